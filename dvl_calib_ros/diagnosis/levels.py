@@ -17,6 +17,8 @@ from .noise import Noise, white_noise
 SIGNIFICANT = 1e-4
 # Rows that are out alone, of which no level is called for
 FEW = 6
+# What a fit takes in of noise depends little on its colour: so often is one found by the other
+TAKEN_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -73,22 +75,28 @@ def _common(values: Array) -> Array:
     return np.clip(values, ordered[few], ordered[-1 - few])
 
 
-def estimated(problem: Problem, seen: Sequence[Seen], left: Array, rotation: Array | None) -> tuple[Noise, Array]:
+def estimated(
+    problem: Problem, seen: Sequence[Seen], left: Array, rotation: Array | None, columns: Array, std: Array
+) -> tuple[Noise, Array]:
     """The noise that is left (M, A) of a problem's residual, in a frame, with the level that it calls for if it does
     so clearly; and what is left with its outliers drawn in.
+
+    columns, std: (M, A, p) and (p,) of what is not left, which has taken in some of the noise.
     """
     noise = white_noise(left, problem.segments, rotation, problem.interval).refitted(left)
-    noise = noise.refitted(noise.robust(left))
+    for _ in range(TAKEN_ROUNDS):
+        taken = noise.taken_by(columns, std)
+        noise = noise.refitted(noise.robust(left), taken=taken)
     names, log_claims = claims_of(problem, seen, rotation)
     if names:
         innovations = noise.whiten(left).reshape(left.shape)
         noise = replace(noise, level=noise.level * followed(log_claims, innovations, names, stretches_of(problem)))
-        noise = noise.refitted(noise.robust(left))
+        noise = noise.refitted(noise.robust(left), taken=taken)
     level = fit_level(problem, seen, noise.whiten(left).reshape(left.shape))
     if level is not None and level.p < SIGNIFICANT:
         noise = replace(noise, level=noise.level * level.values[:, None])
     robust = noise.robust(left)
-    return noise.refitted(robust), robust
+    return noise.refitted(robust, taken=taken), robust
 
 
 def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotation: Array | None) -> Claims | None:

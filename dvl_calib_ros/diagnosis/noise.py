@@ -24,6 +24,8 @@ LONGEST_S = 15.0
 ORDERS = ((0, 0), (1, 0), (1, 1))
 # of a periodogram, after averaging neighbours
 MAX_FREQUENCIES = 300
+# Share of a frequency that a fit takes in, from which on the rest tells nothing of the noise
+MOST_TAKEN = 0.99
 Integers = NDArray[np.intp]
 
 
@@ -111,11 +113,35 @@ class Noise:
             values = np.einsum("mij,mj...->mi...", self.rotation, values)
         return values / self.level.reshape(*self.level.shape, *[1] * (values.ndim - 2))
 
-    def refitted(self, residual: Array, orders: Sequence[tuple[int, int]] = ORDERS) -> Noise:
-        """The same with the ARMA of each axis fitted to a residual (M, A), of the order that BIC takes."""
+    def refitted(
+        self, residual: Array, orders: Sequence[tuple[int, int]] = ORDERS, taken: Array | None = None
+    ) -> Noise:
+        """The same with the ARMA of each axis fitted to a residual (M, A), of the order that BIC takes.
+
+        taken: (A, F) what of the noise a fit has taken out of the residual (`taken_by`); None: nothing.
+        """
         scaled = self._scaled(residual)
-        axes = tuple(_fit_arma(column, self.segments, self.memory, orders) for column in scaled.T)
+        each: Sequence[Array | None] = [None] * len(self.axes) if taken is None else list(taken)
+        axes = tuple(
+            _fit_arma(column, self.segments, self.memory, orders, of_it)
+            for column, of_it in zip(scaled.T, each, strict=True)
+        )
         return replace(self, axes=axes)
+
+    def taken_by(self, columns: Array, std: Array) -> Array:
+        """(A, M // 2 + 1) share of noise like this, by axis and frequency, that a fit of columns (M, A, p) takes in.
+
+        std: (p,) of the fit's prior. What is slow is taken in most: taken for all the noise there is, what is left has
+        too little colour, and a slow effect is found in it.
+        """
+        white = self.whiten(columns)
+        covariance = np.linalg.inv(white.T @ white + np.diag(std**-2.0))
+        m = len(columns)
+        shares = []
+        for axis in range(len(self.axes)):
+            waves = np.fft.rfft(white.reshape(m, -1, len(std))[:, axis], axis=0)
+            shares.append(np.einsum("fp,pq,fq->f", waves, covariance, waves.conj(), optimize=True).real / m)
+        return np.clip(np.array(shares), 0.0, MOST_TAKEN)
 
     @property
     def is_coloured(self) -> bool:
@@ -182,39 +208,52 @@ def _starts_of(segments: Sequence[slice]) -> Integers:
     return np.array([part.start for part in segments if part.stop > part.start], dtype=np.intp)
 
 
-def _fit_arma(series: Array, segments: Sequence[slice], memory: float, orders: Sequence[tuple[int, int]]) -> Arma:
-    """ARMA(1, 1) or less, of the order with the smallest BIC, by Whittle's likelihood.
+def _fit_arma(
+    series: Array,
+    segments: Sequence[slice],
+    memory: float,
+    orders: Sequence[tuple[int, int]],
+    taken: Array | None = None,
+) -> Arma:
+    """ARMA(1, 1) or less, of the order with the smallest BIC, by Whittle's likelihood, restricted to what is not taken.
 
-    With g the spectrum over that of its innovations, n log mean(periodogram / g) is the deviance.
+    With g the spectrum over that of its innovations, and k the share of each frequency that a fit has left,
+    n mean(k) log(mean(periodogram / g) / mean(k)) + n mean(k log g) is the deviance; the mean of log g is 0.
     """
     n = len(series)
-    frequency, power = _periodogram(series)
+    frequency, power, counts, lost = _periodogram(series, taken)
     best = (np.inf, 0.0, 0.0)
     for p, q in orders:
-        deviance, ar, ma = _searched(frequency, power, n, memory, p, q)
+        deviance, ar, ma = _searched(frequency, power, counts, lost, n, memory, p, q)
         best = min(best, (deviance + (p + q) * np.log(n), ar, ma))
     _, ar, ma = best
     coefficients = np.array([ar]) if ar else np.zeros(0)
     arma = Arma(coefficients, ma, 1.0, _ratio(coefficients, ma))
-    std = float(np.sqrt(np.mean(arma.innovations(series, _starts_of(segments)) ** 2)))
+    left = 1.0 if taken is None else 1.0 - (2.0 * taken.sum() - taken[0] - (taken[-1] if n % 2 == 0 else 0.0)) / n
+    std = float(np.sqrt(np.mean(arma.innovations(series, _starts_of(segments)) ** 2) / left))
     return replace(arma, std=max(std, 1e-12))
 
 
-def _periodogram(series: Array) -> tuple[Array, Array]:
-    """Angular frequency per sample (F,) and power, means over even parts of all frequencies."""
+def _periodogram(series: Array, taken: Array | None) -> tuple[Array, Array, Array, Array]:
+    """Angular frequency per sample (F,), power, number and what is taken: means over even parts of all frequencies."""
     power = np.abs(np.fft.rfft(series)[1:]) ** 2 / len(series)
     frequency = np.pi * np.arange(1, len(power) + 1) / max(len(power), 1)
     # the lowest one by one, since colour is there
     edges = np.unique(np.concatenate([np.arange(min(60, len(power))), np.linspace(0, len(power), MAX_FREQUENCIES)]))
     starts = np.unique(edges.astype(int))[:-1]
     counts = np.diff(np.append(starts, len(power)))
-    return np.add.reduceat(frequency, starts) / counts, np.stack([np.add.reduceat(power, starts) / counts, counts])
+    lost = np.zeros_like(power) if taken is None else taken[1:]
+    frequency, power, lost = (np.add.reduceat(each, starts) / counts for each in (frequency, power, lost))
+    return frequency, power, counts, lost
 
 
-def _searched(frequency: Array, power: Array, n: int, memory: float, p: int, q: int) -> tuple[float, float, float]:
+def _searched(
+    frequency: Array, power: Array, counts: Array, lost: Array, n: int, memory: float, p: int, q: int
+) -> tuple[float, float, float]:
     """Deviance, ar and ma of the best ARMA(p, q), on a grid made finer about its best point."""
-    power, counts = power
-    power, wave = power * counts / counts.sum(), np.cos(frequency)
+    share, wave = counts / counts.sum(), np.cos(frequency)
+    power, lost = power * share, lost * share
+    left = 1.0 - float(lost.sum())
     moments = np.column_stack([power, power * wave])
     bound = float(np.arctanh(memory))
     centre, reach = np.zeros(2), np.array([bound if p else 0.0, 2.5 if q else 0.0])
@@ -224,10 +263,13 @@ def _searched(frequency: Array, power: Array, n: int, memory: float, p: int, q: 
                 for c, r, b in zip(centre, reach, (bound, 2.5), strict=True)]  # fmt: skip
         ars, mas = np.tanh(axes[0])[None, :], np.tanh(axes[1])[:, None]
         # the mean of power over spectrum, with |1 - ar e^iω|² = 1 + ar² - 2 ar cos ω and the like of ma
-        even, odd = ((1.0 / (1.0 + mas**2 + 2.0 * mas * wave)) @ moments).T[:, :, None]
+        of_ma = 1.0 + mas**2 + 2.0 * mas * wave
+        even, odd = ((1.0 / of_ma) @ moments).T[:, :, None]
         mean = (1.0 + ars**2) * even - 2.0 * ars * odd
+        logarithm = np.log(1.0 + ars.T**2 - 2.0 * ars.T * wave) @ lost - (np.log(of_ma) @ lost)[:, None]
         # no noise is quieter at low frequencies than at high ones: where it looks so, a fit has taken them in
-        deviance = np.where(ars + mas >= -1e-12, n * np.log(np.maximum(mean, 1e-300)), np.inf)
+        value = n * (left * np.log(np.maximum(mean, 1e-300) / left) + logarithm)
+        deviance = np.where(ars + mas >= -1e-12, value, np.inf)
         row, column = divmod(int(np.argmin(deviance)), ars.size)
         best = min(best, (float(deviance[row, column]), float(ars[0, column]), float(mas[row, 0])))
         centre = np.arctanh(np.clip(best[1:], -0.9999, 0.9999))

@@ -162,17 +162,15 @@ def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fit
     )
     noise = fit.noise
     raw = fit.residual + fitter.outliers
+    columns = columns / np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
     for _ in range(2):
-        explained = _explained(noise, columns, raw - fitter.outliers)
+        explained, std = _explained(noise, columns, raw - fitter.outliers)
         left = raw - explained
         noise, robust = min(
-            (estimated(problem, fit.seen, left, rotation) for rotation in _frames(problem)),
+            (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in _frames(problem)),
             key=lambda each: each[0].deviance(each[1]),
         )
         fitter = Fitter(problem, left - robust)
-    n, p = columns.shape[0] * columns.shape[1], np.linalg.matrix_rank(columns.reshape(-1, columns.shape[2]))
-    grown = float(np.sqrt(n / max(n - int(p), 1)))
-    noise = replace(noise, axes=tuple(replace(arma, std=arma.std * grown) for arma in noise.axes))
     return fitter, fitter.fit(fit.hypothesis, noise)
 
 
@@ -180,13 +178,13 @@ def _frames(problem: Problem) -> list[Array | None]:
     return [None] if problem.earth_from_compared is None else [problem.earth_from_compared, None]
 
 
-def _explained(noise: Noise, columns: Array, residual: Array) -> Array:
-    """(M, A) what all columns explain of a residual, with a ridge that keeps those apart that are alike."""
-    size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
-    white = noise.whiten(columns / size)
+def _explained(noise: Noise, columns: Array, residual: Array) -> tuple[Array, Array]:
+    """(M, A) what all columns of unit size explain of a residual, with a ridge that keeps those apart that are alike;
+    and that ridge, (p,)."""
+    white = noise.whiten(columns)
     ridge = np.full(columns.shape[2], 10.0 * np.sqrt(float((noise.whiten(residual) ** 2).sum())) / np.sqrt(len(white)))
     solution = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge)).solution()
-    return np.asarray((columns / size) @ solution)
+    return np.asarray(columns @ solution), ridge
 
 
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:

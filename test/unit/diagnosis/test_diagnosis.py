@@ -11,6 +11,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from command_line import fail, succeed
+from scipy.signal import lfilter
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
@@ -198,6 +199,27 @@ def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
 @pytest.mark.parametrize(("trajectory", "seed"), [("box", 1), ("lawnmower", 2), ("figure8", 3), ("free", 4)])
 def test_noise_alone_is_not_taken_for_an_effect(trajectory, seed):
     assert diagnosed(trajectory, seed=seed).verdict not in CLAIMS
+
+
+def test_slow_noise_of_the_reference_at_1_hz_is_no_water_that_comes_and_goes():
+    """Each time that it was asked again, the noise was whiter and the current surer."""
+    errors = DvlErrors((0.02, -0.02, 0.01), (0.003,) * 3, beam_std=0.005)
+    given = scenario(seconds=370.0, gnss_std=1e-6, dvl_rate=1.0, gnss_rate=1.0, seed=7, errors=errors)
+    recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
+    keep = np.exp(-1.0 / 6.0)
+    white = np.random.default_rng(7).normal(size=(len(recording.reference.time) + 100, 3))
+    noise = lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], white, axis=0)[100:]
+    noisy = Curve(recording.reference.time, recording.reference.values + 0.006 * noise)
+    assert diagnose_recordings([replace(recording, reference=noisy)], Parameters()).verdict not in CLAIMS
+
+
+def test_a_pitch_of_the_mounting_that_is_not_shown_is_no_coupling_to_tilt():
+    """It makes a velocity upwards, of which a vehicle that tilts by a degree shows a hundredth in surge and sway."""
+    errors = DvlErrors((0.02, 0.1, 0.01), (0.005,) * 3, beam_std=0.002)
+    given = scenario(gnss_std=0.004, waves=Waves(0.06, 6.0), seed=1, dvl_rate=5.0, gnss_rate=5.0, errors=errors)
+    diagnosis = diagnose_recordings([recording_of(simulate(given), given.gnss_frame, axes="xy")], Parameters())
+    assert diagnosis.selection is not None and np.trace(diagnosis.selection.fitter.problem.shown_turns) < 1.5
+    assert diagnosis.verdict not in CLAIMS
 
 
 @pytest.mark.parametrize("share", [0.2, 5.0])

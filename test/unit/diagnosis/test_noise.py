@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,6 +18,7 @@ from dvl_calib_ros.diagnosis.contradicted import without_contradicted
 from dvl_calib_ros.diagnosis.criteria import blocks_of
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
+from dvl_calib_ros.diagnosis.noise import Arma, white_noise
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
 from dvl_calib_ros.simulation.injection import injection
@@ -284,3 +287,53 @@ def test_a_few_quiet_rows_at_a_rare_speed_call_for_no_level(monkeypatch):
     monkeypatch.setattr(levels, "covariates", lambda *_: {"speed": np.linspace(1.0, 2.0, 95)})
     grown = innovations * np.exp(3.0 * np.linspace(0.0, 1.0, 95))[:, None]
     assert levels.fit_level(None, (), grown).p < levels.SIGNIFICANT
+
+
+@pytest.mark.parametrize(("keep", "low"), [(0.0, 0.95), (0.5, 0.85)])
+def test_noise_keeps_the_colour_of_what_a_fit_has_taken_in(keep, low):
+    """What effects leave of noise with a memory looks white: a third of its slow part was gone, and in what was left a
+    current was sure to 8 σ that came and went."""
+    rng, m = np.random.default_rng(3), 185
+    slow = np.cos(np.pi * np.outer(np.linspace(0.0, 1.0, m), np.arange(20)))
+    columns, std = np.concatenate([slow, rng.standard_normal((m, 5))], axis=1)[:, None, :], np.full(25, 10.0)
+    true = Arma(np.array([keep] if keep else []), 0.0, 0.01, float(1.0 / np.sqrt(1.0 - keep**2)))
+    drawn = replace(white_noise(np.ones((m, 1)), (slice(0, m),), None, 2.0), axes=(true,))
+    restricted, plain = [], []
+    for _ in range(40):
+        series = drawn.unwhiten(rng.standard_normal(m))
+        noise = white_noise(series, drawn.segments, None, 2.0)
+        for _ in range(2):
+            white = noise.whiten(columns)
+            left = series - columns @ np.linalg.lstsq(white, noise.whiten(series), rcond=None)[0]
+            for _ in range(2):
+                noise = noise.refitted(left, taken=noise.taken_by(columns, std))
+        restricted.append(_at_rest(noise) / _at_rest(drawn))
+        plain.append(_at_rest(noise.refitted(left)) / _at_rest(drawn))
+    assert low < np.median(restricted) < 1.1
+    assert np.median(plain) < 0.96 * np.median(restricted)
+    assert not keep or np.median(plain) < 0.7
+
+
+def _at_rest(noise):
+    """Root of the spectrum at the frequency 0."""
+    (arma,) = noise.axes
+    return arma.std * (1.0 + arma.ma) / (1.0 - sum(arma.ar))
+
+
+def test_what_lies_about_a_lost_sample_of_a_slow_stream_is_not_compared():
+    """Between two samples that are two seconds apart a vehicle heaves as it likes: seven of 206 rows were four times as
+    loud, and followed the roll."""
+    given = streams(seconds=120.0, dvl_rate=1.0, gnss_rate=1.0)
+    time, velocity = given["reference"]
+    lost = np.isin(np.arange(len(time)), [30, 31, 70])
+
+    def stamps(*reference):
+        streams = recorded(given | {"reference": reference})
+        return make_problem([streams], np.eye(3), np.zeros(3), [Offsets()]).grids[0].stamps
+
+    whole, less = stamps(time, velocity), stamps(time[~lost], velocity[~lost])
+    assert len(whole) >= 100 and 1 <= len(whole) - len(less) <= 6
+    assert all(np.abs(less - at).min() > 0.5 for at in time[lost])
+    # of a fast stream its neighbours tell it
+    fast = streams(seconds=120.0, dvl_rate=5.0, gnss_rate=5.0)
+    assert Curve(*fast["dvl"]).part(np.arange(len(fast["dvl"][0])) != 100).tells(fast["dvl"][0][5:-5]).all()
