@@ -349,6 +349,12 @@ class Problem:
         each = [dvl, reference] if by_dvl else [dvl]
         return tuple(replace(self, recordings=tuple(recordings)) for recordings in each)
 
+    @cached_property
+    def tails(self) -> tuple[float, ...]:
+        """By what factor the noise that is made up for each of `shaken` has a smaller variance than its own."""
+        dvl = max(one.dvl.tails for one in self.recordings)
+        return (dvl, max(one.reference.tails for one in self.recordings))[: len(self.shaken)]
+
     # ------------------------------------------------------------------ the model
 
     def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None) -> Seen:

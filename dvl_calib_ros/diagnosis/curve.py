@@ -27,6 +27,9 @@ NOISE_ALONE, SOME_MOTION = 1.4, 2.5
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Streams slower than this show turns and waves barely; they have no frequencies to spare
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
+# Standard deviations beyond which a sample is an outlier that pulls no more; and by how many of itself the size of the
+# tails has to be above that of normal noise: a median of neighbours' differences is known to 1.6 / √n
+SPIKY, SURELY_HEAVY = 6.0, 3.0 * 1.6
 # Times before and after, in intervals, whose product is larger lie where a sample is lost: 0.25 in the middle of two
 TOLD = 0.4
 
@@ -126,6 +129,22 @@ class Curve:
         if len(self.time) < 10:
             return np.zeros(self.values.shape[1])
         return robust_std(np.diff(self.values, 4, axis=0) / self.loudness[2:-2]) / np.sqrt(70.0)
+
+    @cached_property
+    def tails(self) -> float:
+        """By what factor the variance of the noise, spikes apart, is surely more than that of the usual sample's.
+
+        1 of normal noise; of Student's t with few degrees more, and of a slow stream unknown, whose turns look like it.
+        """
+        if self.interval > FAST_ENOUGH_S or len(self.time) < MIN_SPECTRUM:
+            return 1.0
+        off = np.diff(self.values, 4, axis=0) / self.loudness[2:-2]
+        std = robust_std(off)
+        off, std = off[:, std > 0.0], std[std > 0.0]
+        if not len(std):
+            return 1.0
+        own = np.sqrt(np.mean((np.clip(off / std, -SPIKY, SPIKY)) ** 2))
+        return float(np.maximum(own / (1.0 + SURELY_HEAVY / np.sqrt(off.size)), 1.0) ** 2)
 
     @cached_property
     def loudness(self) -> Array:

@@ -63,7 +63,8 @@ class Fit:
     """A hypothesis fitted. seen: per recording. residual: (M, A) m/s that is left, outliers drawn in. columns:
     (M, A, 6 + p) its derivatives. system: the last step's. own_noise: whitened, what made-up noise of the velocities
     makes in it. deviance: whitened squares and prior, less those of that: a delay interpolates at another phase, a
-    low-pass takes noise off, which must not count for or against them.
+    low-pass takes noise off, which must not count for or against them. of_tails: by how much the squares of own_noise
+    are larger where that has heavier tails than what is made up.
     """
 
     hypothesis: Hypothesis
@@ -74,6 +75,7 @@ class Fit:
     system: WhitenedLeastSquares
     deviance: float
     own_noise: Array
+    of_tails: float = 0.0
 
     def gain_over(self, rest: Fit) -> float:
         """Deviance that this explains beyond another, for sure.
@@ -81,7 +83,8 @@ class Fit:
         With other noise in it, it may fit the reference's noise better by chance: by a normal variable of this size.
         """
         other = self.own_noise - rest.own_noise
-        return rest.deviance - self.deviance - BY_CHANCE * 2.0 * float(np.sqrt(other @ other))
+        sure = rest.deviance - self.deviance - BY_CHANCE * 2.0 * float(np.sqrt(other @ other))
+        return sure - max(rest.of_tails - self.of_tails, 0.0)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -245,7 +248,9 @@ class Fitter:
                 columns = self.columns(hypothesis, seen)
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
-        return Fit(hypothesis, seen, residual, noise, columns, system, deviance, own_noise)
+        of_each = own_noise.reshape(len(self.problem.shaken), -1)
+        of_tails = float((np.array(self.problem.tails) - 1.0) @ (of_each**2).sum(axis=1))
+        return Fit(hypothesis, seen, residual, noise, columns, system, deviance, own_noise, of_tails)
 
     def _without_own_noise(
         self, system: WhitenedLeastSquares, hypothesis: Hypothesis, noise: Noise, columns: Array, residual: Array
