@@ -702,6 +702,10 @@ def _grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
     for curve, own_late in others:
         for at in (base_late - own_late, -MARGIN_S, MARGIN_S):
             known &= curve.covers(true + own_late + at)
+    if not by_dvl:  # the DVL has nothing of the time that its clock went back over, whatever it is late by
+        for event in recording.set_back:
+            of_dvl, around = true + offsets.dvl, event.by + MARGIN_S
+            known &= (of_dvl < event.before - around) | (of_dvl > event.after + around)
     for oriented in (recording.attitude, recording.rates):
         for at in (base_late, -MARGIN_S, MARGIN_S):
             known &= True if oriented is None else oriented.covers(true + at)

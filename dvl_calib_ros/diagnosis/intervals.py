@@ -11,6 +11,7 @@ from ..calibration.frames import Array
 from .composed import is_time_of_run
 from .criteria import blocks_of
 from .fitting import Fit, Fitter
+from .leaps import LEAP, time_by_stamps
 from .made_up import made_up
 from .selection import EffectSelection
 
@@ -36,7 +37,8 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     for effect in fit.effects:
         for spec in filter(is_time_of_run, effect.parameters):
             for recording in dict.fromkeys(each.recording or 0 for each in fit.hypothesis.parameters_of(effect)):
-                found = fitter.time_interval(fit, effect, spec.name, recording)
+                found = time_by_stamps(fitter, fit, spec.name) if effect.name == LEAP else None
+                found = found or fitter.time_interval(fit, effect, spec.name, recording)
                 times[effect.name, recording, spec.name] = found
                 covariance = covariance + fitter.moved_by_time(fit, effect, spec.name, recording, found[1:])
     return covariance, times

@@ -33,6 +33,8 @@ WORTH_FITTING, NO_DELAY = 40.0, 0.13
 # The largest gaps in the stamps, from so many seconds on, are times at which a clock may have leapt ahead, if by as
 # much (but for that many seconds)
 GAPS, GAP_FROM_S, AS_LARGE_S = 6, 0.15, 0.3
+# Lost samples leave a gap of whole steps, a clock's leap such as differs by this share of a step
+OF_A_STEP = 0.15
 
 
 @dataclass(frozen=True)
@@ -67,31 +69,40 @@ def leaping(fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping
 
 def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     """True times (s of the run) of the largest gaps in the stamps of the DVL of one recording, and what each is longer
-    than usual, s.
+    than usual, s; and of where its clock was set back, by how much at most, below zero.
 
     A clock that leaps ahead leaves a gap as large as the leap; lost samples leave gaps as well.
     """
     if len(fit.seen) > 1:
         return []
-    stamps = fitter.problem.recordings[0].dvl.time
+    (recording,) = fitter.problem.recordings
+    stamps = recording.dvl.time
     steps = np.diff(stamps)
     usual = float(np.median(steps))
+    back = [(event.before, -event.by) for event in recording.set_back]
+    for event in recording.set_back:
+        steps[(stamps[:-1] <= event.before) & (stamps[1:] >= event.after)] = usual
     largest = np.argsort(-steps)[:GAPS]
-    stamps, longer = stamps[largest], steps[largest] - usual
+    ahead = zip(stamps[largest].tolist(), (steps[largest] - usual).tolist(), strict=True)
     injections = [each for each in fit.hypothesis.injections(0) if each.effect.name != LEAP]
     leaps = [(each["at_s"], each["seconds"]) for each in fit.values.get(LEAP, ())]
     leaps += [(each["again_at_s"], each["again_seconds"]) for each in fit.values.get(LEAP, ()) if "again_at_s" in each]
     found = []
-    for stamp, gap in zip(stamps.tolist(), longer.tolist(), strict=True):
-        before = sum(seconds for at, seconds in leaps if at + AS_LARGE_S < stamp and abs(seconds - gap) > AS_LARGE_S)
+    for stamp, gap in (*back, *ahead):
+        before = sum(by for at, by in leaps if at + AS_LARGE_S < stamp and not _is_as_large(by, gap))
         at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * usual
-        if gap > GAP_FROM_S and at > 0.0:
+        if abs(gap) > GAP_FROM_S and at > 0.0:
             found.append((at, gap))
     return found
 
 
+def _is_as_large(by: float, gap: float) -> bool:
+    """Whether a leap, s, is one that leaves a gap, s; below zero: of a clock that is set back by no more."""
+    return gap - AS_LARGE_S < by < (0.0 if gap < 0.0 else gap + AS_LARGE_S)
+
+
 def in_gaps(fitter: Fitter, fit: Fit) -> Fit:
-    """A fit whose leaps ahead lie where the stamps have a gap as large, if the data takes that for as good a time.
+    """A fit whose leaps lie where the stamps have a gap as large or go back, if that is as good a time.
 
     Without the outliers there that a wrong time has made: they would be for it.
     """
@@ -100,17 +111,32 @@ def in_gaps(fitter: Fitter, fit: Fit) -> Fit:
             continue
         for at, gap in gaps(fitter, fit):
             (values,) = fit.values[LEAP]
-            if abs(values[seconds] - gap) > AS_LARGE_S:
+            if not _is_as_large(values[seconds], gap):
                 continue
             tried = replace(fit.hypothesis, values={**fit.values, LEAP: ({**values, at_s: at},)})
             times = fitter.problem.time
-            near = (times > min(at, values[at_s]) - gap) & (times < max(at, values[at_s]) + gap)
+            near = (times > min(at, values[at_s]) - abs(gap)) & (times < max(at, values[at_s]) + abs(gap))
             fair = replace(fitter, outliers=np.where(near[:, None], 0.0, fitter.outliers), _fits={})
             left = [fair.fit(each, fit.noise) for each in (fit.hypothesis, tried)]
             before, after = (float((each.noise.whiten(each.residual) ** 2).sum()) for each in left)
             if after < before + OF_A_TIME:
                 fit = fitter.fit(left[1].hypothesis, fit.noise)
     return fit
+
+
+def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, float] | None:
+    """The time of a leap with its interval (s of the run), where the stamps show it to a sample; else None.
+
+    at_s: its name. They show it by a gap that is as large and no whole number of steps, as that of lost samples is, or
+    where they go back.
+    """
+    usual = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
+    value, by = fit.values[LEAP][0][at_s], fit.values[LEAP][0][at_s.replace("at_s", "seconds")]
+    for at, gap in gaps(fitter, fit):
+        is_shifted = gap < 0.0 or OF_A_STEP < (gap / usual) % 1.0 < 1.0 - OF_A_STEP
+        if is_shifted and _is_as_large(by, gap) and abs(value - at) < max(usual, AS_LARGE_S):
+            return value, min(value, at) - usual, max(value, at) + usual
+    return None
 
 
 def _hypotheses(

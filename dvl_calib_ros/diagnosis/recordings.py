@@ -34,6 +34,7 @@ from ..recordings.same import hold_the_same
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason
 from .curve import Curve
+from .set_back import SetBack, set_back
 from .settings import SETTINGS
 
 SECOND_NS = 1_000_000_000
@@ -56,7 +57,7 @@ class RecordedStreams:
     body. dvl_std, reference_std: (3,) m/s, RMS of what the messages claim, the reference's in its frame; None where
     they do not. measured: (3,) which axes of the reference are measured. repeats: of `received` DVL samples, how many
     have the very velocity of the one before; spikes: how many were far off and are left out. registration: how the
-    instruments stand, where that is known already.
+    instruments stand, where that is known already. set_back: where the DVL's clock was.
     """
 
     name: str
@@ -73,6 +74,7 @@ class RecordedStreams:
     spikes: int = 0
     first_ns: int = 0
     registration: Registration | None = None
+    set_back: tuple[SetBack, ...] = ()
 
     @property
     def available(self) -> frozenset[EffectNeeds]:
@@ -146,6 +148,9 @@ def make_recording(
     first_ns: Stamp of the DVL's first sample.
 
     """
+    events, once = set_back(*dvl)
+    if not once.all():
+        dvl, dvl_std = (dvl[0][once], dvl[1][once]), dvl_std if dvl_std is None or dvl_std.ndim == 1 else dvl_std[once]
     time, velocity = dvl
     seconds = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     rate = min(SETTINGS.max_stream_rate, max(SETTINGS.max_points / max(seconds, 1.0), SLOWEST_AVERAGE_HZ))
@@ -173,6 +178,7 @@ def make_recording(
     return RecordedStreams(
         name, dvl_curve, reference_curve, frame, curve(attitude), curve(rates), _rms(dvl_std), _rms(reference_std),
         _measured_axes(reference[1], _usual(reference_std), axes), repeats, len(time), spikes, first_ns,
+        set_back=events,
     )  # fmt: skip
 
 
@@ -345,7 +351,7 @@ def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, not
     imu_ns = clocks.imu_ns
     dvl_stream, dvl_std = _claimed_stream(at, dvl.values, _std(dvl.covariances), first_ns)
     reference_stream, std = _claimed_stream(reference.stamps_ns - clocks.reference_ns, velocity, std, first_ns)
-    return make_recording(
+    recording = make_recording(
         name,
         dvl_stream,
         reference_stream,
@@ -357,6 +363,10 @@ def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, not
         axes=parameters.gnss_axes,
         first_ns=first_ns,
     )
+    if twice := len(dvl_stream[0]) - recording.received:
+        when = " and ".join(f"{event.after:.0f} s" for event in recording.set_back)
+        notes.append(f"dvl: its clock was set back at {when}; {twice} samples of what it stamped twice are left out")
+    return recording
 
 
 def _stream(stamps_ns: NDArray[np.int64], values: Array, first_ns: int) -> tuple[Array, Array]:

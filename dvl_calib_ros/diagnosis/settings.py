@@ -21,8 +21,8 @@ class DiagnosisSettings:
 
     Finding: level: family-wise, of the claim that
     there is an effect. max_effects: named at most. ghost_share: of what is explained already that a further effect
-    must add; less is what the inexactness of a strong one leaves, unless it is an arm, a clock or a lag and more than
-    ghost_of_noise of the noise's deviance. indistinguishable: deviance within which two
+    must add; less is what the inexactness of a strong one leaves, unless it is all that is left, or an arm, a clock or
+    a lag and more than ghost_of_noise of the noise's deviance. indistinguishable: deviance within which two
     explanations are one answer: with truth j and a rival that looks better by d, the odds are those of a normal
     variable beyond √d. robust_level: p of an effect by the scatter of its blocks, a test with few degrees of freedom
     that no colour of the noise upsets.

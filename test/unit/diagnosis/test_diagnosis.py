@@ -25,7 +25,7 @@ from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
 from dvl_calib_ros.diagnosis.holm import holm
-from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays, gaps, in_gaps
+from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays, gaps, in_gaps, time_by_stamps
 from dvl_calib_ros.diagnosis.leaps import _found as _delays
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
@@ -391,6 +391,28 @@ def test_leaps_ahead_are_put_where_the_stamps_have_a_gap_as_large():
     back = {**fit.values, "time_offset_jump": ({"seconds": -1.8, "at_s": 199.0},)}
     back = replace(fit, hypothesis=replace(fit.hypothesis, values=back))
     assert in_gaps(fitter, back) is back
+
+
+def test_a_leap_back_is_put_where_the_stamps_go_back_and_its_time_is_known_to_a_sample():
+    """A short step tells where: the time was open by 25 s, and with it the sizes of both leaps by half a second."""
+    given = scenario(
+        effects=["dvl_time_offset:seconds=0.5", "time_offset_jump:seconds=-1.3,at_s=201.3"],
+        gnss_std=0.02,
+        seconds=400.0,
+    )
+    recording = recording_of(as_sent(simulate(given)), given.gnss_frame)
+    problem = make_problem([recording], np.eye(3), np.zeros(3), [Offsets(0.5, 0.0)])
+    effects = [EFFECTS["dvl_time_offset"], EFFECTS["time_offset_jump"].once]
+    values = {"dvl_time_offset": ({"seconds": 0.5},), "time_offset_jump": ({"seconds": -1.3, "at_s": 199.0},)}
+    start = no_effect().with_effects(effects, 1, values)
+    fitter = Fitter(problem)
+    noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
+    fit = in_gaps(fitter, fitter.fit(start, noise))
+    time, low, high = time_by_stamps(fitter, fit, "at_s")
+    assert low < 201.3 - 0.5 < high and high - low == pytest.approx(0.8, abs=0.01)  # since the first stamp
+    assert time == pytest.approx(201.3 - 0.5, abs=0.3)
+    ahead = replace(fit.hypothesis, values={**fit.values, "time_offset_jump": ({"seconds": 1.3, "at_s": time},)})
+    assert time_by_stamps(fitter, replace(fit, hypothesis=ahead), "at_s") is None
 
 
 def test_times_of_a_leap_that_are_as_good_are_looked_for_beyond_such_as_are_not(monkeypatch):

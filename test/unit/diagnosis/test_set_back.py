@@ -1,0 +1,58 @@
+"""Where stamps show that a clock was set back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dvl_calib_ros.diagnosis.recordings import make_recording
+from dvl_calib_ros.diagnosis.set_back import UP_TO_S, set_back
+
+TRUE = np.arange(0.0, 200.0, 0.2)
+STAMPS = TRUE - 1.27 * (TRUE >= 60.0)
+
+
+def sailed(time):
+    """(N, 3) m/s in waves of five seconds."""
+    return np.column_stack([1.0 + 0.2 * np.sin(1.25 * time), 0.1 * np.cos(1.25 * time), 0.05 * np.sin(0.9 * time)])
+
+
+def test_what_was_stamped_twice_is_found_and_left_out():
+    order = np.argsort(STAMPS)
+    ((before, after, by),), once = set_back(STAMPS[order], sailed(TRUE)[order])
+    assert before == pytest.approx(58.73, abs=0.2) and after == pytest.approx(59.8, abs=0.2)
+    assert by == pytest.approx(1.27, abs=0.3)
+    out = TRUE[order][~once]
+    assert out.min() == pytest.approx(58.8, abs=0.3) and out.max() == pytest.approx(61.2, abs=0.3)
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(TRUE), 1))
+    mixed, claimed = (STAMPS[order], sailed(TRUE)[order]), np.full((len(TRUE), 3), 0.01)
+    recording = make_recording("run", mixed, (TRUE, sailed(TRUE)), attitude=(TRUE, level), dvl_std=claimed)
+    assert recording.set_back == ((before, after, by),) and recording.received == np.count_nonzero(once)
+    assert not ((recording.dvl.time >= before) & (recording.dvl.time <= after)).any()
+
+
+def test_a_short_step_is_where_a_driver_threw_away_what_came_twice():
+    kept = np.maximum.accumulate(np.append(-1.0, STAMPS[:-1])) < STAMPS
+    events, once = set_back(STAMPS[kept], sailed(TRUE)[kept])
+    assert [(each.before, each.by) for each in events] == [(pytest.approx(59.8), UP_TO_S)] and once.all()
+
+
+@pytest.mark.parametrize(
+    "time",
+    [
+        np.concatenate([TRUE[:300], np.arange(60.0, 80.0, 0.1), TRUE[400:]]),
+        TRUE + np.random.default_rng(3).normal(0.0, 0.03, len(TRUE)),
+        np.delete(TRUE, slice(300, 310)),
+        TRUE[:10],
+    ],
+    ids=["pings faster for a while", "jitter", "lost samples", "next to nothing"],
+)
+def test_no_clock_is_set_back_where(time):
+    events, once = set_back(time, sailed(time))
+    assert events == () and once.all()
+
+
+def test_samples_that_are_mixed_and_alike_stay():
+    time = np.sort(STAMPS)
+    events, once = set_back(time, np.ones((len(time), 3)) + np.random.default_rng(1).normal(0.0, 0.01, (len(time), 3)))
+    assert events == () and once.all()
