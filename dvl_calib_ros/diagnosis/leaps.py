@@ -85,11 +85,19 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     largest = np.argsort(-steps)[:GAPS]
     ahead = zip(stamps[largest].tolist(), (steps[largest] - usual).tolist(), strict=True)
     injections = [each for each in fit.hypothesis.injections(0) if each.effect.name != LEAP]
-    leaps = [(each["at_s"], each["seconds"]) for each in fit.values.get(LEAP, ())]
-    leaps += [(each["again_at_s"], each["again_seconds"]) for each in fit.values.get(LEAP, ()) if "again_at_s" in each]
+    leaps: list[tuple[float, float]] = []  # stamps at which they come, s, and by how much
+    for each in fit.values.get(LEAP, ()):
+        for at_s, seconds in (("at_s", "seconds"), ("again_at_s", "again_seconds")):
+            if np.isfinite(each.get(at_s, np.inf)):
+                own = late(injections, ActsOn.DVL_CLOCK, np.array([each[at_s]]))[0]
+                leaps.append((each[at_s] + float(own) + sum(by for _, by in leaps), each[seconds]))
     found = []
     for stamp, gap in (*back, *ahead):
-        before = sum(by for at, by in leaps if at + AS_LARGE_S < stamp and not _is_as_large(by, gap))
+        alike = [
+            each for each in leaps if _is_as_large(each[1], gap)
+        ]  # of which the nearest may be the one that left it
+        others = [each for each in leaps if each != min(alike, key=lambda each: abs(each[0] - stamp), default=None)]
+        before = sum(by for at, by in others if at < stamp)
         at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * usual
         if abs(gap) > GAP_FROM_S and at > 0.0:
             found.append((at, gap))

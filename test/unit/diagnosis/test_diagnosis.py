@@ -415,6 +415,22 @@ def test_a_leap_back_is_put_where_the_stamps_go_back_and_its_time_is_known_to_a_
     assert time_by_stamps(fitter, replace(fit, hypothesis=ahead), "at_s") is None
 
 
+def test_of_two_leaps_back_the_second_is_put_behind_the_first():
+    """It came out by the first, 1.3 s, too early: that was taken for the one that is looked for."""
+    leap = "time_offset_jump:seconds=-1.3,at_s=101.3,again_seconds=-0.9,again_at_s=251.3"
+    given = scenario(effects=["dvl_time_offset:seconds=0.5", leap], gnss_std=0.02, seconds=400.0)
+    recording = recording_of(as_sent(simulate(given)), given.gnss_frame)
+    problem = make_problem([recording], np.eye(3), np.zeros(3), [Offsets(0.5, 0.0)])
+    names = ["dvl_time_offset", "time_offset_jump"]
+    since_first_stamp = {name: value - 0.5 * name.endswith("at_s") for name, value in injection(leap).values.items()}
+    values = {"dvl_time_offset": ({"seconds": 0.5},), "time_offset_jump": (since_first_stamp,)}
+    hypothesis = no_effect().with_effects([EFFECTS[name] for name in names], 1, values)
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=values, seen=[None])
+    shown = [time_by_stamps(Fitter(problem), fit, name) for name in ("at_s", "again_at_s")]
+    for (_, low, high), at in zip(shown, (101.3, 251.3), strict=True):
+        assert low < at - 0.5 < high and high - low < 1.2
+
+
 def test_times_of_a_leap_that_are_as_good_are_looked_for_beyond_such_as_are_not(monkeypatch):
     """On straight legs nothing shows when: 172.6 to 176.2 s were said of a leap at 248 s, which came out 5 worse."""
     leap = EFFECTS["time_offset_jump"]
