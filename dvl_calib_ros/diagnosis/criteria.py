@@ -107,7 +107,7 @@ def finer_steps(problem: Problem) -> list[float]:
     """Steps (s) by which times of the run are refined: half of those tried, down to the time between samples."""
     seconds = max(recording.seconds for recording in problem.recordings) / WINDOW_STEPS
     steps: list[float] = []
-    while seconds > 0.7 * problem.interval and len(steps) < 8:
+    while seconds > 0.5 * problem.interval and len(steps) < 8:
         seconds /= 2.0
         steps.append(seconds)
     return steps

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,10 @@ SHORTLIST, FITTED, NOT_WORTH_IT = 12, 7, 40.0
 ADDING_MOST = 4
 # How many times of the run are kept of an effect that comes and goes
 KEPT_VARIANTS = 2
+# Standard deviation of noise over that of its innovations, from which on it has a memory to speak of
+WITH_A_MEMORY = 1.2
+# Share of its squares, up to which what is left is noise of another kind
+MOST_OF_NOISE = 0.5
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,12 @@ class Variant:
     def p(self) -> int:
         """Number of columns."""
         return self.columns.shape[2]
+
+    @property
+    def comes_and_goes(self) -> bool:
+        """Whether it is there for a part of the run only."""
+        times = [spec.name for spec in self.effect.parameters if is_time_of_run(spec)]
+        return any(each[name] != self.effect.defaults[name] for each in self.values for name in times)
 
 
 @dataclass(frozen=True)
@@ -62,6 +72,37 @@ class StraightLines:
 
 def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     """Hypotheses worth fitting, by their straight lines about a fit; the fit's own among them."""
+    table, worth = _worth(fitter, fit, effects)
+    own = tuple(range(len(fit.effects)))
+    return [
+        *(combined(fitter, fit, table, chosen) for chosen in (worth if own in worth else [*worth, own])),
+        *told_by_other_clocks(fitter, fit, effects),
+        *_told_by_a_lag(fit, effects),
+    ]
+
+
+def coming_and_going(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """The best with effects that come and go, as they would be if the noise were white.
+
+    Noise with a memory takes in what a wrong time leaves, and of times on a grid the least wrong ones are no better.
+    Only such as are the most of it: of noise that has a memory by itself they would always explain some.
+    """
+    if max(arma.ratio for arma in fit.noise.axes) < WITH_A_MEMORY:
+        return []
+    fit = replace(fit, noise=fit.noise.white)
+    table, worth = _worth(fitter, fit, effects)
+    own = len(fit.effects)
+    most = MOST_OF_NOISE * table.drop(range(own))
+    come = [
+        chosen
+        for chosen in worth
+        if any(i >= own and table.variants[i].comes_and_goes for i in chosen) and table.drop(chosen) < most
+    ]
+    return [combined(fitter, fit, table, chosen) for chosen in come[:KEPT_VARIANTS]]
+
+
+def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[StraightLines, list[tuple[int, ...]]]:
+    """The straight lines about a fit, and which variants of them are worth fitting together, the best first."""
     table = straight_lines(fitter, fit, effects)
     n = len(fitter.problem.recordings)
     cost = [price(v.effect, len(effects), n, v.tried) for v in table.variants]
@@ -86,13 +127,7 @@ def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hy
     worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
     if not any(_is_possible(table, chosen) for chosen in worth):  # lines are straight no more: the likely is tried too
         worth += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
-    if tuple(own) not in worth:
-        worth.append(tuple(own))
-    return [
-        *(combined(fitter, fit, table, chosen) for chosen in worth),
-        *told_by_other_clocks(fitter, fit, effects),
-        *_told_by_a_lag(fit, effects),
-    ]
+    return table, worth
 
 
 def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Variant]:
@@ -234,8 +269,23 @@ def told_by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]
     found = []
     for one in told:
         if set(one) <= set(effects) and len(rest) + len(one) <= SETTINGS.max_effects:
-            start = {name: tuple({"seconds": float(s)} for s in seconds) for name, seconds in one.items()}
+            start: dict[str, tuple[Values, ...]] = _at_other_times(fit, rest, dvl + attitude - one.get(DVL_CLOCK, 0.0))
+            start |= {name: tuple({"seconds": float(s)} for s in seconds) for name, seconds in one.items()}
             found.append(fit.hypothesis.with_effects([*rest, *(effects[name] for name in one)], n, start))
+    return found
+
+
+def _at_other_times(fit: Fit, effects: Sequence[Effect], later: Array) -> dict[str, tuple[Values, ...]]:
+    """Values of effects that come and go, all that happens being later by so many seconds (of each recording)."""
+    found: dict[str, tuple[Values, ...]] = {}
+    for effect in effects:
+        times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
+        per = zip(fit.values[effect.name], later.tolist(), strict=True)
+        if times:  # what is there from the beginning goes on being so
+            found[effect.name] = tuple(
+                {**each, **{name: max(each[name] + by, 0.0) if each[name] else 0.0 for name in times}}
+                for each, by in per
+            )
     return found
 
 

@@ -31,7 +31,7 @@ from .leaps import LEAP, in_gaps, leaping
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
-from .proposing import leaps_at_the_beginning, proposed, told_by_other_clocks, variants_about
+from .proposing import coming_and_going, leaps_at_the_beginning, proposed, told_by_other_clocks, variants_about
 from .recordings import RecordedStreams
 from .registered import FirstGuess, first_guess
 from .shown import shown_parts, unshown_parts, without_faint
@@ -120,6 +120,9 @@ def select(
         fits += [each for each in leapt if not is_taken_back(fitter, each, LEAP, fit.deviance - each.deviance)]
         fits += happening_again(fitter, fits, every, effects)
         finer = finer_steps(problem)
+        for hypothesis in coming_and_going(fitter, fit, effects):
+            as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
+            fits.append(fitter.fit(as_white.hypothesis, fit.noise))
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
         best = fitter.refined_as_white(fitter.refined(best_of(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
         best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))

@@ -17,10 +17,11 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.diagnosis import fitting, intervals, shown, twice
 from dvl_calib_ros.diagnosis.called_for import _is_late_before_a_leap, once_where_borne_out, only_called_for
-from dvl_calib_ros.diagnosis.clock_or_arm import lags_and_delays
+from dvl_calib_ros.diagnosis.clock_or_arm import CLOCKS, lags_and_delays
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.diagnosis.composed import Grid, Hypothesis, Offsets, Problem, make_problem, no_effect
+from dvl_calib_ros.diagnosis.criteria import finer_steps
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
@@ -29,6 +30,7 @@ from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays, gaps, in_gaps, 
 from dvl_calib_ros.diagnosis.leaps import _found as _delays
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
+from dvl_calib_ros.diagnosis.proposing import coming_and_going, told_by_other_clocks
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm
@@ -127,6 +129,54 @@ def test_two_clocks_that_are_as_late_as_each_other_are_told_by_the_third_whateve
     found = _by_fewer_clocks(fitter, fit, EFFECTS)
     assert {effect.name for effect in found.effects} == {"attitude_time_offset", "mount_flexure"}
     assert found.values["attitude_time_offset"][0]["seconds"] == pytest.approx(0.52, abs=0.02)
+
+
+def test_what_comes_and_goes_does_so_at_another_time_by_another_clock():
+    """By an IMU that is late a current was where the DVL's late clock had it: the two clocks were named for it."""
+    lock = {"east_mps": 0.2, "north_mps": -0.3, "from_s": 110.0, "to_s": np.inf}
+    always = {"seconds": 0.2, "at_s": 0.0}
+    values = {"dvl_time_offset": ({"seconds": 0.9},), "reference_time_offset": ({"seconds": 0.8},)}
+    values |= {"water_lock": (lock,), "time_offset_jump": (always,)}
+    effects = {name: EFFECTS[name].once for name in values} | {"attitude_time_offset": EFFECTS["attitude_time_offset"]}
+    hypothesis = no_effect().with_effects([effects[name] for name in values], 1, values)
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=values, effects=hypothesis.effects, seen=[None])
+    fitter = Mock(spec=Fitter, problem=Mock(spec=Problem, recordings=[Mock(seconds=0.0)]))
+    found = [
+        (each.values["water_lock"][0], each.values["time_offset_jump"][0], {*each.values} & {*CLOCKS})
+        for each in told_by_other_clocks(fitter, fit, effects)
+    ]
+    assert [its for *_, its in found[:2]] == [{"attitude_time_offset"}, {"dvl_time_offset"}]
+    assert [its["from_s"] for its, *_ in found] == pytest.approx([110.9, 110.8, 110.9, 110.0])
+    assert all(its["to_s"] == np.inf and leap["at_s"] == 0.0 for its, leap, _ in found)
+
+
+def test_a_current_that_was_taken_for_noise_is_proposed_when_it_came_and_went():
+    """With a memory of 15 s, it was for as long as it takes in least: all after it began. 0.4 m/s were unknown."""
+    given = scenario(effects=["water_lock:east_mps=0.2,north_mps=-0.34,from_s=120,to_s=241"], gnss_std=0.02)
+    fitter, fit, _ = fitted(given, {})
+    assert not coming_and_going(fitter, fit, EFFECTS)
+    fitter, fit = _about(fitter, fit, {})
+    assert max(arma.ratio for arma in fit.noise.axes) > 2.0
+    effects = {name: EFFECTS[name].once for name in ("water_lock", "heading_error", "velocity_bias", "scale_drift")}
+    (best, *_) = coming_and_going(fitter, fit, effects)
+    assert best.values["water_lock"][0]["to_s"] == pytest.approx(240.0, abs=1.0)
+    assert best.values["water_lock"][0]["east_mps"] == pytest.approx(0.2, abs=0.05)
+
+
+@pytest.mark.parametrize(("seconds", "between_samples"), [(387.0, 1.0), (400.0, 0.4), (370.0, 0.2)])
+def test_times_of_a_run_are_refined_to_less_than_the_time_between_samples(seconds, between_samples):
+    """To 1.2 s of samples at 1 Hz, the end of a current was one sample late for good, and a leap of the clock there."""
+    steps = finer_steps(Mock(spec=Problem, recordings=[Mock(seconds=seconds)], interval=2.0 * between_samples))
+    assert 0.3 * between_samples < steps[-1] < between_samples
+    np.testing.assert_allclose(np.array(steps[1:]) / steps[:-1], 0.5)
+
+
+def test_a_clock_of_the_imu_is_told_beside_a_current_that_comes_and_goes():
+    effects = ["lever_arm:x_m=2.4,y_m=-0.9", "attitude_time_offset:seconds=-0.87"]
+    current = "water_lock:east_mps=0.2,north_mps=-0.34,from_s=111,to_s=248"
+    diagnosis = diagnosed("free", effects=[*effects, current], seed=1, gnss_std=0.02)
+    assert {*found(diagnosis)} == {"lever_arm", "attitude_time_offset", "water_lock"}
+    assert_within(diagnosis, "attitude_time_offset", seconds=-0.87)
 
 
 def test_a_leap_at_the_beginning_beside_a_clock_is_the_third_clock():
