@@ -45,7 +45,7 @@ class Selected:
 
 
 @dataclass(frozen=True)
-class Told:
+class ToldApart:
     """What is said of the effects of a fit: they, strongest first, and the fit with the clocks that are as likely.
 
     opened, moved: as `EffectSelection` has them.
@@ -59,7 +59,7 @@ class Told:
 
 def tell_apart(
     fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], alike: Mapping[str, str]
-) -> Told:
+) -> ToldApart:
     """What is said of each effect of a fit. alike: by name of an effect, another that the fit has it as likely for."""
     called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
@@ -84,7 +84,7 @@ def tell_apart(
     fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, {})
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
-    return Told(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
+    return ToldApart(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
 
 
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
