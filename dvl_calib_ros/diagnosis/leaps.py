@@ -119,9 +119,8 @@ def in_gaps(fitter: Fitter, fit: Fit) -> Fit:
             continue
         for at, gap in gaps(fitter, fit):
             (values,) = fit.values[LEAP]
-            other = values.get("at_s" if at_s == "again_at_s" else "again_at_s", np.inf)
-            if not _is_as_large(values[seconds], gap) or abs(other - at) < abs(gap) + AS_LARGE_S:
-                continue  # of two leaps one has left it
+            if not _is_as_large(values[seconds], gap):
+                continue
             tried = replace(fit.hypothesis, values={**fit.values, LEAP: ({**values, at_s: at},)})
             times = fitter.problem.time
             near = (times > min(at, values[at_s]) - abs(gap)) & (times < max(at, values[at_s]) + abs(gap))

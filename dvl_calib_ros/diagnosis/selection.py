@@ -36,7 +36,7 @@ from .recordings import RecordedStreams
 from .registered import FirstGuess, first_guess
 from .shown import shown_parts, unshown_parts, without_faint
 from .told_apart import Selected, tell_apart
-from .twice import happening_again, is_taken_back, once_where_at_once
+from .twice import happening_again, is_taken_back
 from .unexplained import unexplained
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
@@ -126,7 +126,6 @@ def select(
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
         best = fitter.refined_as_white(fitter.refined(best_of(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
         best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))
-        best = once_where_at_once(fitter, best, every, effects)
         best = only_called_for(fitter, best, len(effects))
         names = frozenset(effect.name for effect in best.effects)
         fitter, fit = _about(fitter, best, every)

@@ -8,9 +8,9 @@ import numpy as np
 
 from ..effects.base import Effect
 from .composed import Hypothesis, is_time_of_run
-from .criteria import WINDOW_STEPS, best_of, finer_steps, price, times_tried
+from .criteria import WINDOW_STEPS, best_of, price, times_tried
 from .fitting import Fit, Fitter
-from .leaps import LEAP, gaps, in_gaps
+from .leaps import LEAP, gaps
 from .proposing import KEPT_VARIANTS
 from .settings import SETTINGS
 from .unexplained import unexplained
@@ -99,21 +99,6 @@ def either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] |
     return starts
 
 
-def once_where_at_once(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
-    """A fit in which what happens twice, but at once, happens once: two halves of a leap are one."""
-    for effect in fit.effects:
-        if not _is_at_once(fitter, apart_and_undone(fit, effect.name)[0]):
-            continue
-        starts = either_alone(fit, effects[effect.name], every[effect.name], clear=())
-        found = [fitter.refined(fitter.fit(start, fit.noise), finer_steps(fitter.problem)) for start in starts]
-        return in_gaps(fitter, min(found, key=lambda each: each.deviance))
-    return fit
-
-
-def _is_at_once(fitter: Fitter, apart: float) -> bool:
-    return apart < max(recording.seconds for recording in fitter.problem.recordings) / WINDOW_STEPS
-
-
 def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | None = None) -> bool:
     """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording.
 
@@ -121,7 +106,7 @@ def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | 
     it) explains less. That is asked of what explains more than such causes do unseen only if it is undone exactly.
     """
     apart, share = apart_and_undone(fit, name)
-    at_once = _is_at_once(fitter, apart)
+    at_once = apart < max(recording.seconds for recording in fitter.problem.recordings) / WINDOW_STEPS
     if at_once or share >= TAKEN_BACK or drop < MUCH:
         return at_once or share < TAKEN_BACK
     if rest is None or (drop > SETTINGS.instead_of and share >= TAKEN_BACK_EXACTLY):

@@ -36,7 +36,7 @@ from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagn
 from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm
 from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
 from dvl_calib_ros.diagnosis.told_apart import _clock_or_arm, _selected
-from dvl_calib_ros.diagnosis.twice import happening_again, is_taken_back, once_where_at_once
+from dvl_calib_ros.diagnosis.twice import happening_again, is_taken_back
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.base import ActsOn
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -463,21 +463,6 @@ def test_a_leap_back_is_put_where_the_stamps_go_back_and_its_time_is_known_to_a_
     assert time == pytest.approx(201.3 - 0.5, abs=0.3)
     ahead = replace(fit.hypothesis, values={**fit.values, "time_offset_jump": ({"seconds": 1.3, "at_s": time},)})
     assert time_by_stamps(fitter, replace(fit, hypothesis=ahead), "at_s") is None
-
-
-def test_two_halves_of_a_leap_that_come_at_once_are_one():
-    """A leap of -1.06 s was unknown: half of it was put where the stamps go back, and what came at once was dropped."""
-    leap = "time_offset_jump"
-    given = scenario(effects=[f"{leap}:seconds=-1.06,at_s=201.3"], gnss_std=0.02, seconds=400.0)
-    halves = {"seconds": -0.5, "at_s": 201.3, "again_seconds": -0.5, "again_at_s": 216.0}
-    fitter, fit, _ = fitted(given, {leap: halves})
-    once = {name: effect.once for name, effect in EFFECTS.items()}
-    (values,) = once_where_at_once(fitter, fit, EFFECTS, once).values[leap]
-    assert "again_seconds" not in values
-    assert values["seconds"] == pytest.approx(-1.06, abs=0.05) and values["at_s"] == pytest.approx(201.3, abs=15.0)
-    apart = {**fit.values[leap][0], "again_at_s": 300.0}
-    other = replace(fit, hypothesis=replace(fit.hypothesis, values={leap: (apart,)}))
-    assert once_where_at_once(fitter, other, EFFECTS, once) is other
 
 
 def test_of_two_leaps_back_the_second_is_put_behind_the_first():
