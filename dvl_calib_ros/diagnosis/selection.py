@@ -133,7 +133,7 @@ def select(
             break
         seen_before.add(names)
     fit = only_borne_out(fitter, only_called_for(fitter, fit, len(effects)), len(effects))
-    fit = once_where_borne_out(fitter, fit, every, effects)
+    fit = in_gaps(fitter, once_where_borne_out(fitter, fit, every, effects))
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
     fit = without_nothing(fitter, fit, len(effects))

@@ -443,6 +443,12 @@ def test_leaps_ahead_are_put_where_the_stamps_have_a_gap_as_large():
     assert in_gaps(fitter, back) is back
 
 
+def two_leaps(fit: Fit, values) -> Hypothesis:
+    others = [effect for effect in fit.effects if effect.name != "time_offset_jump"]
+    leap = EFFECTS["time_offset_jump"]
+    return fit.hypothesis.with_effects([*others, leap], 1, {leap.name: (values,)})
+
+
 def test_a_leap_back_is_put_where_the_stamps_go_back_and_its_time_is_known_to_a_sample():
     """A short step tells where: the time was open by 25 s, and with it the sizes of both leaps by half a second."""
     given = scenario(
@@ -461,6 +467,9 @@ def test_a_leap_back_is_put_where_the_stamps_go_back_and_its_time_is_known_to_a_
     time, low, high = time_by_stamps(fitter, fit, "at_s")
     assert low < 201.3 - 0.5 < high and high - low == pytest.approx(0.8, abs=0.01)  # since the first stamp
     assert time == pytest.approx(201.3 - 0.5, abs=0.3)
+    twice = {"seconds": -0.5, "at_s": 120.0, "again_seconds": -0.8, "again_at_s": 200.0}  # one of two has left it
+    (twice,) = in_gaps(fitter, replace(fit, hypothesis=two_leaps(fit, twice))).values["time_offset_jump"]
+    assert twice["at_s"] == 120.0
     ahead = replace(fit.hypothesis, values={**fit.values, "time_offset_jump": ({"seconds": 1.3, "at_s": time},)})
     assert time_by_stamps(fitter, replace(fit, hypothesis=ahead), "at_s") is None
 
