@@ -94,10 +94,9 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
                 leaps.append((each[at_s] + float(own) + sum(by for _, by in leaps), each[seconds]))
     found = []
     for stamp, gap in (*back, *ahead):
-        alike = [
-            each for each in leaps if _is_as_large(each[1], gap)
-        ]  # of which the nearest may be the one that left it
-        others = [each for each in leaps if each != min(alike, key=lambda each: abs(each[0] - stamp), default=None)]
+        alike = [each for each in leaps if _is_as_large(each[1], gap)]
+        its = min(alike, key=lambda each: abs(each[0] - stamp), default=None)  # that may have left it
+        others = [each for each in leaps if each != its]
         before = sum(by for at, by in others if at < stamp)
         at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * usual
         if abs(gap) > GAP_FROM_S and at > 0.0:

@@ -16,8 +16,8 @@ TWO_STEPS, FEWEST = 1.25, 4
 TO_AND_FRO = 2.0
 # A step shorter than this share of the usual one tells of a clock where all but so many are within this of it
 SHORT, RARE, REGULAR = 0.8, 3, 0.1
-# By as much, s, is a clock set back of which the stamps do not tell by how much
-UP_TO_S = 2.0
+# By as much at most, s, is a clock set back of which the stamps do not tell by how much; and of which they do
+UP_TO_S, LONGEST_S = 2.0, 5.0
 
 
 class SetBack(NamedTuple):
@@ -33,8 +33,8 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
 
     time: (N,) s, stamps in order. velocity: (N, 3) m/s, of the same samples. A clock that is set back by two seconds
     stamps two seconds once more; or a driver that wants stamps in order throws two seconds away, which leaves one step
-    that is short. A DVL that pings faster for a while has short steps as well, but many, and its velocity goes on as
-    smoothly.
+    that is short. A DVL that pings faster for a while has short steps as well, but for longer, and its velocity goes on
+    as smoothly.
     """
     once = np.ones(len(time), dtype=bool)
     if len(time) < 4 * FEWEST:
@@ -45,9 +45,10 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
     bent = np.linalg.norm(velocity[1:-1] - 0.5 * (velocity[:-2] + velocity[2:]), axis=1)
     found = []
     for first, behind in np.flatnonzero(np.diff(np.pad(crowded, 1).astype(int))).reshape(-1, 2).tolist():
-        if behind - first >= FEWEST and np.median(bent[first:behind]) > TO_AND_FRO * np.median(bent):
+        inside = float(time[behind + 1] - time[first])
+        is_mixed = np.median(bent[first:behind]) > TO_AND_FRO * np.median(bent)
+        if behind - first >= FEWEST and inside < LONGEST_S and is_mixed:
             once[first : behind + 2] = False
-            inside = float(time[behind + 1] - time[first])
             found.append(SetBack(float(time[first]), float(time[behind + 1]), inside))
     odd = np.flatnonzero(np.abs(steps - usual) > REGULAR * usual)
     short = odd[steps[odd] < SHORT * usual]

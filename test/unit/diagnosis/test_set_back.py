@@ -52,6 +52,15 @@ def test_no_clock_is_set_back_where(time):
     assert events == () and once.all()
 
 
+def test_a_dvl_that_pings_faster_and_is_noisier_for_a_minute_loses_nothing():
+    time = np.concatenate([TRUE[:300], np.arange(60.0, 100.0, 0.1), TRUE[500:]])
+    noise = np.where((time >= 60.0) & (time < 100.0), 0.1, 0.01)[:, None] * np.random.default_rng(2).normal(
+        size=(len(time), 3)
+    )
+    events, once = set_back(time, sailed(time) + noise)
+    assert events == () and once.all()
+
+
 def test_samples_that_are_mixed_and_alike_stay():
     time = np.sort(STAMPS)
     events, once = set_back(time, np.ones((len(time), 3)) + np.random.default_rng(1).normal(0.0, 0.01, (len(time), 3)))
