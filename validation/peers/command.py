@@ -65,6 +65,8 @@ def main(argv: Sequence[str]) -> int:
     outside = Trial(
         arguments.out / FOREIGN, arguments.seed, arguments.jobs, beside=beside, recorder=record_foreign
     )  # fmt: skip
+    if arguments.anew and not any(read_answers(each.answers) for each in (inside, outside)):
+        raise InputError(f"{arguments.out}: has no answers to be asked for anew; run it without --anew first")
     with common.progress("peers") as on_progress:
         chosen, strange = generator_cases(arguments.cases - n_foreign), foreign_cases(n_foreign)
         run = asked_anew if arguments.anew else Trial.run
@@ -85,6 +87,7 @@ def asked_anew(
 
     The folder has the new ones when all are there; until then a further call goes on. Raises InputError.
     """
+    trial.prepare()
     before = read_answers(trial.answers)
     asked = [case for case in cases if case.id in before]
     again = replace(trial, folder=trial.folder / "anew", beside={})

@@ -117,7 +117,7 @@ class Trial:
 
         seconds: no further case is begun after this time.
         """
-        self._prepare()
+        self.prepare()
         done = read_answers(self.answers)
         until = time.monotonic() + seconds
         left = [case for case in cases if case.id not in done]
@@ -135,8 +135,8 @@ class Trial:
         begun = itertools.takewhile(lambda _: time.monotonic() < until, cases)
         return map(work, begun) if self.jobs == 1 else outcomes_on_cores(work, begun, self.jobs)
 
-    def _prepare(self) -> None:
-        """Make the folder, or check that what is in it is of this trial."""
+    def prepare(self) -> None:
+        """Make the folder, or check that what is in it is of this trial. Raises InputError."""
         self.sealed.mkdir(parents=True, exist_ok=True)
         header = {"seed": self.seed, "generator": GENERATOR_VERSION}
         path = self.folder / "trial.json"

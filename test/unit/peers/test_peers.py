@@ -118,6 +118,11 @@ def test_a_library_that_is_missing_is_told_in_one_line(monkeypatch, capsys, tmp_
     assert capsys.readouterr().err.count("\n") == 1
 
 
+def test_nothing_is_asked_for_anew_where_nothing_was_answered(capsys, tmp_path):
+    assert main(["peers", "--anew", "--peer", "correlation", "--out", str(tmp_path / "none")]) == 2
+    assert "has no answers" in capsys.readouterr().err and not (tmp_path / "none").exists()
+
+
 # ------------------------------------------------------------------ side by side
 
 
@@ -145,6 +150,9 @@ def test_who_is_asked_beside_is_asked_of_the_same_bags_and_scored_with_the_same_
     assert [each["document"]["effects"][0]["name"] for each in anew.values()] == ["lever_arm"] * 2
     assert [each["beside"] for each in anew.values()] == [each["beside"] for each in answers.values()]
     assert len(seen["other"]) == 2 and read_answers(trial.answers) == anew and not (tmp_path / "anew").exists()
+    with pytest.raises(InputError, match=r"not .*'seed': 9101"):  # the peers' answers are to other bags
+        asked_anew(replace(changed, seed=SEED + 1), cases, lambda _: None, np.inf)
+    assert read_answers(trial.answers) == anew
     both = sides(unseal(trial.sealed), answers)
     assert [side.name for side in both] == ["diagnose", "other"]
     right = [{case.truth.category: is_right(case) for case in side.cases.values()} for side in both]
