@@ -43,7 +43,9 @@ def _calibrate(data: SensorData, end: int, procedure: Procedure, failures: list[
     results = []
     for variant in range(len(data.velocity_dvl))[VERIFIED]:
         try:
-            calibrator = Calibrator(parameters, prior_sway_heave=prior, block_size=end, verified=True)
+            calibrator = Calibrator(
+                parameters, prior_sway_heave=prior, block_size=end, verified=True, models=procedure.models
+            )
             calibrator.feed(streams_of(stretch, variant))
             results.append(calibrator.result())
         except Exception as error:
