@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import dvl_calib_ros as dc
 from validation.trial.motion import BOAT, RECORDED
 from validation.trial.plan import KINDS, Case, Family, plan
 from validation.trial.recorded import has_boat, recordings_folder
@@ -120,15 +119,6 @@ def test_an_arm_that_may_be_another_is_so_after_an_effect_was_dropped(tmp_path, 
     answers = trial.run([Case(Category.PAIR, BOAT, "lag", number=6, family=Family.DISPLACED)])
     [case] = join(unseal(trial.sealed), answers)
     assert case.verdict != "failed"
-
-
-def test_a_turn_that_is_not_shown_and_that_the_mounting_found_has_is_not_left_at_a_stroke(tmp_path, snapir_ins):
-    """Nobody told the mounting, so one of 12 degrees of pitch was found: without it all at once the fit ran away."""
-    trial = Trial(tmp_path / "trial", seed=25404, jobs=1, keep_bags=True)
-    case = Case(Category.TRIPLE, RECORDED, "lag+late+leaps", number=5, family=Family.DISPLACED)
-    trial.run([case])
-    found = dc.diagnose(tmp_path / "trial" / "bags" / case.id / "recording0")
-    assert np.isfinite([value for value, _, _ in found.calibration]).all()
 
 
 def test_on_real_motion_what_was_named_leaves_little_more_than_the_noise(at_sea):

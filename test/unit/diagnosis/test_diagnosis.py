@@ -33,7 +33,7 @@ from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.proposing import coming_and_going, told_by_other_clocks
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
-from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm
+from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm, started
 from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
 from dvl_calib_ros.diagnosis.told_apart import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.twice import happening_again, is_taken_back
@@ -270,6 +270,17 @@ def test_a_pitch_of_the_mounting_that_is_not_shown_is_no_coupling_to_tilt():
     diagnosis = diagnose_recordings([recording_of(simulate(given), given.gnss_frame, axes="xy")], Parameters())
     assert diagnosis.selection is not None and np.trace(diagnosis.selection.fitter.problem.shown_turns) < 1.5
     assert diagnosis.verdict not in CLAIMS
+
+
+def test_a_turn_that_is_not_shown_and_that_the_mounting_found_has_is_not_left_at_a_stroke():
+    """Nobody told the mounting, so one of 12 degrees of pitch was found: without it all at once the fit ran away."""
+    errors = DvlErrors((0.02, 0.2, 0.01), (0.005,) * 3, beam_std=0.002)
+    given = scenario(gnss_std=0.004, waves=Waves(0.06, 6.0), seed=1, dvl_rate=5.0, gnss_rate=5.0, errors=errors)
+    recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
+    problem, start, (guess,), _ = started([recording], np.eye(3), np.zeros(3), EFFECTS)
+    assert guess.phi[1] == pytest.approx(-0.2, abs=0.05) and np.trace(problem.shown_turns) < 1.5
+    np.testing.assert_allclose(problem.shown_turns @ start.phi, start.phi, atol=1e-12)
+    assert start.phi[2] == pytest.approx(-0.01, abs=0.02)
 
 
 @pytest.mark.parametrize("share", [0.2, 5.0])
