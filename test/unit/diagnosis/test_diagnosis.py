@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
-from dvl_calib_ros.diagnosis import fitting, intervals, shown, twice
+from dvl_calib_ros.diagnosis import fitting, intervals, proposing, shown, twice
 from dvl_calib_ros.diagnosis.called_for import _is_late_before_a_leap, once_where_borne_out, only_called_for
 from dvl_calib_ros.diagnosis.clock_or_arm import CLOCKS, lags_and_delays
 from dvl_calib_ros.diagnosis.closure import Gap
@@ -226,12 +226,33 @@ def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best():
 # ------------------------------------------------------------------ what is found
 
 
-def test_where_all_that_is_proposed_is_beyond_its_bounds_what_is_within_them_is_tried_as_well():
-    """A shear of 17° and more was in every proposal, no fit of them went anywhere, and the current was not found."""
-    told = ["attitude_time_offset:seconds=-0.26", "water_lock:east_mps=0.14,north_mps=0.26,from_s=61,to_s=140"]
-    diagnosis = diagnosed(effects=told, seed=7, dvl_rate=5.0, gnss_rate=5.0, gnss_std=0.02)
-    assert diagnosis.verdict is DiagnosisVerdict.KNOWN
-    assert set(found(diagnosis)) == {"attitude_time_offset", "water_lock"}
+def test_where_all_that_is_proposed_is_beyond_its_bounds_what_is_within_them_is_tried_as_well(monkeypatch):
+    """A shear of 17° and more was in every proposal, no fit of them went anywhere, and a current was not found."""
+    fitter, fit, _ = fitted(scenario(effects=["velocity_bias:x_mps=0.1"]), {})
+    _, worth = proposing._worth(fitter, fit, EFFECTS)
+    assert worth and () not in worth
+    monkeypatch.setattr(proposing, "_is_possible", lambda table, chosen: chosen in ((), worth[-1]))
+    assert proposing._worth(fitter, fit, EFFECTS)[1] == worth
+    monkeypatch.setattr(proposing, "_is_possible", lambda table, chosen: chosen == ())
+    assert proposing._worth(fitter, fit, EFFECTS)[1] == [*worth, ()]
+
+
+def test_straight_lines_are_possible_within_the_bounds_of_all_that_they_hold():
+    shear, clock = EFFECTS["axis_nonorthogonality"], EFFECTS["clock_drift"]
+    (high, *_), (drift,) = ([spec.high for spec in each.parameters] for each in (shear, clock))
+    variants = [
+        proposing.Variant(each, (each.defaults,), np.zeros((1, 3, p)), 1.0) for each, p in ((shear, 3), (clock, 1))
+    ]
+    blocks = [np.arange(6, 9), np.arange(9, 10)]
+    for values, is_possible in (
+        ([0.9 * high, 0.0, 0.0, 0.9 * drift], True),
+        ([1.1 * high, 0.0, 0.0, 0.0], False),
+        ([0.0, 0.0, -1.1 * high, 0.0], False),
+        ([0.0, 0.0, 0.0, 1.1 * drift], False),
+    ):
+        part = Mock(solution=lambda values=values: np.array([9.0] * 6 + values))
+        table = proposing.StraightLines(variants, blocks, Mock(part=lambda index, part=part: part))
+        assert proposing._is_possible(table, (0, 1)) is is_possible
 
 
 def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
