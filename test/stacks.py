@@ -18,7 +18,7 @@ from driver_fixtures import Maker
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy
+from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, cross, rotation_from_rpy
 from dvl_calib_ros.simulation.trajectories import Motion, make_motion
 
 START_NS = 1_760_000_000_000_000_000
@@ -78,7 +78,7 @@ class Told:
     def dvl_velocity(self, i: int, mounting_rpy: tuple[float, ...]) -> Array:
         """What the DVL measures in its forward-left-up axes, m/s."""
         m = motion()
-        at_dvl = m.velocity_body[i] + np.cross(m.angular_velocity[i], LEVER_ARM)
+        at_dvl = m.velocity_body[i] + cross(m.angular_velocity[i], np.array(LEVER_ARM))
         body_from_dvl = true_mounting(mounting_rpy)
         return body_from_dvl.T @ at_dvl + self.rng.normal(0.0, DVL_STD, 3)
 
@@ -134,15 +134,11 @@ class Told:
         m = motion()
         body_from_imu = np.eye(3) if mounting is None else mounting
         world_from_enu = ENU_FROM_NED.T if world == "ned" else np.eye(3)
-        for i, stamp in self.every(rate_hz):
-            rotation = world_from_enu @ m.rotation_enu_from_body[i] @ body_from_imu
-            message = self.make.imu(
-                Oriented(
-                    stamp,
-                    Rotation.from_matrix(rotation).as_quat(),
-                    body_from_imu.T @ m.angular_velocity[i],
-                )
-            )
+        each = self.every(rate_hz)
+        rotations = [world_from_enu @ m.rotation_enu_from_body[i] @ body_from_imu for i, _ in each]
+        quaternions = Rotation.from_matrix(rotations).as_quat()  # one by one takes as long as all else
+        for (i, stamp), rotation, quaternion in zip(each, rotations, quaternions, strict=True):
+            message = self.make.imu(Oriented(stamp, quaternion, body_from_imu.T @ m.angular_velocity[i]))
             message.header.frame_id = frame
             gravity = rotation.T @ (world_from_enu @ np.array([0.0, 0.0, 9.81]))
             message.linear_acceleration = self.make.vector(gravity)
@@ -209,6 +205,7 @@ class Oriented:
     angular_velocity: Array
 
 
+@cache
 def true_mounting(mounting_rpy: tuple[float, ...]) -> Array:
     """rotation_body_from_dvl of the axes forward-left-up, misalignment and all."""
     return rotation_from_rpy(mounting_rpy) @ rotation_from_rpy(MISALIGNMENT)

@@ -330,9 +330,12 @@ def _write_imu(drawn: Drawn, motion: Motion, bag: Bag, rng: np.random.Generator)
     seen = seen * Rotation.from_rotvec(np.deg2rad(rng.normal(0.0, 0.05, (len(off), 3))))
     gravity = attitude.inv().apply(np.tile([0.0, 0.0, 9.81], (len(off), 1)))
     rates = rates + rng.normal(0.0, 0.002, rates.shape)
-    for time, rotation, rate, pull in zip(times.tolist(), seen, rates, gravity, strict=True):
+    covariances = [(variance * np.eye(3)).ravel() for variance in (1e-6, 4e-6, 1e-3)]
+    turned = seen.as_quat().tolist()  # one by one takes as long as all else
+    for time, quaternion, rate, pull in zip(times.tolist(), turned, rates, gravity, strict=True):
+        orientation = bag.new("geometry_msgs/msg/Quaternion", *quaternion)
         message = bag.new(
-            IMU, bag.header(time, "base_link"), bag.quaternion(rotation), (1e-6 * np.eye(3)).ravel(), bag.vector(rate),
-            (4e-6 * np.eye(3)).ravel(), bag.vector(pull), (1e-3 * np.eye(3)).ravel(),
+            IMU, bag.header(time, "base_link"), orientation, covariances[0], bag.vector(rate),
+            covariances[1], bag.vector(pull), covariances[2],
         )  # fmt: skip
         bag.add(time + 0.005, "/imu/data", IMU, message)
