@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from dvl_calib_ros.errors import InputError
 
-from .registry import ROOT, dvl_calib, snapir_ins
+from .registry import ROOT, by_itself, dvl_calib, snapir_ins
 from .sea import GAZEBO, IMPORT, RECORDINGS
 from .stored import git, head
 
@@ -104,7 +104,7 @@ def demo(folder: Path) -> None:
     """The end of the demo."""
     from rich.text import Text
 
-    output = dvl_calib("demo")
+    output = by_itself("demo")
     lines = [line.rstrip() for line in output.splitlines() if not line.startswith("   playing")]
     terminal(Text("\n".join(lines)), folder, "demo", "dvl-calib demo", 104)
 

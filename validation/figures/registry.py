@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -63,21 +65,45 @@ def measurement(
     return register
 
 
-def dvl_calib(*arguments: object, cwd: Path = ROOT, codes: tuple[int, ...] = (0,)) -> str:
-    """Output of a command of this tree. Raises CalledProcessError with what it said."""
-    return _run(["dvl_calib_ros.cli.main", *map(str, arguments)], cwd, codes)
+def dvl_calib(*arguments: object) -> str:
+    """Output of a command of this tree. Raises CalledProcessError with what it said.
+
+    In this process and from its folder: what a command imports takes as long as many of them take.
+    """
+    from dvl_calib_ros.cli.main import main
+
+    command, before = [str(each) for each in arguments], Path.cwd()
+    said, warned = io.BytesIO(), io.BytesIO()
+    output, errors = (io.TextIOWrapper(each, encoding="utf-8", write_through=True) for each in (said, warned))
+    os.chdir(ROOT)
+    try:
+        with redirect_stdout(output), redirect_stderr(errors):
+            code: int | str | None = main(command)
+    except SystemExit as end:  # of a command that there is not
+        code = end.code
+    finally:
+        os.chdir(before)
+    if code:
+        number = code if isinstance(code, int) else 1
+        raise subprocess.CalledProcessError(number, command, said.getvalue().decode(), warned.getvalue().decode())
+    return said.getvalue().decode()
+
+
+def by_itself(*arguments: object) -> str:
+    """`dvl_calib` in a process of its own."""
+    return _run(["dvl_calib_ros.cli.main", *map(str, arguments)])
 
 
 def validation(*arguments: object) -> str:
     """Output of another command of `python -m validation`. Raises CalledProcessError with what it said."""
-    return _run(["validation", *map(str, arguments)], ROOT, (0,))
+    return _run(["validation", *map(str, arguments)])
 
 
-def _run(module: Sequence[str], cwd: Path, codes: Sequence[int]) -> str:
+def _run(module: Sequence[str]) -> str:
     command = [sys.executable, "-m", *module]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=cwd, env={**os.environ, "PYTHONPATH": str(ROOT)})
-    if done.returncode not in codes:
-        raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr)
+    done = subprocess.run(
+        command, capture_output=True, text=True, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True
+    )
     return done.stdout
 
 
