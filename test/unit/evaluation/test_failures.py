@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from report_fixtures import drawn
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.cli.main import main
@@ -58,6 +59,7 @@ def test_the_command_counts_what_raised_says_which_and_why_and_goes_on(monkeypat
     told = sensor_data(own_trajectories()["T15"], seed=0).velocity_dvl[7, 5]
     assert main([*COMMAND, "--json", str(tmp_path / "whole.json")]) == 0
     refuse(monkeypatch, "G1", told)
+    drawn(monkeypatch)  # the pictures are looked at elsewhere
     outputs = [
         "--json",
         str(tmp_path / "e.json"),
