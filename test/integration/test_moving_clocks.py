@@ -16,11 +16,12 @@ from dvl_calib_ros.simulation.sensors import DvlErrors
 ARM, AT_S = -0.6, 170.0
 
 
-def bag_of(folder, topic, drift=0.0, leap=0.0):
+def bag_of(folder, topic, drift=0.0, leap=0.0, hz=5.0):
     """Figures of eight; stamps of a topic get later. A drift takes ten minutes to show, a leap less."""
     arm = injection(f"lever_arm:x_m={ARM}")
     errors = DvlErrors((0.01, -0.01, 0.02), (0.003,) * 3, beam_std=0.005)
-    made = simulate(Scenario("figure8", 600.0 if drift else 400.0, 3, errors, gnss_std=0.05, effects=(arm,)))
+    seconds, rates = 600.0 if drift else 400.0, {"dvl_rate": hz, "gnss_rate": hz, "imu_rate": 4.0 * hz}
+    made = simulate(Scenario("figure8", seconds, 3, errors, gnss_std=0.05, effects=(arm,), **rates))
     first_ns = made.dvl[0].stamp_ns
 
     def change(name, message):
@@ -48,7 +49,7 @@ def said(command, bag, capsys):
     ids=["leap", "drift"],
 )
 def test_a_reference_whose_clock_moves_is_named_by_all_and_not_accepted(moves, words, tmp_path, capsys):
-    bag = bag_of(tmp_path, "gnss/twist", **moves)
+    bag = bag_of(tmp_path, "gnss/twist", **moves, hz=2.0)  # a diagnosis takes as long as there are samples
     for command in ("doctor", "diagnose"):
         assert words in said(command, bag, capsys)
     replayed = said("replay", bag, capsys)
