@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from validation.trial.motion import BOAT, RECORDED
+from validation.trial.motion import RECORDED
 from validation.trial.plan import KINDS, Case, Family, plan
-from validation.trial.recorded import has_boat, recordings_folder
 from validation.trial.run import Trial
 from validation.trial.scored import join
 from validation.trial.truth import Category, unseal
@@ -109,16 +108,6 @@ def test_on_real_motion_exactly_the_true_effects_are_named_with_and_without_a_ve
     assert all(case.is_exact for case in pairs)
     inside = [interval.holds for case in pairs for interval in case.intervals]
     assert np.mean(inside) >= 0.8
-
-
-def test_an_arm_that_may_be_another_is_so_after_an_effect_was_dropped(tmp_path, snapir_ins):
-    """By how much was a vector of the effects there had been: the diagnosis broke."""
-    if not has_boat(recordings_folder()):
-        pytest.skip("needs the recordings of a boat (DVL_CALIB_SHARED)")
-    trial = Trial(tmp_path / "trial", seed=25404, jobs=1)
-    answers = trial.run([Case(Category.PAIR, BOAT, "lag", number=6, family=Family.DISPLACED)])
-    [case] = join(unseal(trial.sealed), answers)
-    assert case.verdict != "failed"
 
 
 def test_on_real_motion_what_was_named_leaves_little_more_than_the_noise(at_sea):

@@ -17,7 +17,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.diagnosis import fitting, intervals, proposing, shown, twice
 from dvl_calib_ros.diagnosis.called_for import _is_late_before_a_leap, once_where_borne_out, only_called_for
-from dvl_calib_ros.diagnosis.clock_or_arm import CLOCKS, lags_and_delays
+from dvl_calib_ros.diagnosis.clock_or_arm import CLOCKS, lags_and_delays, moved_arm, with_moved
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.diagnosis.composed import Grid, Hypothesis, Offsets, Problem, make_problem, no_effect
@@ -1157,6 +1157,20 @@ def test_a_height_of_three_metres_is_found_where_one_of_a_third_would_not_be_sho
         assert whole.values[arm.name][0]["z_m"] == pytest.approx(z, abs=0.1)
     else:
         assert whole is fit
+
+
+def test_an_arm_that_may_be_another_is_so_after_an_effect_was_dropped():
+    """By how much was a vector of the effects there had been: the diagnosis broke."""
+    lag, arm = EFFECTS["reference_lag"], EFFECTS["lever_arm"]
+    values = {lag.name: ({"time_constant_s": 1.0},), arm.name: ({"x_m": 0.5, "y_m": 0.1, "z_m": 0.0},)}
+    there_were, there_are = (no_effect().with_effects(some, 1, values) for some in ([lag, arm], [arm.without({"z_m"})]))
+    fit = Mock(spec=Fit, hypothesis=there_were, values=there_were.values)
+    near, far = ({arm.name: ({"x_m": x, "y_m": 0.2},)} for x in (0.6, 0.9))
+    moved = moved_arm(fit, [Mock(spec=Hypothesis, values=each) for each in (near, far, {})])
+    added = with_moved(Mock(spec=Fit, hypothesis=there_are), np.eye(8), moved) - np.eye(8)
+    expected = np.zeros((8, 8))
+    expected[6:, 6:] = np.outer([0.4, 0.1], [0.4, 0.1])
+    np.testing.assert_allclose(added, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize(
