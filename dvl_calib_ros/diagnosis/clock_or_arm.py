@@ -181,10 +181,20 @@ def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
     return max(moved, key=lambda each: sum(by**2 for by in each.values()), default={})
 
 
+def moved_lag(fit: Fit, joint: Fit) -> dict[str, float]:
+    """By how much (s) a lag is another in a fit than in the same with more clocks, which are late in its place, where
+    it explains the data as well without these."""
+    if not {LAG} <= fit.values.keys() & joint.values.keys():
+        return {}
+    if fit.deviance > joint.deviance + SETTINGS.indistinguishable:
+        return {}
+    return {name: value - joint.values[LAG][0][name] for name, value in fit.values[LAG][0].items()}
+
+
 def with_moved(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
-    """A covariance (6 + p, 6 + p) in which the lever arm may be another, as `moved_arm` has it."""
+    """A covariance (6 + p, 6 + p) in which lever arm or lag may be another, as `moved_arm` and `moved_lag` have it."""
     step = np.zeros(len(covariance))
-    for name, i in _places(fit, ARM).items():
+    for name, i in (_places(fit, ARM) | _places(fit, LAG)).items():
         step[i] = moved.get(name, 0.0)
     return np.asarray(covariance + np.outer(step, step))
 

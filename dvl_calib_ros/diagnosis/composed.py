@@ -28,7 +28,7 @@ from ..calibration.samples import VelocityFrame
 from ..effects.along_time import slopes
 from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectParameter, MountingEffect
 from ..effects.composition import Injection, late, traces, turns
-from .curve import Curve
+from .curve import FAST_ENOUGH_S, Curve
 from .noise import segments_of
 from .recordings import RecordedStreams
 from .settings import SETTINGS
@@ -36,6 +36,9 @@ from .settings import SETTINGS
 Values = Mapping[str, float]
 # Passes in which an effect is undone that acts on the very motion it changes: it is small against that motion
 _PASSES = 3
+# Seconds between the times of a motion that a filter follows as it was, where it is looked at more seldom than
+# `FAST_ENOUGH_S`: by its slopes at 1 Hz a wave of 5 s is a quarter too small
+CLOSE_S = 0.1
 
 
 def is_time_of_run(spec: EffectParameter) -> bool:
@@ -80,6 +83,11 @@ class Hypothesis:
     def lags(self, recording: int) -> list[tuple[Effect, Values]]:
         """The effects of one recording with a memory, and their values."""
         return [(effect, self.values[effect.name][recording]) for effect in self.effects if effect.has_memory]
+
+    @property
+    def without_memory(self) -> Hypothesis:
+        """The same without effects that have one."""
+        return replace(self, effects=tuple(effect for effect in self.effects if not effect.has_memory))
 
     def parameters(self) -> list[Parameter]:
         """What is fitted beside the calibration, in order."""
@@ -140,7 +148,7 @@ class Seen:
     (F, 3) m/s smoothed DVL velocity, its frame. error: (F, 3) e, body frame.
     angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
     dvl_stamps, reference_stamps: (F,) s that these give the same times. projection: (F, A, 3) or (1, A, 3) from the
-    body frame to the axes that are compared. change: makes `rate_of_change`.
+    body frame to the axes that are compared. change: makes `rate_of_change`. closely: makes `close`.
     """
 
     motion: EffectInput
@@ -153,11 +161,26 @@ class Seen:
     reference_stamps: Array
     projection: Array
     change: Callable[[], Array] = field(repr=False)
+    closely: Callable[[], tuple[Seen, NDArray[np.intp]] | None] = field(repr=False)
 
     @cached_property
     def rate_of_change(self) -> Array:
         """(F, 3) m/s² of the smoothed DVL velocity, which few ask for."""
         return self.change()
+
+    @cached_property
+    def close(self) -> tuple[Seen, NDArray[np.intp] | slice]:
+        """The same without effects that have a memory, at times so close that these miss nothing, and which are its."""
+        return self.closely() or (self, slice(None))
+
+    def on_reference(self, injections: Sequence[Injection]) -> Array:
+        """(F, 3) m/s, traces on REFERENCE, body frame."""
+        lagging = [each for each in injections if isinstance(each.effect, Effect) and each.effect.has_memory]
+        if not lagging or self.close[0] is self:
+            return traces(injections, self.motion, ActsOn.REFERENCE)
+        close, own = self.close
+        found = traces([each for each in injections if each not in lagging], self.motion, ActsOn.REFERENCE)
+        return np.asarray(found + traces(lagging, close.motion, ActsOn.REFERENCE)[own])
 
     def compared(self, body: Array) -> Array:
         """(F, 3) or (F, 3, p) of the body frame along the axes that are compared, (F, A) or (F, A, p)."""
@@ -210,6 +233,22 @@ class Grid:
         for of_bin in range(1, self.per_bin):  # few: faster than a mean along so short an axis
             total += values[of_bin :: self.per_bin]
         return total / self.per_bin
+
+    def between(self, time: Array) -> tuple[Array, NDArray[np.intp]] | None:
+        """Times (C,) s among which are those of the samples (F,), with those between, but over gaps; and which are.
+
+        None where these are close enough by themselves, or too many.
+        """
+        if len(time) < 2:
+            return None
+        steps = np.diff(time)
+        usual = float(np.median(steps))
+        parts = min(int(np.ceil(usual / CLOSE_S)), SETTINGS.max_points // len(time))
+        if usual <= FAST_ENOUGH_S or parts < 2:
+            return None
+        of_each = np.where(steps < SETTINGS.max_gap_intervals * usual, parts, 1)
+        own = np.concatenate([[0], np.cumsum(of_each)])
+        return np.interp(np.arange(own[-1] + 1), own, time), own
 
     def true_time(self, injections: Sequence[Injection]) -> Array:
         """(F,) s, increasing, at which what is stamped so was measured.
@@ -357,8 +396,9 @@ class Problem:
 
     # ------------------------------------------------------------------ the model
 
-    def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None) -> Seen:
-        """A recording through a hypothesis; at: true times (F,) s, by default those of the grid."""
+    def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None, as_it_is: bool = False) -> Seen:
+        """A recording through a hypothesis; at: true times (F,) s, by default those of the grid. as_it_is: its motion
+        is that of a slow DVL as it is: smoothed, it lacks what a filter would take off."""
         stream, injections = self.recordings[recording], hypothesis.injections(recording)
         time = self.grids[recording].true_time(injections) if at is None else at
         dvl, reference, attitude = (
@@ -372,6 +412,9 @@ class Problem:
         if stream.frame is not VelocityFrame.BODY and rotation is not None:
             g = np.einsum("nji,nj->ni", rotation, g)
         raw, smooth = _measured(stream.dvl, dvl, by_dvl)
+        moving = stream.dvl.smooth
+        if as_it_is and stream.dvl.interval > FAST_ENOUGH_S:
+            moving, smooth = stream.dvl, raw
         lever = np.zeros(3) if rates is None or not self.lever_arm.any() else cross(rates, self.lever_arm)
         nominal = self.rotation_dvl_from_body
         turn: Array = np.zeros(3)
@@ -385,13 +428,23 @@ class Problem:
         at_dvl, of_dvl = _undone(injections, measured, ActsOn.DVL, matrix @ nominal)
         motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
         motion, of_motion = _undone(injections, motion, ActsOn.MOTION, None)
-        error = _turned(matrix, raw) - of_dvl - of_motion - lever - g - traces(injections, motion, ActsOn.REFERENCE)
-        for lag, values in hypothesis.lags(recording):
-            error = error - lag.of_before(motion, error, values)
+        error = _turned(matrix, raw) - of_dvl - of_motion - lever - g
         projection = self._kept_projection(stream, rotation, attitude)
         angles = hypothesis.phi + turn
-        change = partial(_change, stream.dvl, dvl)
-        return Seen(motion, at_dvl, smooth, error, angles, matrix, dvl, reference, projection, change)
+        change = partial(_change, moving, dvl)
+        closely = partial(self._close, hypothesis, recording, time)
+        found = Seen(motion, at_dvl, smooth, error, angles, matrix, dvl, reference, projection, change, closely)
+        error -= found.on_reference(injections)  # in place: what it is seen as close by is kept
+        for lag, values in hypothesis.lags(recording):
+            error -= lag.of_before(motion, error, values)
+        return found
+
+    def _close(self, hypothesis: Hypothesis, recording: int, time: Array) -> tuple[Seen, NDArray[np.intp]] | None:
+        """For `Seen.close`; None where the times are close."""
+        between = self.grids[recording].between(time)
+        return (
+            None if between is None else (self.seen(hypothesis.without_memory, recording, between[0], True), between[1])
+        )
 
     def _kept_projection(self, stream: RecordedStreams, rotation: Array | None, at: Array) -> Array:
         """`projection` at times (F,) s of the attitude, of which the last few are kept."""
@@ -455,13 +508,14 @@ class Problem:
             # of one mounting they are linear in the velocity, and so in its mean over each bin
             lags = hypothesis.lags(recording)
             is_linear = each.body_from_measured.ndim == 2 and all(self.measured) and not lags
-            measured = grid.averaged(each.measured) if is_linear else each.measured
+            close, own = each.close if lags else (each, slice(None))
+            measured = grid.averaged(each.measured) if is_linear else close.measured
             columns = np.empty((len(measured), 3, 6))
-            by_turn = _by_turn(hypothesis, each, measured)
+            by_turn = _by_turn(hypothesis, close, measured)
             columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
             unscaled = measured / (1.0 + hypothesis.scale)
-            np.multiply(-unscaled[:, None, :], each.body_from_measured, out=columns[:, :, 3:])
-            lagging = columns if is_linear else _begun(lags, each, _lagging(lags, each, columns))
+            np.multiply(-unscaled[:, None, :], close.body_from_measured, out=columns[:, :, 3:])
+            lagging = columns if is_linear else _begun(lags, each, _lagging(lags, close, columns)[own])
             parts.append(lagging if is_linear else self._in_bins(grid, lagging, each))
         return np.concatenate(parts)
 
@@ -469,11 +523,11 @@ class Problem:
         """(M, A, p) d e / d parameters of an effect about values, per recording; of the day: by recording."""
         per_recording = []
         for recording, each in enumerate(seen):
-            body = self._derivatives(hypothesis, each, effect, values[recording])
             lags = hypothesis.lags(recording)
-            if effect.acts_on is not ActsOn.REFERENCE:
-                body = _lagging(lags, each, body)
-            per_recording.append(_begun(lags, each, body))
+            of_motion = lags if effect.acts_on is not ActsOn.REFERENCE else []
+            close, own = each.close if of_motion or effect.has_memory else (each, slice(None))
+            body = self._derivatives(hypothesis, close, effect, values[recording])
+            per_recording.append(_begun(lags, each, _lagging(of_motion, close, body)[own]))
         joined = self.binned(per_recording, seen)
         if not effect.of_the_day or len(seen) == 1:
             return joined
@@ -563,9 +617,9 @@ def _measured(curve: Curve, at: Array, at_samples: bool) -> tuple[Array, Array]:
 
 
 def _change(curve: Curve, at: Array) -> Array:
-    """(F, 3) m/s² of the smoothed velocity."""
+    """(F, 3) m/s² of a velocity."""
     clipped = np.clip(at, curve.time[0], curve.time[-1])
-    return np.asarray(curve.kept.at("change", at, lambda: curve.smooth.derivative(clipped)))
+    return np.asarray(curve.kept.at("change", at, lambda: curve.derivative(clipped)))
 
 
 def _undone(

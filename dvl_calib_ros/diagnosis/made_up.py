@@ -17,7 +17,7 @@ from scipy.interpolate import Akima1DInterpolator
 from ..calibration.frames import Array
 from ..calibration.samples import VelocityFrame
 from ..effects.base import ActsOn
-from ..effects.composition import late, traces
+from ..effects.composition import late
 from .composed import Hypothesis, Problem, Seen
 from .curve import FAST_ENOUGH_S, Curve
 from .fitting import Fit
@@ -99,8 +99,9 @@ def _reference(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     time = recording.reference.time
     for _ in range(_PASSES):
         time = recording.reference.time - late(injections, ActsOn.REFERENCE_CLOCK, time)
-    motion = problem.seen(hypothesis, index, time).motion
-    velocity: Array = motion.velocity_body - traces(injections, motion, ActsOn.REFERENCE)
+    seen = problem.seen(hypothesis, index, time)
+    motion = seen.motion
+    velocity: Array = motion.velocity_body - seen.on_reference(injections)
     if recording.frame is not VelocityFrame.BODY and motion.rotation_enu_from_body is not None:
         velocity = np.einsum("nij,nj->ni", motion.rotation_enu_from_body, velocity)
     return velocity

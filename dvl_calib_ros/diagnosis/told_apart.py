@@ -18,6 +18,7 @@ from .clock_or_arm import (
     OpenArm,
     is_open,
     moved_arm,
+    moved_lag,
     opened_arm,
     with_arm,
     with_clocks,
@@ -81,7 +82,7 @@ def tell_apart(
             _or_else(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
         ]
-    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, {})
+    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
     return ToldApart(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)

@@ -1,0 +1,120 @@
+"""A reference that lags is followed between the samples of slow streams, where a vehicle goes on moving."""
+
+from __future__ import annotations
+
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dvl_calib_ros.diagnosis.clock_or_arm import moved_lag, with_moved
+from dvl_calib_ros.diagnosis.composed import Offsets, Problem, make_problem, no_effect
+from dvl_calib_ros.diagnosis.fitting import Fit
+from dvl_calib_ros.diagnosis.made_up import _reference
+from dvl_calib_ros.diagnosis.recordings import make_recording
+from dvl_calib_ros.effects.registry import EFFECTS
+
+LAG, LAGS_S = EFFECTS["reference_lag"], 1.2
+LAGGING = no_effect().with_effects([LAG], 1, {LAG.name: ({"time_constant_s": LAGS_S},)})
+# Rad/s and complex amplitudes, m/s, of east, north and up: a vehicle under way in waves of 5 s
+MOVES = ((0.05, (1.2, -1.0j, 0.0)), (0.31, (0.3j, 0.2, 0.05)), (2.0 * np.pi / 5.0, (0.1, 0.08j, 0.1)))
+
+
+def _velocity(at: np.ndarray, lags_s: float = 0.0) -> np.ndarray:
+    """(N, 3) m/s, east, north, up; through a low-pass that has been there for ever."""
+    found = np.zeros((len(at), 3))
+    for rate, amplitudes in MOVES:
+        turning = np.exp(1j * rate * at) / (1.0 + 1j * rate * lags_s)
+        found += np.real(np.outer(turning, amplitudes))
+    return found
+
+
+def _problem(dvl_hz: float, lost: slice = slice(0, 0)) -> Problem:
+    seconds, at = np.arange(0.0, 200.0, 1.0 / dvl_hz), np.arange(0.4, 199.0)
+    at = np.delete(at, lost)
+
+    def attitude(time: np.ndarray) -> Rotation:
+        euler = [0.05 * time + 0.3 * np.sin(0.2 * time), 0.05 * np.sin(0.9 * time), 0.05 * np.cos(0.8 * time)]
+        return Rotation.from_euler("ZYX", np.column_stack(euler))
+
+    often = np.arange(0.0, 200.0, 0.2)
+    return make_problem(
+        [
+            make_recording(
+                "run",
+                (seconds, attitude(seconds).apply(_velocity(seconds), inverse=True)),
+                (at, _velocity(at, LAGS_S)),
+                attitude=(often, attitude(often).as_quat()),
+            )
+        ],
+        np.eye(3),
+        np.zeros(3),
+        [Offsets()],
+    )
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values[10:-5] ** 2)))  # the filter begins with the first sample
+
+
+@pytest.mark.parametrize(("dvl_hz", "share"), [(1.0, 0.05), (5.0, 0.01)])
+def test_what_a_lag_takes_off_is_told_between_slow_samples(dvl_hz, share):
+    """By slopes at 1 Hz it was a quarter too small in waves of 5 s: a delay explained more, and stood for the lag."""
+    problem = _problem(dvl_hz)
+    added = _rms(problem.residual(problem.all_seen(no_effect())))
+    assert added > 0.05
+    assert _rms(problem.residual(problem.all_seen(LAGGING))) < share * added
+
+
+@pytest.mark.parametrize("name", ["reference_lag", "dvl_time_offset", "quadratic_scale"])
+@pytest.mark.parametrize("dvl_hz", [1.0, 5.0])
+def test_derivatives_are_those_of_what_is_followed_between_samples(dvl_hz, name):
+    problem, effect = _problem(dvl_hz), EFFECTS[name]
+    about = LAGGING.with_effects(list({LAG.name: LAG, name: effect}.values()), 1, {})
+    columns = np.concatenate(
+        [
+            problem.calibration_columns(about, problem.all_seen(about)),
+            *(problem.columns(about, problem.all_seen(about), each, about.values[each.name]) for each in about.effects),
+        ],
+        axis=2,
+    )
+    for number in range(columns.shape[2]):
+        step = np.zeros(columns.shape[2])
+        step[number] = 0.01
+        ends = [problem.residual(problem.all_seen(about.moved(sign * step))) for sign in (-1.0, 1.0)]
+        expected = (ends[1] - ends[0]) / 0.02
+        assert _rms(columns[:, :, number] - expected) < 0.1 * _rms(expected), number
+
+
+def test_over_a_gap_nothing_is_told_of_what_was_between():
+    problem = _problem(5.0, lost=slice(80, 100))
+    time = problem.grids[0].true_time([])
+    between, own = problem.grids[0].between(time)
+    np.testing.assert_allclose(between[own], time)
+    gap = int(np.argmax(np.diff(time)))
+    assert own[gap + 1] == own[gap] + 1
+    assert np.sort(np.diff(between))[-2] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("worse", "std"), [(5.0, 0.31), (7.0, 0.1)])
+def test_a_lag_beside_free_clocks_may_be_what_it_is_without_them(worse, std):
+    """With DVL and reference early by 0.3 s it was 0.52 s, to 0.1 of them; without, which fits as well, 0.81."""
+    clock = EFFECTS["dvl_time_offset"]
+    lags = [({"time_constant_s": seconds},) for seconds in (0.81, 0.52)]
+    alone = no_effect().with_effects([LAG], 1, {LAG.name: lags[0]})
+    both = no_effect().with_effects([clock, LAG], 1, {clock.name: ({"seconds": -0.3},), LAG.name: lags[1]})
+    fit, joint = (
+        Mock(spec=Fit, hypothesis=each, values=each.values, deviance=deviance)
+        for each, deviance in ((alone, 100.0 + worse), (both, 100.0))
+    )
+    found = with_moved(joint, 0.1**2 * np.eye(8), moved_lag(fit, joint))
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [*[0.1] * 7, std], atol=0.005)
+    assert not moved_lag(Mock(spec=Fit, values={}), joint)
+
+
+def test_made_up_recordings_lag_as_the_fit_does():
+    problem = _problem(5.0)
+    (recording,) = problem.recordings
+    made = _reference(problem, LAGGING, 0)
+    assert _rms(made - recording.reference.values) < 0.01 * _rms(recording.reference.values)
