@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache, partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from .fitting import Fit, Fitter
 from .leaps import LEAP
 from .settings import SETTINGS
 from .twice import TAKEN_BACK, TAKEN_BACK_EXACTLY, apart_and_undone, either_alone, is_taken_back
-from .unexplained import matters, unexplained
+from .unexplained import Unexplained, matters, unexplained
 
 # A clock that explains less than this share of what two leaps do, and makes them cancel, is not late before them
 LITTLE_OF_LEAPS = 0.02
@@ -27,6 +28,7 @@ def only_called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
         explained = base.deviance - fit.deviance
         rests = [(effect, fit_without(fitter, fit, effect)) for effect in fit.effects]
         drops = {effect.name: rest.deviance - fit.deviance for effect, rest in rests}
+        left = cache(partial(unexplained, fitter, fit))
         weak = [
             rest
             for effect, rest in rests
@@ -36,7 +38,7 @@ def only_called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             or (
                 _is_ghost(effect, drops[effect.name], explained, fit.deviance)
                 and not _is_late_before_a_leap(fit, effect)
-                and not _is_all_that_is_left(fitter, fit, rest)
+                and not _is_all_that_is_left(fitter, rest, left)
             )
         ]
         if not weak:
@@ -62,12 +64,12 @@ def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> boo
     return not effect.bends_arm or drop < SETTINGS.ghost_of_noise * left
 
 
-def _is_all_that_is_left(fitter: Fitter, fit: Fit, rest: Fit) -> bool:
-    """Whether a fit without one of its effects (rest) leaves what matters, and with it nothing.
+def _is_all_that_is_left(fitter: Fitter, rest: Fit, left: Callable[[], Unexplained]) -> bool:
+    """Whether a fit without one of its effects (rest) leaves what matters, and with it nothing. left: then.
 
     What an inexact strong effect leaves has the shape of no other: one takes in a part of it at most.
     """
-    return matters(fitter.problem, rest, unexplained(fitter, rest)) and not unexplained(fitter, fit).found
+    return matters(fitter.problem, rest, unexplained(fitter, rest)) and not left().found
 
 
 def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:

@@ -103,9 +103,14 @@ def blocks_of(problem: Problem) -> NDArray[np.intp]:
     return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)
 
 
+def step_of_times(problem: Problem) -> float:
+    """Seconds between the times of the run that are tried: what is nearer happens at once."""
+    return max(recording.seconds for recording in problem.recordings) / WINDOW_STEPS
+
+
 def finer_steps(problem: Problem) -> list[float]:
     """Steps (s) by which times of the run are refined: half of those tried, down to the time between samples."""
-    seconds = max(recording.seconds for recording in problem.recordings) / WINDOW_STEPS
+    seconds = step_of_times(problem)
     steps: list[float] = []
     while seconds > 0.5 * problem.interval and len(steps) < 8:
         seconds /= 2.0

@@ -17,7 +17,7 @@ from ..effects.base import ActsOn, Effect
 from ..effects.composition import late
 from .clock_or_arm import ARM, CLOCKS, DVL_CLOCK, LAG, LAG_OR_DELAY, lags_and_delays
 from .composed import Hypothesis, Values
-from .criteria import WINDOW_STEPS
+from .criteria import step_of_times
 from .fitting import OF_A_TIME, Fit, Fitter
 from .settings import SETTINGS
 
@@ -120,7 +120,7 @@ def in_gaps(fitter: Fitter, fit: Fit) -> Fit:
         for at, gap in gaps(fitter, fit):
             (values,) = fit.values[LEAP]
             other = values.get("at_s" if at_s == "again_at_s" else "again_at_s", np.inf)
-            is_of_other = abs(other - at) < fitter.problem.recordings[0].seconds / WINDOW_STEPS
+            is_of_other = abs(other - at) < step_of_times(fitter.problem)
             if is_of_other or not _is_as_large(values[seconds], gap):
                 continue
             tried = replace(fit.hypothesis, values={**fit.values, LEAP: ({**values, at_s: at},)})

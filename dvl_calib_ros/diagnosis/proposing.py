@@ -17,7 +17,7 @@ from ..calibration.frames import Array
 from ..effects.base import Effect
 from .clock_or_arm import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
 from .composed import Hypothesis, Values, amplitudes, is_time_of_run, no_effect
-from .criteria import WINDOW_STEPS, price, windows
+from .criteria import price, step_of_times, windows
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, prior_std
 from .leaps import LEAP
 from .least_squares import WhitenedLeastSquares
@@ -299,8 +299,8 @@ def _told_by_a_lag(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
 
 
 def leaps_at_the_beginning(fitter: Fitter, fit: Fit) -> bool:
-    """Whether there is one leap, and in each recording before the first of the times that are tried for it."""
+    """Whether there is one leap, and before the first of the times that are tried for it."""
     leaps = fit.values.get(LEAP, ())
-    first = [recording.seconds / WINDOW_STEPS for recording in fitter.problem.recordings]
+    first = step_of_times(fitter.problem)
     twice = any(np.isfinite(leap.get("again_at_s", np.inf)) for leap in leaps)
-    return bool(leaps) and not twice and all(leap["at_s"] < at for leap, at in zip(leaps, first, strict=True))
+    return bool(leaps) and not twice and all(leap["at_s"] < first for leap in leaps)

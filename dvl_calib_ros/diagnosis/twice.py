@@ -8,7 +8,7 @@ import numpy as np
 
 from ..effects.base import Effect
 from .composed import Hypothesis, is_time_of_run
-from .criteria import WINDOW_STEPS, best_of, price, times_tried
+from .criteria import WINDOW_STEPS, best_of, price, step_of_times, times_tried
 from .fitting import Fit, Fitter
 from .leaps import LEAP, gaps
 from .proposing import KEPT_VARIANTS
@@ -106,7 +106,7 @@ def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | 
     it) explains less. That is asked of what explains more than such causes do unseen only if it is undone exactly.
     """
     apart, share = apart_and_undone(fit, name)
-    at_once = apart < max(recording.seconds for recording in fitter.problem.recordings) / WINDOW_STEPS
+    at_once = apart < step_of_times(fitter.problem)
     if at_once or share >= TAKEN_BACK or drop < MUCH:
         return at_once or share < TAKEN_BACK
     if rest is None or (drop > SETTINGS.instead_of and share >= TAKEN_BACK_EXACTLY):
