@@ -63,8 +63,12 @@ def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
         columns, parameters = fit.columns[:, :, 6:], fit.hypothesis.parameters()
         values = fit.hypothesis.vector()[6:] - np.array([each.spec.default for each in parameters])
         without = fit.residual - columns @ values
-        told = told_elsewhere(selection.fitter.problem, fit.noise, fit.columns[:, :, :6], columns, without)
+        told = told_elsewhere(
+            selection.fitter.problem, fit.noise, fit.hypothesis, fit.columns[:, :, :6], columns, without
+        )
         if told < BORNE_OUT * (explained - len(values)):
             return False
     p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
-    return gap.interval[0] > 0.0 if p > WEAK else gap.after < gap.before
+    if gap.interval[0] <= 0.0:  # whatever its p, it does not hold elsewhere
+        return False
+    return gap.interval[0] > 0.0 if p > WEAK else gap.after < gap.before  # where there is no interval

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..calibration.distributions import chi2_isf, chi2_logsf
 from ..calibration.frames import Array
 from ..verdict.reasons import Reason, finding
-from .composed import Problem, Seen
+from .composed import Hypothesis, Problem, Seen
 from .dictionary import ALTERNATIVES, dictionary
 from .fitting import Fit, Fitter, prior_std
 from .folds import stretch_of
@@ -29,8 +29,6 @@ from .settings import SETTINGS
 LEVEL = 0.001
 # Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has
 SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
-# Standard deviation, m/s, of what nothing is known of
-WIDE = 10.0
 # Standard deviations that were taken off an outlier
 OUTLYING = 5.0
 # Made-up recordings that tell what is chance, and degrees of freedom of the belief that this is as it should be
@@ -138,6 +136,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
         beside = (known, _with_rows_of_prior(beside[1], white), white)
     clear_energy = explained(*beside, 1.0)[1]
     clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
+    energy = max(energy, clear_energy - best[2].shape[2])  # a period is of no group
     cost = _price(tested, best[2].shape[2])
     found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
@@ -275,7 +274,7 @@ def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     noise = fit.noise
     if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
         noise = _coloured_anew(fit, fit.columns, rest.clearest, fit.residual).noise
-    return told_elsewhere(problem, noise, fit.columns, rest.clearest, fit.residual)
+    return told_elsewhere(problem, noise, fit.hypothesis, fit.columns, rest.clearest, fit.residual)
 
 
 def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
@@ -301,27 +300,31 @@ def _likely(raw: Array, residual: Array) -> float:
     return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
 
 
-def told_elsewhere(problem: Problem, noise: Noise, known: Array, raw: Array, residual: Array) -> float:
-    """Whitened squares of a residual (M, A) that columns raw (M, A, c), beside known ones, explain on stretches of time
-    that they were not fitted to.
+def told_elsewhere(
+    problem: Problem, noise: Noise, hypothesis: Hypothesis, known: Array, raw: Array, residual: Array
+) -> float:
+    """Whitened squares of a residual (M, A) of a hypothesis that columns raw (M, A, c), beside known ones (M, A, k),
+    which are the first of its own, explain on stretches of time that they were not fitted to.
 
     One of many regressors may have a small p-value by chance or for an interpolation that is bent in sharp corners;
-    what is there tells of itself elsewhere.
+    what is there tells of itself elsewhere. Known ones have the prior of the hypothesis, without which the scale of a
+    heave that is hardly there would take in what is left.
     """
-    fold = stretch_of(problem.time) % SETTINGS.folds
-    sizes = [np.maximum(np.sqrt((each**2).mean(axis=(0, 1))), 1e-12) for each in (known, raw)]
-    white = noise.whiten(np.concatenate([known / sizes[0], raw / sizes[1]], axis=2))
+    fold, k = stretch_of(problem.time) % SETTINGS.folds, known.shape[2]
+    size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
+    white = noise.whiten(np.concatenate([known, raw / size], axis=2))
     series = noise.whiten(residual)
     # all together are no larger than the residual: else stretches without a turn would be told of any size
-    std = np.concatenate([np.full(known.shape[2], WIDE), np.full(raw.shape[2], _likely(raw, residual))])
+    std = np.concatenate([prior_std(hypothesis)[:k], np.full(raw.shape[2], _likely(raw, residual))])
+    centre = np.concatenate([hypothesis.vector()[:k], np.zeros(raw.shape[2])])
     rows = np.repeat(fold, residual.shape[1])
     gain = 0.0
     for held in np.unique(fold):
         train, test = rows != held, rows == held
-        solution = _solved(white[train], series[train], std)
-        base = _solved(white[train][:, : known.shape[2]], series[train], std[: known.shape[2]])
-        left = series[test] - white[test][:, : known.shape[2]] @ base
-        gain += float(left @ left - np.sum((series[test] - white[test] @ solution) ** 2))
+        system = WhitenedLeastSquares.of(white[train], series[train], std, centre)
+        base = system.part(np.arange(k)).solution()
+        left = series[test] - white[test][:, :k] @ base
+        gain += float(left @ left - np.sum((series[test] - white[test] @ system.solution()) ** 2))
     return gain
 
 

@@ -1,8 +1,9 @@
-"""What is not looked at twice, or not at all, changes no answer."""
+"""What is left is what it is also elsewhere; what is not looked at twice, or not at all, changes no answer."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from dvl_calib_ros.diagnosis import unexplained as looking
 from dvl_calib_ros.diagnosis.composed import Offsets, _by_turn, make_problem, no_effect
 from dvl_calib_ros.diagnosis.fitting import NEARBY, SURELY, Fitter
 from dvl_calib_ros.diagnosis.noise import white_noise
-from dvl_calib_ros.diagnosis.unexplained import unexplained
+from dvl_calib_ros.diagnosis.standing import is_borne_out
+from dvl_calib_ros.diagnosis.unexplained import holds_out, matters, unexplained
 from dvl_calib_ros.simulation.scenario import simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
@@ -21,7 +23,11 @@ from dvl_calib_ros.simulation.sensors import DvlErrors
 def stepped():
     """Fitter and fit, without any effect, of a run in which a bias steps by 3 cm/s."""
     run = simulate(scenario("lawnmower", seconds=300.0, gnss_std=0.03))
-    recording = with_added(run, lambda time, _: 0.03 * np.outer(time > 200.0, [0.0, 1.0, 0.0]))
+    return without_effects(with_added(run, lambda time, _: 0.03 * np.outer(time > 200.0, [0.0, 1.0, 0.0])))
+
+
+def without_effects(recording):
+    """Fitter and fit without any effect, under white noise."""
     problem = make_problem([recording], np.eye(3), np.zeros(3), [Offsets()])
     fitter = Fitter(problem)
     noise = white_noise(fitter.evaluated(no_effect())[1], problem.segments, None, problem.interval)
@@ -92,3 +98,38 @@ def test_lines_are_looked_for_in_what_a_fit_leaves(stepped, monkeypatch):
     unexplained(fitter, off)
     white = fit.noise.whiten(off.residual).reshape(off.residual.shape)
     np.testing.assert_allclose(seen[0] / np.sqrt(np.mean(seen[0] ** 2)), white / np.sqrt(np.mean(white**2)))
+
+
+def with_a_wave(seconds, velocity):
+    """Ten minutes at the surface in which a wave (3,) m/s of so many seconds is on the DVL alone."""
+    run = simulate(scenario("lawnmower", seconds=600.0, gnss_std=0.03, errors=DvlErrors(beam_std=0.02)))
+    added = with_added(run, lambda time, _: np.outer(np.sin(2.0 * np.pi * time / seconds), velocity))
+    return without_effects(added)
+
+
+def test_what_is_left_of_a_heave_that_is_hardly_there_is_there_elsewhere_as_well():
+    """A scale of the heave, free to be anything, took it in wherever it was fitted to: -19 were told, and no gap."""
+    fitter, fit = with_a_wave(118.0, (0.0, 0.0, 0.01))
+    rest = unexplained(fitter, fit)
+    assert rest.about == pytest.approx(118.0, rel=0.05)
+    assert holds_out(fitter.problem, fit, rest) > 0.8 * rest.energy
+    assert matters(fitter.problem, fit, rest)
+
+
+def test_a_period_that_no_function_of_time_follows_has_the_energy_of_its_own_wave():
+    """Of no group it counted for nothing: with 56 in units of the noise it was too little to matter."""
+    fitter, fit = with_a_wave(18.0, (0.0, 0.008, 0.0))
+    rest = unexplained(fitter, fit)
+    assert rest.about == pytest.approx(18.0, rel=0.05)
+    assert 0.8 * rest.clear_energy < rest.energy < rest.clear_energy
+    assert matters(fitter.problem, fit, rest)
+
+
+@pytest.mark.parametrize(("low", "stands"), [(-0.7, False), (0.1, True)])
+def test_what_may_make_it_worse_where_it_was_not_fitted_to_does_not_stand_however_sure(low, stands):
+    """A bias and a current of 12 s stood for a hysteresis, and closed 36 % of the gap, -72 to 100 %."""
+    selected = [SimpleNamespace(log_p=-200.0)]
+    fits = [SimpleNamespace(deviance=deviance) for deviance in (900.0, 300.0)]
+    selection = SimpleNamespace(base=fits[0], fit=fits[1], selected=selected)
+    gap = SimpleNamespace(before=0.049, after=0.048, interval=(low, 1.0))
+    assert is_borne_out(selection, gap, 20) is stands
