@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Set
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from ..effects.base import Effect
 from .closure import Gap
 from .criteria import price
+from .fitting import Fit, Fitter
 from .selection import EffectSelection
 from .settings import SETTINGS
 from .unexplained import Unexplained, matters, told_elsewhere, unexplained
@@ -19,6 +21,8 @@ WEAK = 1e-3
 # Deviance that all effects together explain, up to which they must explain this share of it on stretches that they were
 # not fitted to as well: pairs that cancel but for noise do not, of real ones nine in ten do with a signal-to-noise of 5
 FAINT, BORNE_OUT = 200.0, 0.25
+# Share of what effects explain that an unknown cause must explain beyond its price to tell more elsewhere
+TOLD_FROM = 0.5
 # Deviance by which a bound on another may be off as numbers are rounded
 ROUNDING = 1e-3
 
@@ -27,6 +31,8 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
     """A selection without what an unknown cause explains better, and what it then leaves.
 
     Of effects that nobody would see without a test: a step in a bias looks like a drift, but for what that leaves.
+    Better is what explains more for its price, or on stretches of the run that it was not fitted to: several effects
+    together have shapes enough for a stall in turns, where they are fitted.
     """
     fitter, fit = selection.fitter, selection.fit
     rest = unexplained(fitter, fit)
@@ -40,14 +46,27 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
             continue
         lost = drop - sum(price(effect, n_tested, len(fit.seen)) for effect in out)
         wanted = SETTINGS.indistinguishable + SETTINGS.instead_share * drop
-        other = unexplained(fitter, reduced, asked=wanted + lost - ROUNDING)
-        gain = (other.clear_energy - other.price) - lost
-        if not other.found or gain < wanted or not matters(fitter.problem, reduced, other):
+        other = unexplained(fitter, reduced, asked=min(wanted + lost, TOLD_FROM * drop) - ROUNDING)
+        if not other.found:
+            continue
+        gain = max((other.clear_energy - other.price) - lost, _told_more_elsewhere(fitter, fit, reduced, names, other))
+        if gain < wanted or not matters(fitter.problem, reduced, other):
             continue
         if best is None or gain > best[0]:
             chosen = tuple(each for each in selection.selected if each.effect.name not in names)
             best = gain, replace(selection, selected=chosen, fit=reduced), other
     return (selection, rest) if best is None else (best[1], best[2])
+
+
+def _told_more_elsewhere(fitter: Fitter, fit: Fit, reduced: Fit, names: Set[str], other: Unexplained) -> float:
+    """By how much more deviance an unknown cause explains than effects of a fit, by name, on stretches that neither was
+    fitted to. reduced: the fit without these."""
+    own = [parameter.effect.name in names for parameter in fit.hypothesis.parameters()]
+    unknown, effects = (
+        told_elsewhere(fitter.problem, fit.noise, reduced.hypothesis, reduced.columns, columns, reduced.residual)
+        for columns in (other.clearest, fit.columns[:, :, 6:][:, :, own])
+    )
+    return unknown - effects
 
 
 def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
