@@ -113,7 +113,7 @@ def diagnose_recordings(
     verdict = _verdict(selection, rest, gap, len(visible) / len(testable))
     covariance, times = covariance_of(selection)
     if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # whose part in the sizes nobody knows
-        moved = moved_by(selection.fit, rest)
+        moved = moved_by(selection.fitter.problem, selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
     covariance = with_shown(selection.fitter.problem, selection.fit, covariance)
     unmoved, covariance = covariance, with_open(selection.fit, covariance, selection.opened)

@@ -14,7 +14,7 @@ from .criteria import price
 from .fitting import Fit, Fitter
 from .selection import EffectSelection
 from .settings import SETTINGS
-from .unexplained import Unexplained, matters, told_elsewhere, unexplained
+from .unexplained import FittedBeside, Unexplained, matters, told_elsewhere, unexplained
 
 # p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
 WEAK = 1e-3
@@ -62,8 +62,9 @@ def _told_more_elsewhere(fitter: Fitter, fit: Fit, reduced: Fit, names: Set[str]
     """By how much more deviance an unknown cause explains than effects of a fit, by name, on stretches that neither was
     fitted to. reduced: the fit without these."""
     own = [parameter.effect.name in names for parameter in fit.hypothesis.parameters()]
+    known = FittedBeside.of(fitter.problem, reduced.hypothesis, reduced.seen, reduced.columns)
     unknown, effects = (
-        told_elsewhere(fitter.problem, fit.noise, reduced.hypothesis, reduced.columns, columns, reduced.residual)
+        told_elsewhere(fitter.problem, fit.noise, known, columns, reduced.residual)
         for columns in (other.clearest, fit.columns[:, :, 6:][:, :, own])
     )
     return unknown - effects
@@ -82,9 +83,9 @@ def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
         columns, parameters = fit.columns[:, :, 6:], fit.hypothesis.parameters()
         values = fit.hypothesis.vector()[6:] - np.array([each.spec.default for each in parameters])
         without = fit.residual - columns @ values
-        told = told_elsewhere(
-            selection.fitter.problem, fit.noise, fit.hypothesis, fit.columns[:, :, :6], columns, without
-        )
+        problem = selection.fitter.problem
+        known = FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns[:, :, :6])
+        told = told_elsewhere(problem, fit.noise, known, columns, without)
         if told < BORNE_OUT * (explained - len(values)):
             return False
     p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))

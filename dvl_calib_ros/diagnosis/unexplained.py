@@ -70,6 +70,24 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
+class FittedBeside(NamedTuple):
+    """What is fitted beside what is looked for. columns: (M, A, k) d residual / d parameters. std, centre: (k,), of the
+    prior of what they explain of a fit's residual.
+    """
+
+    columns: Array
+    std: Array
+    centre: Array
+
+    @staticmethod
+    def of(problem: Problem, hypothesis: Hypothesis, seen: Sequence[Seen], columns: Array) -> FittedBeside:
+        """Columns (M, A, k) of the first k parameters of a hypothesis, and those of what is not shown (u more)."""
+        unshown, sizes = problem.unshown_columns(hypothesis, seen)
+        k, none = columns.shape[2], np.zeros(len(sizes))
+        std, centre = np.append(prior_std(hypothesis)[:k], sizes), np.append(hypothesis.vector()[:k], none)
+        return FittedBeside(np.concatenate([columns, unshown], axis=2), std, centre)
+
+
 def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
     """Look for what the residual of a fit still follows.
 
@@ -77,29 +95,30 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     to be clearer than its price to be of use; where that cannot be, nothing is found, and at once.
     """
     problem, noise = fitter.problem, fit.noise
-    looks, white, raw, known = _looked(fitter, fit, problem, fit.seen, fit.residual)
+    looks, white, raw, basis = _looked(fitter, fit, problem, fit.seen, fit.residual)
     nothing = raw["time"][:, :, :0]
     # Noise in the columns keeps a fit from standing where the residual is at right angles to them. Put there, it would
     # follow the vehicle's speed, and have its periods
     left = noise.whiten(fit.residual)
-    left = left / np.sqrt(float(left @ left) / (left.size - known.shape[1]))
+    left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
     tested = len(looks) + len(followed) + noise.is_coloured * (len(raw) - 1)
     if asked > -np.inf:
         most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
         for line in followed:
             waves = _along_axes(line.waves, problem.axes)
-            energy = explained(known[: left.size, :0], noise.whiten(waves), left, 1.0)[1]
+            energy = explained(basis[: left.size, :0], noise.whiten(waves), left, 1.0)[1]
             most.append((energy + waves.shape[2], waves.shape[2]))
         prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
         if max(each - prices[columns] for each, columns in most) < asked:
             return Unexplained(0.0, 0.0, "", nothing, nothing)
     recoloured: list[FollowTest] = []
     if noise.is_coloured:  # what changes with time alone may as well be noise
-        alone = _coloured_anew(fit, fit.columns, nothing, fit.residual)
+        beside = FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
+        alone = _coloured_anew(noise, beside, nothing, fit.residual)
         for name, columns in raw.items():
             if name != "time":
-                drop, rank = alone.lowered_by(_coloured_anew(fit, fit.columns, columns, fit.residual))
+                drop, rank = alone.lowered_by(_coloured_anew(noise, beside, columns, fit.residual))
                 recoloured.append(FollowTest(name, np.arange(columns.shape[2]), True, drop, rank))
     looked_at = float(np.log(tested))
     nominal = [
@@ -131,10 +150,11 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
-    beside = (known[: left.size, :0], noise.whiten(best[2]), left)
+    clearest = noise.whiten(best[2])
+    held_against = (basis[: left.size, :0], clearest, left)
     if not isinstance(best[1], float):
-        beside = (known, _with_rows_of_prior(beside[1], white), white)
-    clear_energy = explained(*beside, 1.0)[1]
+        held_against = (basis, _with_rows_of_prior(clearest, white), white)
+    clear_energy = explained(*held_against, 1.0)[1]
     clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
     energy = max(energy, clear_energy - best[2].shape[2])  # a period is of no group
     cost = _price(tested, best[2].shape[2])
@@ -181,11 +201,12 @@ def _looked(
     the fit's columns, with the rows of its prior; the columns of every group; and the basis of the fit's.
     """
     noise = fit.noise
-    known = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
-    unshown, sizes = problem.unshown_columns(fit.hypothesis, seen)
-    q, white = _beside_prior(fit, noise.whiten(np.concatenate([known, unshown], axis=2)), noise.whiten(residual), sizes)
+    own = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
+    known = FittedBeside.of(problem, fit.hypothesis, seen, own)
+    q, white = _beside_prior(known, noise.whiten(known.columns), noise.whiten(residual))
     white = white - q @ (q.T @ white)
-    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + len(sizes)))
+    unshown = known.columns.shape[2] - own.shape[2]
+    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unshown))
     looks: list[FollowTest] = []
     raw: dict[str, Array] = {}
     sound = ~_upset(fitter, noise)[:, None]
@@ -197,15 +218,14 @@ def _looked(
     return looks, white, raw, q
 
 
-def _beside_prior(fit: Fit, known: Array, white: Array, sizes: Array) -> tuple[Array, Array]:
-    """Orthonormal basis of whitened columns (M A, 6 + p + u), and a whitened series (M A,), each with the rows of the
-    prior below, the fit's and that of sizes (u,): 6 + p + u more.
+def _beside_prior(known: FittedBeside, columns: Array, white: Array) -> tuple[Array, Array]:
+    """Orthonormal basis of the columns (M A, k) of what is known, whitened, and a whitened series (M A,), each with the
+    rows of the prior below: k more.
 
     Without it the scale of a sway that is hardly there, which is noise, would explain that noise.
     """
-    own = prior_std(fit.hypothesis)
-    basis = _orthonormal(np.concatenate([known, np.diag(1.0 / np.append(own, sizes))]))
-    return basis, np.concatenate([white, fit.hypothesis.vector() / own, np.zeros(len(sizes))])
+    basis = _orthonormal(np.concatenate([columns, np.diag(1.0 / known.std)]))
+    return basis, np.concatenate([white, known.centre / known.std])
 
 
 def _with_rows_of_prior(columns: Array, white: Array) -> Array:
@@ -271,10 +291,10 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
 
 def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     """Deviance that what the rest follows most clearly explains where it was not fitted to (`told_elsewhere`)."""
-    noise = fit.noise
+    noise, known = fit.noise, FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
     if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
-        noise = _coloured_anew(fit, fit.columns, rest.clearest, fit.residual).noise
-    return told_elsewhere(problem, noise, fit.hypothesis, fit.columns, rest.clearest, fit.residual)
+        noise = _coloured_anew(noise, known, rest.clearest, fit.residual).noise
+    return told_elsewhere(problem, noise, known, rest.clearest, fit.residual)
 
 
 def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
@@ -284,15 +304,15 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
     return holds_out(problem, fit, rest) > SETTINGS.unexplained_held_out
 
 
-def moved_by(fit: Fit, rest: Unexplained) -> Array:
+def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     """(6 + p,) by how much the parameters of a fit move with what the rest follows most clearly fitted beside them."""
-    noise, raw = fit.noise, rest.clearest
+    noise, raw, known = fit.noise, rest.clearest, FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
     if noise.is_coloured:
-        noise = _coloured_anew(fit, fit.columns, raw, fit.residual).noise
-    size, at = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12), fit.columns.shape[2]
-    white = noise.whiten(np.concatenate([fit.columns, raw / size], axis=2))
-    std = np.concatenate([prior_std(fit.hypothesis), np.full(raw.shape[2], _likely(raw, fit.residual))])
-    return _solved(white, noise.whiten(-fit.residual), std)[:at]
+        noise = _coloured_anew(noise, known, raw, fit.residual).noise
+    size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
+    white = noise.whiten(np.concatenate([known.columns, raw / size], axis=2))
+    std = np.append(known.std, np.full(raw.shape[2], _likely(raw, fit.residual)))
+    return _solved(white, noise.whiten(-fit.residual), std)[: fit.columns.shape[2]]
 
 
 def _likely(raw: Array, residual: Array) -> float:
@@ -300,23 +320,21 @@ def _likely(raw: Array, residual: Array) -> float:
     return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
 
 
-def told_elsewhere(
-    problem: Problem, noise: Noise, hypothesis: Hypothesis, known: Array, raw: Array, residual: Array
-) -> float:
-    """Whitened squares of a residual (M, A) of a hypothesis that columns raw (M, A, c), beside known ones (M, A, k),
-    which are the first of its own, explain on stretches of time that they were not fitted to.
+def told_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> float:
+    """Whitened squares of a residual (M, A) that columns raw (M, A, c), beside known ones, explain on stretches of time
+    that they were not fitted to.
 
     One of many regressors may have a small p-value by chance or for an interpolation that is bent in sharp corners;
-    what is there tells of itself elsewhere. Known ones have the prior of the hypothesis, without which the scale of a
-    heave that is hardly there would take in what is left.
+    what is there tells of itself elsewhere. Known ones have a prior, without which the scale of a heave that is hardly
+    there would take in what is left.
     """
-    fold, k = stretch_of(problem.time) % SETTINGS.folds, known.shape[2]
+    fold, k = stretch_of(problem.time) % SETTINGS.folds, len(known.std)
     size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
-    white = noise.whiten(np.concatenate([known, raw / size], axis=2))
+    white = noise.whiten(np.concatenate([known.columns, raw / size], axis=2))
     series = noise.whiten(residual)
     # all together are no larger than the residual: else stretches without a turn would be told of any size
-    std = np.concatenate([prior_std(hypothesis)[:k], np.full(raw.shape[2], _likely(raw, residual))])
-    centre = np.concatenate([hypothesis.vector()[:k], np.zeros(raw.shape[2])])
+    std = np.append(known.std, np.full(raw.shape[2], _likely(raw, residual)))
+    centre = np.append(known.centre, np.zeros(raw.shape[2]))
     rows = np.repeat(fold, residual.shape[1])
     gain = 0.0
     for held in np.unique(fold):
@@ -338,10 +356,11 @@ def _chance(fitter: Fitter, fit: Fit, name: str) -> float:
     """
     lowered, dof, sound = PRIOR_DOF, PRIOR_DOF, ~_upset(fitter, fit.noise)[:, None]
     for other, seen, residual in made_up(fitter.problem, fit, MADE_UP // 2):
-        known = replace(fitter, problem=other).columns(fit.hypothesis, seen)
+        columns = replace(fitter, problem=other).columns(fit.hypothesis, seen)
+        known = FittedBeside.of(other, fit.hypothesis, seen, columns)
         raw = _along_axes(dictionary(other, seen)[name] * sound, other.axes)
-        alone = _coloured_anew(fit, known, raw[:, :, :0], residual)
-        drop, rank = alone.lowered_by(_coloured_anew(fit, known, raw, residual))
+        alone = _coloured_anew(fit.noise, known, raw[:, :, :0], residual)
+        drop, rank = alone.lowered_by(_coloured_anew(fit.noise, known, raw, residual))
         lowered, dof = lowered + drop, dof + rank
     return max(1.0, lowered / dof)
 
@@ -360,20 +379,21 @@ class _Coloured(NamedTuple):
         return max(self.deviance - beside.deviance, 0.0), max(beside.rank - self.rank, 1)
 
 
-def _coloured_anew(fit: Fit, known: Array, raw: Array, residual: Array) -> _Coloured:
-    """A residual (M, A) under columns (M, A, c) beside those of the fit (M, A, 6 + p), which have its prior."""
-    joined = np.concatenate([known, raw], axis=2)
+def _coloured_anew(noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> _Coloured:
+    """A residual (M, A) under columns (M, A, c) beside known ones, and noise like the given one."""
+    joined = np.concatenate([known.columns, raw], axis=2)
     size = np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
     joined = joined / size
-    std = prior_std(fit.hypothesis) * size[: known.shape[2]]
+    scale = size[: len(known.std)]
+    std = known.std * scale
     held = np.eye(joined.shape[2])[: len(std)] / std[:, None]
-    vector = fit.hypothesis.vector() * size[: len(std)] / std
-    left, colour = residual, fit.noise.white
+    left, colour = residual, noise.white
     for _ in range(2):
         white = colour.whiten(joined)
-        rows, series = np.concatenate([white, held]), np.concatenate([colour.whiten(residual), vector])
+        rows = np.concatenate([white, held])
+        series = np.concatenate([colour.whiten(residual), known.centre * scale / std])
         left = residual - joined @ np.linalg.lstsq(rows, series, rcond=INDEPENDENT)[0]
-        colour = fit.noise.like(left)
+        colour = noise.like(left)
     return _Coloured(colour.deviance(left), _orthonormal(white).shape[1], colour)
 
 

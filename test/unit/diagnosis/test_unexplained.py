@@ -7,17 +7,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_diagnosis import fitted, scenario, with_added
+from test_diagnosis import fitted, recording_of, scenario, with_added
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.diagnosis import unexplained as looking
 from dvl_calib_ros.diagnosis.composed import Offsets, _by_turn, make_problem, no_effect
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import NEARBY, SURELY, Fitter
-from dvl_calib_ros.diagnosis.noise import white_noise
+from dvl_calib_ros.diagnosis.noise import Noise, white_noise
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.standing import is_borne_out
 from dvl_calib_ros.diagnosis.unexplained import holds_out, matters, unexplained
+from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.scenario import simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
@@ -126,6 +127,18 @@ def test_a_period_that_no_function_of_time_follows_has_the_energy_of_its_own_wav
     assert rest.about == pytest.approx(18.0, rel=0.05)
     assert 0.8 * rest.clear_energy < rest.energy < rest.clear_energy
     assert matters(fitter.problem, fit, rest)
+
+
+def test_what_is_not_shown_is_no_finding_under_noise_that_is_estimated_anew_either(monkeypatch):
+    """The height of a DVL a metre up, which a horizontal reference hardly shows, was what is left of right answers."""
+    monkeypatch.setattr(Noise, "is_coloured", True)
+    arm = EFFECTS["lever_arm"].without({"x_m", "y_m"})
+    fitter, fit = without_effects(recording_of(simulate(scenario("lawnmower", gnss_std=0.03))))
+    height = fitter.problem.columns(fit.hypothesis, fit.seen, arm, [arm.defaults])
+    off = replace(fit, residual=fit.residual + 0.015 / np.sqrt(np.mean(height**2)) * height[:, :, 0])
+    assert unexplained(fitter, off).about == "roll and pitch rate"
+    unshown = replace(fitter.problem, unshown=(arm,))
+    assert not unexplained(replace(fitter, problem=unshown), off).found
 
 
 @pytest.mark.parametrize(("low", "stands"), [(-0.7, False), (0.1, True)])
