@@ -235,17 +235,24 @@ def noise(data: SensorData, combination: int = 0):
 # ------------------------------------------------------------------ scale
 
 
-def same(one, other) -> bool:
-    """To rounding: with another number of threads, older linear algebra adds in another order."""
-    pairs = [(getattr(one, name), getattr(other, name)) for name in ("avg_vrmse", "avg_vrmse_by_time")]
-    pairs.append((one.errors_in_variables.measured, other.errors_in_variables.measured))
-    return all(np.allclose(a, b, rtol=1e-10, atol=1e-13, equal_nan=True) for a, b in pairs)
-
-
-def test_workers_change_nothing():
-    """Of two seeds and two sets, which one model shows as well as all."""
-    of = partial(evaluate, None, Parameters(**DEFAULTS), n_seeds=2, models=("M4",), sets=("E1", "E3"))
-    assert same(of(workers=Workers(jobs=2)), of())
+def test_workers_change_nothing(evaluation):
+    """Of two sets, which one model shows as well as all: to rounding, as with another number of threads older linear
+    algebra adds in another order."""
+    options = {"n_seeds": 2, "models": ("M4",), "sets": ("E1", "E3")}
+    found = evaluate(None, Parameters(**DEFAULTS), **options, workers=Workers(jobs=2))
+    of_sets = [[each.name for each in evaluation.sets].index(each.name) for each in found.sets]
+    of_columns = [0, evaluation.columns.index("M4")]
+    of_model = evaluation.errors_in_variables.models.index("M4")
+    for one, other in (
+        (found.avg_vrmse, evaluation.avg_vrmse[of_sets][:, of_columns]),
+        (found.avg_vrmse_by_time, evaluation.avg_vrmse_by_time[of_sets][:, :, of_columns]),
+        (found.errors_in_variables.measured[0], evaluation.errors_in_variables.measured[of_model]),
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-13)
+    held_out = {(each.set_name, each.model): each for each in evaluation.held_out}
+    assert len(found.held_out) == 2
+    for each in found.held_out:
+        assert each.corrected == pytest.approx(held_out[each.set_name, "M4"].corrected, rel=1e-10)
 
 
 def test_a_worker_process_that_is_killed_is_said():
