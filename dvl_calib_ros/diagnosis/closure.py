@@ -27,7 +27,8 @@ class Gap:
 
     noise_floor: what the instruments and the high frequencies show. closure: of what is beyond that, nan where there
     is none; interval: its 95 per cent. not_explained: what of `after` is not noise. reported: noise that the messages
-    claim, None where they do not. by_recording: before and after of each of several.
+    claim, None where they do not. by_recording: before and after of each of several. left_open: what of
+    `not_explained` is in stretches that alone tell a part of the effects, and no more than was to be expected there.
     """
 
     before: float
@@ -38,6 +39,12 @@ class Gap:
     not_explained: float = 0.0
     reported: float | None = None
     by_recording: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    left_open: float = 0.0
+
+    @property
+    def not_expected(self) -> float:
+        """m/s, of what is not explained, beyond what is left open."""
+        return float(np.sqrt(max(0.0, self.not_explained**2 - self.left_open**2)))
 
     @property
     def beyond_noise(self) -> float:
@@ -48,17 +55,26 @@ class Gap:
 @dataclass(frozen=True)
 class HeldOutResiduals:
     """before, after: errors (F, 3) m/s of calibrations without and with the effects that have not seen them.
-    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling.
+    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling. left_open: (F,)
+    (m/s)², square of what calibrations with the effects are to be off by there, as far as what they have seen tells.
     """
 
     before: Array
     after: Array
     floor: Array
     block: Integers
+    left_open: Array | float = 0.0
 
     def squares(self) -> tuple[Array, Array, Array]:
         """Squares of before, after and floor summed over each block (B,), (m/s)²."""
         return self._summed(self.before**2), self._summed(self.after**2), self._summed(self.floor)
+
+    @property
+    def square_left_open(self) -> float:
+        """(m/s)², mean of what is left open, of each block no more than it has beyond the noise."""
+        _, after, floor = self.squares()
+        left_open = np.bincount(self.block, np.broadcast_to(self.left_open, len(self.block)))
+        return float(np.minimum(left_open, np.maximum(after - floor, 0.0)).sum()) / len(self.block)
 
     def _summed(self, squares: Array) -> Array:
         return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
@@ -74,22 +90,33 @@ def held_out(selection: EffectSelection) -> HeldOutResiduals:
     problem = fitter.problem
     before, after = np.zeros((len(problem.bin_of), 3)), np.zeros((len(problem.bin_of), 3))
     hypotheses = selection.base.hypothesis, fit.hypothesis
-    fold_of = folds_of(problem)
+    fold_of, left_open = folds_of(problem), np.zeros(len(problem.bin_of))
     for fold, each in fitted_without(fitter, hypotheses, fit.noise, fold_of):
         at = (fold_of == fold)[problem.bin_of]
         for fitted, into in zip(each, (before, after), strict=True):
             if len(problem.recordings) > 1:
-                of_day = _with_its_own_day(selection, fitted, fold)
+                of_day = _with_its_own_day(selection, fitted.hypothesis, fold)
                 into[at] = only(problem, fold).errors(of_day.seen)
             else:
-                into[at] = problem.errors(problem.all_seen(fitted))[at]
+                into[at] = problem.errors(fitted.seen)[at]
+        left_open[at] = _left_open(each[-1])[problem.bin_of][at]
     block = np.unique(_block_keys(problem), return_inverse=True)[1][problem.bin_of]
     return HeldOutResiduals(
         before,
         after,
         noise_floor(selection),
         np.asarray(block, dtype=np.intp),
+        left_open,
     )
+
+
+def _left_open(fit: Fit) -> Array:
+    """(M,) (m/s)², square of what a fit is to be off by in each bin; of several recordings but for what is the day's,
+    which is fitted to what is held out."""
+    of_day = [each.effect.of_the_day and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
+    own = np.flatnonzero(~np.array([False] * 6 + of_day))
+    columns, covariance = fit.columns[:, :, own], fit.system.covariance()[np.ix_(own, own)]
+    return np.asarray(np.einsum("map,map->m", columns @ covariance, columns))
 
 
 def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
@@ -136,6 +163,7 @@ def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
         not_explained=float(np.sqrt(max(0.0, squares[1] - squares[2]))),
         reported=_reported(selection.fitter.problem),
         by_recording=_by_recording(selection.fitter.problem, residuals),
+        left_open=float(np.sqrt(residuals.square_left_open)),
     )
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..calibration.frames import Array
 from .composed import Hypothesis, Problem
-from .fitting import Fitter
+from .fitting import Fit, Fitter
 from .noise import Noise
 from .settings import SETTINGS
 
@@ -24,14 +24,14 @@ def fitted_without(
     noise: Noise,
     fold_of: Integers,
     fixed: frozenset[str] = frozenset(),
-) -> Iterator[tuple[int, list[Hypothesis]]]:
-    """Every fold of bins (M,), and hypotheses as fitted to all the others.
+) -> Iterator[tuple[int, list[Fit]]]:
+    """Every fold of bins (M,), and fits of hypotheses to all the others.
 
     Models that are linear need no further fit: `calibration.folds` leaves out what a fold told.
     """
     for fold in np.unique(fold_of).tolist():
         train = fitter.without(fold_of == fold)
-        yield fold, [train.fit(each, noise, FOLD_STEPS, fixed=fixed).hypothesis for each in hypotheses]
+        yield fold, [train.fit(each, noise, FOLD_STEPS, fixed=fixed) for each in hypotheses]
 
 
 def folds_of(problem: Problem) -> Integers:

@@ -161,7 +161,7 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     for fold, (fitted,) in fitted_without(fitter, [start], fit.noise, bins, fixed):
         for index in range(n):
             at = sample_folds[index] == fold
-            predicted[index][at] = simulated(quiet, fitted, index)[at]
+            predicted[index][at] = simulated(quiet, fitted.hypothesis, index)[at]
     return predicted
 
 

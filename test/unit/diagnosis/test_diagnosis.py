@@ -18,7 +18,7 @@ from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.diagnosis import fitting, intervals, proposing, shown, twice
 from dvl_calib_ros.diagnosis.called_for import _is_late_before_a_leap, once_where_borne_out, only_called_for
 from dvl_calib_ros.diagnosis.clock_or_arm import CLOCKS, lags_and_delays, moved_arm, with_moved
-from dvl_calib_ros.diagnosis.closure import Gap
+from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.diagnosis.composed import Grid, Hypothesis, Offsets, Problem, make_problem, no_effect
 from dvl_calib_ros.diagnosis.criteria import finer_steps
@@ -1049,6 +1049,24 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
     effect = FoundEffect("scale_drift", (), {}, 0.7, 1e-9)
     reasons = _reasons(found, gap, [effect], nothing_left, [], 1)
     assert ("REST_FOLLOWS_NOTHING" in {each.code for each in reasons}) == (verdict is DiagnosisVerdict.UNKNOWN)
+
+
+def test_what_the_very_stretch_that_is_held_out_tells_is_no_unknown_cause():
+    """A current of 20 s, known exactly: elsewhere nothing tells of it, and what that leaves was called unknown."""
+    current = "water_lock:east_mps=0.4,north_mps=0.1,from_s=101,to_s=119"
+    diagnosis = diagnosed(effects=[LEVER, "dvl_time_offset:seconds=1.2", current], seconds=300.0, gnss_std=0.02)
+    assert set(found(diagnosis)) == {"lever_arm", "dvl_time_offset", "water_lock"}
+    assert diagnosis.gap.not_explained > 2.0 * diagnosis.gap.noise_floor
+    assert diagnosis.gap.not_expected < 0.3 * diagnosis.gap.noise_floor
+    assert diagnosis.verdict is DiagnosisVerdict.KNOWN
+
+
+def test_a_stretch_is_left_open_by_no_more_than_what_it_has_beyond_the_noise():
+    after = np.sqrt([[5.0], [3.0], [2.0], [2.0], [1.0], [0.0]])
+    residuals = HeldOutResiduals(
+        after, after, np.ones((6, 1)), np.array([0, 0, 1, 1, 2, 2]), np.array([900.0, 1.0, 0.5, 0.5, 7.0, 0.0])
+    )
+    assert residuals.square_left_open == pytest.approx((6.0 + 1.0 + 0.0) / 6.0)
 
 
 def test_what_is_left_beyond_all_doubt_is_told_by_what_explains_it():
