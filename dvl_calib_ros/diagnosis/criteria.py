@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
+from ..calibration.frames import Array
 from ..effects.base import Effect
 from .composed import Problem, is_time_of_run
 from .fitting import Fit, Fitter, n_amplitudes
@@ -78,8 +79,11 @@ def log_p_in_place(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> float
     return log_p_value(gain, fit.dof - rest.dof, times_tried(effect))
 
 
-def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "") -> float:
-    """p of a Wald test with the covariance that blocks show, of all parameters of an effect or of one by name."""
+def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "", moved: Array | float = 0.0) -> float:
+    """p of a Wald test with the covariance that blocks show, of all parameters of an effect or of one by name.
+
+    moved: (6 + p,) by how much the parameters may be others for a cause that is not in the fit.
+    """
     at, start = np.zeros(0, dtype=int), 6
     for other in fit.effects:
         p = len(fit.hypothesis.parameters_of(other))
@@ -90,7 +94,10 @@ def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "") 
     is_asked = np.array([not name or each.spec.name == name for each in own])
     at, defaults = at[is_asked], np.array([each.spec.default for each in own])[is_asked]
     values = fit.hypothesis.vector()[at] - defaults
-    covariance = fit.covariance(block)[np.ix_(at, at)]
+    covariance = fit.covariance(block)
+    if isinstance(moved, np.ndarray):
+        covariance = covariance + np.outer(moved, moved)
+    covariance = covariance[np.ix_(at, at)]
     wald = float(values @ np.linalg.solve(covariance, values)) / len(at)
     blocks = int(block.max()) + 1
     return float(f_sf(wald, len(at), max(blocks - len(at), 2)))

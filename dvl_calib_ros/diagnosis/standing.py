@@ -10,11 +10,11 @@ import numpy as np
 
 from ..effects.base import Effect
 from .closure import Gap
-from .criteria import price
+from .criteria import blocks_of, price, robust_p
 from .fitting import Fit, Fitter
 from .selection import EffectSelection
 from .settings import SETTINGS
-from .unexplained import FittedBeside, Unexplained, matters, told_elsewhere, unexplained
+from .unexplained import FittedBeside, Unexplained, matters, moved_by, told_elsewhere, unexplained
 
 # p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
 WEAK = 1e-3
@@ -28,7 +28,7 @@ ROUNDING = 1e-3
 
 
 def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection, Unexplained]:
-    """A selection without what an unknown cause explains better, and what it then leaves.
+    """A selection without what an unknown cause explains better or may be a part of, and what it then leaves.
 
     Of effects that nobody would see without a test: a step in a bias looks like a drift, but for what that leaves.
     Better is what explains more for its price, or on stretches of the run that it was not fitted to: several effects
@@ -55,7 +55,30 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
         if best is None or gain > best[0]:
             chosen = tuple(each for each in selection.selected if each.effect.name not in names)
             best = gain, replace(selection, selected=chosen, fit=reduced), other
-    return (selection, rest) if best is None else (best[1], best[2])
+    return _sure_beside(*((selection, rest) if best is None else best[1:]))
+
+
+def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectSelection, Unexplained]:
+    """A selection without effects that are not sure with what the rest follows fitted beside them, and what it leaves.
+
+    Which part of them is the unknown cause's nobody knows: a current and two drifts in the place of a step in a bias.
+    """
+    fitter, block = selection.fitter, blocks_of(selection.fitter.problem)
+    while selection.selected and matters(fitter.problem, selection.fit, rest):
+        fit, named = selection.fit, {each.effect.name for each in selection.selected}
+        moved = moved_by(fitter.problem, fit, rest)
+        p_values = {e.name: robust_p(fit, e, block, moved=moved) for e in fit.effects if e.name in named}
+        worst = max(p_values, key=lambda name: p_values[name])
+        if p_values[worst] < SETTINGS.robust_level:
+            break
+        kept = [effect for effect in fit.effects if effect.name != worst]
+        reduced = fitter.fit(fit.hypothesis.with_effects(kept, len(fit.seen), {}), fit.noise)
+        other = unexplained(fitter, reduced)
+        if not matters(fitter.problem, reduced, other):
+            break
+        chosen = tuple(each for each in selection.selected if each.effect.name != worst)
+        selection, rest = replace(selection, selected=chosen, fit=reduced), other
+    return selection, rest
 
 
 def _told_more_elsewhere(fitter: Fitter, fit: Fit, reduced: Fit, names: Set[str], other: Unexplained) -> float:

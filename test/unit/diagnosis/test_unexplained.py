@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from test_diagnosis import fitted, recording_of, scenario, with_added
+from test_diagnosis import LEVER, fitted, recording_of, scenario, with_added
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.diagnosis import unexplained as looking
@@ -16,7 +16,8 @@ from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import NEARBY, SURELY, Fitter
 from dvl_calib_ros.diagnosis.noise import Noise, white_noise
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
-from dvl_calib_ros.diagnosis.standing import is_borne_out
+from dvl_calib_ros.diagnosis.selection import EffectSelection, Selected
+from dvl_calib_ros.diagnosis.standing import is_borne_out, settled
 from dvl_calib_ros.diagnosis.unexplained import holds_out, matters, unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.scenario import simulate
@@ -158,3 +159,20 @@ def test_what_is_off_in_turns_is_unknown_and_no_heading_error():
     recording = with_added(run, lambda _, turning: 0.02 * np.outer(np.abs(turning) > 0.05, [0.6, 0.8, 0.3]))
     diagnosis = diagnose_recordings([recording], Parameters())
     assert diagnosis.verdict is DiagnosisVerdict.UNKNOWN and not diagnosis.effects
+
+
+def test_effects_that_an_unknown_cause_may_be_a_part_of_are_not_named_beside_it():
+    """A step in a bias was named a current and two drifts beside what is unknown, by another reference other ones."""
+    run = simulate(scenario("free", seconds=300.0, gnss_std=0.03, effects=[LEVER]))
+    recording = with_added(run, lambda time, _: 0.05 * np.outer(time > 200.0, [0.7, 0.7, 0.0]))
+    problem = make_problem([recording], np.eye(3), np.zeros(3), [Offsets()])
+    fitter, effects = Fitter(problem), [EFFECTS[name] for name in ("lever_arm", "misalignment_drift", "scale_drift")]
+    start = no_effect().with_effects(effects, 1, {effect.name: (effect.defaults,) for effect in effects})
+    noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
+    noise = white_noise(fitter.fit(start, noise).residual, problem.segments, None, problem.interval)
+    base, fit = fitter.fit(no_effect(), noise), fitter.fit(start, noise)
+    assert unexplained(fitter, fit).found
+    selected = tuple(Selected(effect, -50.0, ()) for effect in effects)
+    left, rest = settled(EffectSelection(selected, base, fit, fitter, (), EFFECTS), len(EFFECTS))
+    assert rest.about == "a step in time"
+    assert [each.effect.name for each in left.selected] == ["lever_arm"] == [each.name for each in left.fit.effects]
