@@ -17,8 +17,8 @@ STEPS = 11
 FADES_S = (4.0, 12.0, 40.0)
 # rad/s from which the vehicle is in a turn, whose side may stay until the next
 TURNING_RADPS = float(np.deg2rad(2.0))
-# Of these one function is enough, and is looked for by itself
-ALTERNATIVES = ("a step in time", "a band of speeds", "turns before")
+# Of these one function is enough, and is looked for by itself, or so many: a cosine and its sine
+ALTERNATIVES = {"a step in time": 1, "a band of speeds": 1, "turns before": 1, "heading": 2}
 HEADING_HARMONICS = 4
 
 

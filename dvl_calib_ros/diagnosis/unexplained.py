@@ -407,7 +407,10 @@ def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
     """Columns of `_along_axes` that are tested together: all, each axis, and each of those that are alternatives."""
     index = np.arange(axes * c).reshape(axes, c)
     looks = [index.ravel(), *index]
-    return [*looks, *index.T] if name in ALTERNATIVES else looks
+    if name not in ALTERNATIVES:
+        return looks
+    together = ALTERNATIVES[name]
+    return [*looks, *(index[:, at : at + together].ravel() for at in range(0, c, together))]
 
 
 def _orthonormal(white: Array) -> Array:

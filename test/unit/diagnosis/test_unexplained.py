@@ -142,6 +142,20 @@ def test_what_is_not_shown_is_no_finding_under_noise_that_is_estimated_anew_eith
     assert not unexplained(replace(fitter, problem=unshown), off).found
 
 
+def test_one_harmonic_of_the_heading_is_looked_for_by_itself():
+    """Among ten functions of the heading a third harmonic was half as clear, and a current of minutes stood for it."""
+    run = simulate(scenario("free", gnss_std=0.03, seed=3))
+
+    def third(time, turning):
+        heading = np.cumsum(turning * np.diff(time, prepend=time[0]))
+        return 0.01 * np.outer(np.sin(3.0 * heading), [0.0, 1.0, 0.0])
+
+    fitter, fit = without_effects(with_added(run, third))
+    rest = unexplained(fitter, fit)
+    assert rest.about == "heading" and rest.clearest.shape[2] == 6
+    assert matters(fitter.problem, fit, rest)
+
+
 @pytest.mark.parametrize(("low", "stands"), [(-0.7, False), (0.1, True)])
 def test_what_may_make_it_worse_where_it_was_not_fitted_to_does_not_stand_however_sure(low, stands):
     """A bias and a current of 12 s stood for a hysteresis, and closed 36 % of the gap, -72 to 100 %."""
