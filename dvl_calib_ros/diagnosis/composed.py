@@ -26,7 +26,16 @@ from scipy.spatial.transform import Rotation
 from ..calibration.frames import Array, cross, skew
 from ..calibration.samples import VelocityFrame
 from ..effects.along_time import slopes
-from ..effects.base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectParameter, MountingEffect
+from ..effects.base import (
+    ActsOn,
+    ClockEffect,
+    Effect,
+    EffectInput,
+    EffectNeeds,
+    EffectParameter,
+    EffectWithMemory,
+    MountingEffect,
+)
 from ..effects.composition import Injection, late, traces, turns
 from .curve import FAST_ENOUGH_S, Curve
 from .noise import segments_of
@@ -80,14 +89,15 @@ class Hypothesis:
         """The effects as one recording has them."""
         return [Injection(effect, self.values[effect.name][recording]) for effect in self.effects]
 
-    def lags(self, recording: int) -> list[tuple[Effect, Values]]:
+    def lags(self, recording: int) -> list[tuple[EffectWithMemory, Values]]:
         """The effects of one recording with a memory, and their values."""
-        return [(effect, self.values[effect.name][recording]) for effect in self.effects if effect.has_memory]
+        with_memory = [effect for effect in self.effects if isinstance(effect, EffectWithMemory)]
+        return [(effect, self.values[effect.name][recording]) for effect in with_memory]
 
     @property
     def without_memory(self) -> Hypothesis:
         """The same without effects that have one."""
-        return replace(self, effects=tuple(effect for effect in self.effects if not effect.has_memory))
+        return replace(self, effects=tuple(each for each in self.effects if not isinstance(each, EffectWithMemory)))
 
     def parameters(self) -> list[Parameter]:
         """What is fitted beside the calibration, in order."""
@@ -175,7 +185,7 @@ class Seen:
 
     def on_reference(self, injections: Sequence[Injection]) -> Array:
         """(F, 3) m/s, traces on REFERENCE, body frame."""
-        lagging = [each for each in injections if isinstance(each.effect, Effect) and each.effect.has_memory]
+        lagging = [each for each in injections if isinstance(each.effect, EffectWithMemory)]
         if not lagging or self.close[0] is self:
             return traces(injections, self.motion, ActsOn.REFERENCE)
         close, own = self.close
@@ -525,7 +535,7 @@ class Problem:
         for recording, each in enumerate(seen):
             lags = hypothesis.lags(recording)
             of_motion = lags if effect.acts_on is not ActsOn.REFERENCE else []
-            close, own = each.close if of_motion or effect.has_memory else (each, slice(None))
+            close, own = each.close if of_motion or isinstance(effect, EffectWithMemory) else (each, slice(None))
             body = self._derivatives(hypothesis, close, effect, values[recording])
             per_recording.append(_begun(lags, each, _lagging(of_motion, close, body)[own]))
         joined = self.binned(per_recording, seen)
@@ -646,19 +656,17 @@ def _undone(
     return motion, added
 
 
-def _lagging(lags: Sequence[tuple[Effect, Values]], seen: Seen, columns: Array) -> Array:
+def _lagging(lags: Sequence[tuple[EffectWithMemory, Values]], seen: Seen, columns: Array) -> Array:
     """Derivatives (F, 3, p) of the reference point's velocity, m/s, of references that follow with a lag."""
     for lag, values in lags:
-        moved = [replace(seen.motion, velocity_body=column) for column in np.moveaxis(columns, 2, 0)]
-        columns = columns - np.stack([lag.trace(one, values) for one in moved], axis=2)
+        columns = columns - lag.filtered(seen.motion, columns, values)
     return columns
 
 
-def _begun(lags: Sequence[tuple[Effect, Values]], seen: Seen, columns: Array) -> Array:
+def _begun(lags: Sequence[tuple[EffectWithMemory, Values]], seen: Seen, columns: Array) -> Array:
     """Derivatives (F, 3, p) m/s without what a lag explains of them by what it remembers of before."""
     for lag, values in lags:
-        of_before = [lag.of_before(seen.motion, column, values) for column in np.moveaxis(columns, 2, 0)]
-        columns = columns - np.stack(of_before, axis=2)
+        columns = columns - lag.of_before(seen.motion, columns, values)
     return columns
 
 

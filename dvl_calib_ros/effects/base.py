@@ -171,8 +171,7 @@ class Effect(AnyEffect, ABC):
     remedy: what to do about it where it is found, as part of a sentence. manoeuvre: what to fly to see it and tell it
     from what it is confounded with. of_the_day: whether its size is another in every recording; else it belongs to the
     vehicle. relative_to_first: whether it is a change against the first of several recordings. bends_arm: whether
-    little of it, left out, moves the lever arm by decimetres, as a clock's delay does beside an arm of metres.
-    has_memory: whether its trace is that of a filter, linear in the velocity. again:
+    little of it, left out, moves the lever arm by decimetres, as a clock's delay does beside an arm of metres. again:
     parameters of a second time that it happens, which is looked for where a first was found -> those of the first.
     rarer: parameters that are looked for where several recordings ask for them.
     """
@@ -182,14 +181,8 @@ class Effect(AnyEffect, ABC):
     of_the_day: ClassVar[bool] = False
     relative_to_first: ClassVar[bool] = False
     bends_arm: ClassVar[bool] = False
-    has_memory: ClassVar[bool] = False
     again: ClassVar[Mapping[str, str]] = {}
     rarer: ClassVar[frozenset[str]] = frozenset()
-
-    def of_before(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
-        """That part (N, 3) m/s of a velocity (N, 3) m/s, body frame, that what an effect with a memory has kept of the
-        time before the motion explains, by least squares. values: of the effect."""
-        return np.zeros_like(velocity)
 
     @property
     def usual(self) -> Effect:
@@ -231,6 +224,23 @@ class Effect(AnyEffect, ABC):
         values: every parameter by name. (N, 3) m/s in the nominal body frame, at `motion.time`; where it comes in is
         told by `ActsOn`. An effect on the reference returns minus what it adds to the reference velocity.
         """
+
+
+class EffectWithMemory(Effect):
+    """An effect whose trace is that of a filter: linear in the velocity, also of the time before a recording began."""
+
+    @abstractmethod
+    def filtered(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
+        """What `trace` is of a velocity (N, 3) m/s, body frame, or of several (N, 3, p)."""
+
+    @abstractmethod
+    def of_before(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
+        """That part of a velocity (N, 3) m/s, body frame, or of several (N, 3, p), that what the filter has kept of the
+        time before the motion explains, by least squares."""
+
+    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+        """What the filter adds to the motion's own velocity."""
+        return self.filtered(motion, motion.velocity_body, values)
 
 
 class ClockEffect(Effect):

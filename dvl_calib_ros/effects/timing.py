@@ -14,7 +14,7 @@ from ..calibration.frames import Array
 from ..calibration.register.coarse import LONGEST_S
 from ..calibration.samples import VelocityFrame
 from .along_time import recursion, slopes
-from .base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectParameter
+from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory
 
 # As far as clocks are registered
 LONGEST_OFFSET_S = LONGEST_S
@@ -110,7 +110,7 @@ class ReferenceTimeOffset(ClockEffect):
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """g(t) - g(t - τ), in the frame in which the reference was recorded, turned into the body."""
-        reference = _in_reference_frame(motion)
+        reference = _in_reference_frame(motion, motion.velocity_body)
         late = self.late(motion.elapsed, values)
         return _in_body(motion, reference - delayed(motion.time, reference, late))
 
@@ -142,7 +142,7 @@ class AttitudeTimeOffset(ClockEffect):
         return motion.velocity_body - np.einsum("nji,nj->ni", then, earth)
 
 
-class ReferenceLag(Effect):
+class ReferenceLag(EffectWithMemory):
     """The receiver filters its velocity: a first-order low-pass, in the frame in which it was recorded."""
 
     name = "reference_lag"
@@ -156,13 +156,13 @@ class ReferenceLag(Effect):
     )
     acts_on = ActsOn.REFERENCE
     bends_arm = True
-    has_memory = True
     confounded_with = ("reference_time_offset", "dvl_time_offset", "sideslip", "lever_arm")
 
-    def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
+    def filtered(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
         """g - (g filtered), turned into the body."""
-        reference = _in_reference_frame(motion)
-        return _in_body(motion, -lag_error(motion.time, reference, values["time_constant_s"]))
+        reference = _in_reference_frame(motion, velocity)
+        error = lag_error(motion.time, reference.reshape(len(reference), -1), values["time_constant_s"])
+        return _in_body(motion, -error.reshape(reference.shape))
 
     def of_before(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
         """What the filter had in it at the first sample dies away with its time constant, whatever it was."""
@@ -170,8 +170,8 @@ class ReferenceLag(Effect):
         if constant <= 0.0:
             return np.zeros_like(velocity)
         left = np.exp((motion.time[0] - motion.time) / constant)
-        at_first = left @ (_in_reference_frame(replace(motion, velocity_body=velocity)) / (left @ left))
-        return _in_body(motion, np.outer(left, at_first))
+        at_first = np.tensordot(left, _in_reference_frame(motion, velocity), axes=1) / (left @ left)
+        return _in_body(motion, np.multiply.outer(left, at_first))
 
 
 def delayed(time: Array, values: Array, delay: float | Array) -> Array:
@@ -186,7 +186,7 @@ def delayed(time: Array, values: Array, delay: float | Array) -> Array:
 
 
 def lag_error(time: Array, values: Array, time_constant: float) -> Array:
-    """First-order low-pass of `values` (N, 3) less `values`: exact where slopes are straight between their times.
+    """First-order low-pass of `values` (N, k) less `values`: exact where slopes are straight between their times.
 
     With e = output - input, de/dt = -e / T - slope. Where the slope goes from s_0 to s_1 within a step of h, one
     solution is p(t) = T² (s_1 - s_0) / h - T slope(t), so e_n = exp(-h / T) (e_(n-1) - p_(n-1)) + p_n. The filter
@@ -207,11 +207,17 @@ def _turns(motion: EffectInput) -> bool:
     return motion.reference_frame is not VelocityFrame.BODY and motion.rotation_enu_from_body is not None
 
 
-def _in_reference_frame(motion: EffectInput) -> Array:
-    if not _turns(motion):
-        return motion.velocity_body
-    return np.einsum("nij,nj->ni", motion.attitude, motion.velocity_body)
+def _in_reference_frame(motion: EffectInput, velocity: Array) -> Array:
+    """(N, 3) or (N, 3, p), body frame -> that of the reference."""
+    return _turned(motion.attitude, velocity) if _turns(motion) else velocity
 
 
 def _in_body(motion: EffectInput, velocity: Array) -> Array:
-    return np.einsum("nji,nj->ni", motion.attitude, velocity) if _turns(motion) else velocity
+    return _turned(np.swapaxes(motion.attitude, 1, 2), velocity) if _turns(motion) else velocity
+
+
+def _turned(rotation: Array, velocity: Array) -> Array:
+    """(N, 3) or (N, 3, p), each by its own (N, 3, 3)."""
+    if velocity.ndim == 2:
+        return np.einsum("nij,nj->ni", rotation, velocity)
+    return np.asarray(rotation @ velocity)  # of several columns in a fifth of the time
