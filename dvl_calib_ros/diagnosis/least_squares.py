@@ -53,6 +53,10 @@ class WhitenedLeastSquares:
         extended = np.append(-x, 1.0)
         return float(extended @ self.gram @ extended + np.sum(((x - self.centre) / self.std) ** 2))
 
+    def surprise(self) -> float:
+        """-2 log of how likely the target was, but for what columns have no part in and for the prior's own size."""
+        return self.misfit(self.solution()) + float(np.linalg.slogdet(self._normal)[1])
+
     def covariance(self) -> Array:
         """(n, n) of the solution, for noise of unit variance."""
         return np.asarray(np.linalg.inv(self._normal))

@@ -14,15 +14,16 @@ from .criteria import blocks_of, price, robust_p
 from .fitting import Fit, Fitter
 from .selection import EffectSelection
 from .settings import SETTINGS
-from .unexplained import FittedBeside, Unexplained, matters, moved_by, told_elsewhere, unexplained
+from .unexplained import FittedBeside, Unexplained, matters, moved_by, predicted_elsewhere, told_elsewhere, unexplained
 
 # p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
 WEAK = 1e-3
 # Deviance that all effects together explain, up to which they must explain this share of it on stretches that they were
 # not fitted to as well: pairs that cancel but for noise do not, of real ones nine in ten do with a signal-to-noise of 5
 FAINT, BORNE_OUT = 200.0, 0.25
-# Share of what effects explain that an unknown cause must explain beyond its price to tell more elsewhere
-TOLD_FROM = 0.5
+# Of what effects explain: the share that an unknown cause must explain beyond its price to predict better elsewhere, and
+# the share that curves between samples leave
+TOLD_FROM, OF_INEXACT = 0.5, 0.02
 # Deviance by which a bound on another may be off as numbers are rounded
 ROUNDING = 1e-3
 
@@ -31,8 +32,8 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
     """A selection without what an unknown cause explains better or may be a part of, and what it then leaves.
 
     Of effects that nobody would see without a test: a step in a bias looks like a drift, but for what that leaves.
-    Better is what explains more for its price, or on stretches of the run that it was not fitted to: several effects
-    together have shapes enough for a stall in turns, where they are fitted.
+    Better is what explains more for its price, or predicts stretches of the run that neither was fitted to: several
+    effects together have shapes enough for a stall in turns, where they are fitted.
     """
     fitter, fit = selection.fitter, selection.fit
     rest = unexplained(fitter, fit)
@@ -49,8 +50,12 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
         other = unexplained(fitter, reduced, asked=min(wanted + lost, TOLD_FROM * drop) - ROUNDING)
         if not other.found:
             continue
-        gain = max((other.clear_energy - other.price) - lost, _told_more_elsewhere(fitter, fit, reduced, names, other))
-        if gain < wanted or not matters(fitter.problem, reduced, other):
+        elsewhere = _better_elsewhere(fitter, fit, reduced, names, other)
+        gain = max(
+            (other.clear_energy - other.price) - lost - wanted,
+            elsewhere - SETTINGS.indistinguishable - OF_INEXACT * drop,
+        )
+        if gain < 0.0 or not matters(fitter.problem, reduced, other):
             continue
         if best is None or gain > best[0]:
             chosen = tuple(each for each in selection.selected if each.effect.name not in names)
@@ -81,13 +86,13 @@ def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectS
     return selection, rest
 
 
-def _told_more_elsewhere(fitter: Fitter, fit: Fit, reduced: Fit, names: Set[str], other: Unexplained) -> float:
-    """By how much more deviance an unknown cause explains than effects of a fit, by name, on stretches that neither was
-    fitted to. reduced: the fit without these."""
+def _better_elsewhere(fitter: Fitter, fit: Fit, reduced: Fit, names: Set[str], other: Unexplained) -> float:
+    """By how much better, in deviance, an unknown cause predicts than effects of a fit, by name, on stretches that
+    neither was fitted to. reduced: the fit without these."""
     own = [parameter.effect.name in names for parameter in fit.hypothesis.parameters()]
     known = FittedBeside.of(fitter.problem, reduced.hypothesis, reduced.seen, reduced.columns)
     unknown, effects = (
-        told_elsewhere(fitter.problem, fit.noise, known, columns, reduced.residual)
+        predicted_elsewhere(fitter.problem, fit.noise, known, columns, reduced.residual)
         for columns in (other.clearest, fit.columns[:, :, 6:][:, :, own])
     )
     return unknown - effects

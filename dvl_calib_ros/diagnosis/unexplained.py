@@ -7,7 +7,7 @@ for shares one test and one price.)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -328,22 +328,48 @@ def told_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Arr
     what is there tells of itself elsewhere. Known ones have a prior, without which the scale of a heave that is hardly
     there would take in what is left.
     """
-    fold, k = stretch_of(problem.time) % SETTINGS.folds, len(known.std)
-    size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
-    white = noise.whiten(np.concatenate([known.columns, raw / size], axis=2))
-    series = noise.whiten(residual)
-    # all together are no larger than the residual: else stretches without a turn would be told of any size
-    std = np.append(known.std, np.full(raw.shape[2], _likely(raw, residual)))
-    centre = np.append(known.centre, np.zeros(raw.shape[2]))
-    rows = np.repeat(fold, residual.shape[1])
-    gain = 0.0
-    for held in np.unique(fold):
-        train, test = rows != held, rows == held
+    white, series, std, centre = _beside(noise, known, raw, residual)
+    gain, k = 0.0, len(known.std)
+    for train in _trained(problem, residual):
         system = WhitenedLeastSquares.of(white[train], series[train], std, centre)
         base = system.part(np.arange(k)).solution()
-        left = series[test] - white[test][:, :k] @ base
-        gain += float(left @ left - np.sum((series[test] - white[test] @ system.solution()) ** 2))
+        left = series[~train] - white[~train][:, :k] @ base
+        gain += float(left @ left - np.sum((series[~train] - white[~train] @ system.solution()) ** 2))
     return gain
+
+
+def predicted_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> float:
+    """By how much better, in deviance, a residual (M, A) is predicted with columns raw (M, A, c), beside known ones, on
+    stretches of time that they were not fitted to.
+
+    As they are known there: of the only dive of a run, held out, no other stretch tells what an effect of the pitch
+    does, and none claims to.
+    """
+    white, series, std, centre = _beside(noise, known, raw, residual)
+    whole, calibration = WhitenedLeastSquares.of(white, series, std, centre), np.arange(len(known.std))
+    gain = 0.0
+    for train in _trained(problem, residual):
+        part = WhitenedLeastSquares.of(white[train], series[train], std, centre)
+        without = whole.part(calibration).surprise() - part.part(calibration).surprise()
+        gain += without - (whole.surprise() - part.surprise())
+    return gain
+
+
+def _beside(noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> tuple[Array, Array, Array, Array]:
+    """Whitened columns (M A, k + c), known ones first, and residual (M A,); std and centre (k + c,) of their prior."""
+    size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
+    white = noise.whiten(np.concatenate([known.columns, raw / size], axis=2))
+    # all together are no larger than the residual: else stretches without a turn would be told of any size
+    std = np.append(known.std, np.full(raw.shape[2], _likely(raw, residual)))
+    return white, noise.whiten(residual), std, np.append(known.centre, np.zeros(raw.shape[2]))
+
+
+def _trained(problem: Problem, residual: Array) -> Iterator[NDArray[np.bool_]]:
+    """Of each fold, which of the M A rows of a residual are fitted to."""
+    fold = stretch_of(problem.time) % SETTINGS.folds
+    rows = np.repeat(fold, residual.shape[1])
+    for held in np.unique(fold):
+        yield rows != held
 
 
 def _solved(white: Array, series: Array, std: Array) -> Array:

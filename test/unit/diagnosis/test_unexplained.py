@@ -18,7 +18,14 @@ from dvl_calib_ros.diagnosis.noise import Noise, white_noise
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.selection import EffectSelection, Selected
 from dvl_calib_ros.diagnosis.standing import is_borne_out, settled
-from dvl_calib_ros.diagnosis.unexplained import holds_out, matters, unexplained
+from dvl_calib_ros.diagnosis.unexplained import (
+    FittedBeside,
+    holds_out,
+    matters,
+    predicted_elsewhere,
+    told_elsewhere,
+    unexplained,
+)
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.scenario import simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -190,3 +197,19 @@ def test_effects_that_an_unknown_cause_may_be_a_part_of_are_not_named_beside_it(
     left, rest = settled(EffectSelection(selected, base, fit, fitter, (), EFFECTS), len(EFFECTS))
     assert rest.about == "a step in time"
     assert [each.effect.name for each in left.selected] == ["lever_arm"] == [each.name for each in left.fit.effects]
+
+
+def test_what_one_stretch_alone_tells_of_an_effect_is_not_held_against_it_where_that_is_held_out():
+    """Of the only dive of a run no other stretch tells: a coupling to tilt told -86 there, and was an unknown cause."""
+    rng, time = np.random.default_rng(1), np.arange(0.0, 400.0, 0.5)
+    dives = (time >= 100.0) & (time < 120.0)
+    column = np.where(dives, 1.0, 0.01) * rng.standard_normal(len(time))
+    residual = (3.0 * column + rng.standard_normal(len(time)))[:, None]
+    noise = white_noise(rng.standard_normal((len(time), 1)), (slice(0, len(time)),), None, 0.5)
+    known = FittedBeside(np.ones((len(time), 1, 1)), np.ones(1), np.zeros(1))
+    asked = SimpleNamespace(time=time), noise, known, column[:, None, None], residual
+    assert told_elsewhere(*asked) < 0.0
+    explained = float(
+        np.sum((noise.whiten(residual)) ** 2) - np.sum(noise.whiten(residual - 3.0 * column[:, None]) ** 2)
+    )
+    assert predicted_elsewhere(*asked) == pytest.approx(explained, abs=20.0)
