@@ -171,7 +171,7 @@ class Seen:
     reference_stamps: Array
     projection: Array
     change: Callable[[], Array] = field(repr=False)
-    closely: Callable[[], tuple[Seen, NDArray[np.intp]] | None] = field(repr=False)
+    closely: Callable[[bool], tuple[Seen, NDArray[np.intp]] | None] = field(repr=False)
 
     @cached_property
     def rate_of_change(self) -> Array:
@@ -181,14 +181,19 @@ class Seen:
     @cached_property
     def close(self) -> tuple[Seen, NDArray[np.intp] | slice]:
         """The same without effects that have a memory, at times so close that these miss nothing, and which are its."""
-        return self.closely() or (self, slice(None))
+        return self.closely(False) or (self, slice(None))
+
+    @cached_property
+    def close_as_it_is(self) -> tuple[Seen, NDArray[np.intp] | slice]:
+        """`close` of a motion that is not smoothed, which would lack what a filter takes off."""
+        return self.closely(True) or (self, slice(None))
 
     def on_reference(self, injections: Sequence[Injection]) -> Array:
         """(F, 3) m/s, traces on REFERENCE, body frame."""
         lagging = [each for each in injections if isinstance(each.effect, EffectWithMemory)]
-        if not lagging or self.close[0] is self:
+        if not lagging or self.close_as_it_is[0] is self:
             return traces(injections, self.motion, ActsOn.REFERENCE)
-        close, own = self.close
+        close, own = self.close_as_it_is
         found = traces([each for each in injections if each not in lagging], self.motion, ActsOn.REFERENCE)
         return np.asarray(found + traces(lagging, close.motion, ActsOn.REFERENCE)[own])
 
@@ -449,12 +454,14 @@ class Problem:
             error -= lag.of_before(motion, error, values)
         return found
 
-    def _close(self, hypothesis: Hypothesis, recording: int, time: Array) -> tuple[Seen, NDArray[np.intp]] | None:
+    def _close(
+        self, hypothesis: Hypothesis, recording: int, time: Array, as_it_is: bool
+    ) -> tuple[Seen, NDArray[np.intp]] | None:
         """For `Seen.close`; None where the times are close."""
         between = self.grids[recording].between(time)
-        return (
-            None if between is None else (self.seen(hypothesis.without_memory, recording, between[0], True), between[1])
-        )
+        if between is None:
+            return None
+        return self.seen(hypothesis.without_memory, recording, between[0], as_it_is), between[1]
 
     def _kept_projection(self, stream: RecordedStreams, rotation: Array | None, at: Array) -> Array:
         """`projection` at times (F,) s of the attitude, of which the last few are kept."""
@@ -535,7 +542,9 @@ class Problem:
         for recording, each in enumerate(seen):
             lags = hypothesis.lags(recording)
             of_motion = lags if effect.acts_on is not ActsOn.REFERENCE else []
-            close, own = each.close if of_motion or isinstance(effect, EffectWithMemory) else (each, slice(None))
+            close, own = each.close if of_motion else (each, slice(None))
+            if isinstance(effect, EffectWithMemory):
+                close, own = each.close_as_it_is
             body = self._derivatives(hypothesis, close, effect, values[recording])
             per_recording.append(_begun(lags, each, _lagging(of_motion, close, body)[own]))
         joined = self.binned(per_recording, seen)

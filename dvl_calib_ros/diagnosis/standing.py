@@ -21,8 +21,8 @@ WEAK = 1e-3
 # Deviance that all effects together explain, up to which they must explain this share of it on stretches that they were
 # not fitted to as well: pairs that cancel but for noise do not, of real ones nine in ten do with a signal-to-noise of 5
 FAINT, BORNE_OUT = 200.0, 0.25
-# Of what effects explain: the share that an unknown cause must explain beyond its price to predict better elsewhere, and
-# the share that curves between samples leave
+# Of what effects explain, the share that an unknown cause must explain beyond its price to be asked whether it predicts
+# better elsewhere; and the share that curves between samples leave
 TOLD_FROM, OF_INEXACT = 0.5, 0.02
 # Deviance by which a bound on another may be off as numbers are rounded
 ROUNDING = 1e-3

@@ -30,7 +30,7 @@ def _velocity(at: np.ndarray, lags_s: float = 0.0) -> np.ndarray:
     return found
 
 
-def _problem(dvl_hz: float, lost: slice = slice(0, 0)) -> Problem:
+def _problem(dvl_hz: float, lost: slice = slice(0, 0), noise_mps: float = 0.0) -> Problem:
     seconds, at = np.arange(0.0, 200.0, 1.0 / dvl_hz), np.arange(0.4, 199.0)
     at = np.delete(at, lost)
 
@@ -39,11 +39,12 @@ def _problem(dvl_hz: float, lost: slice = slice(0, 0)) -> Problem:
         return Rotation.from_euler("ZYX", np.column_stack(euler))
 
     often = np.arange(0.0, 200.0, 0.2)
+    noise = noise_mps * np.random.default_rng(0).standard_normal((len(seconds), 3))
     return make_problem(
         [
             make_recording(
                 "run",
-                (seconds, attitude(seconds).apply(_velocity(seconds), inverse=True)),
+                (seconds, attitude(seconds).apply(_velocity(seconds), inverse=True) + noise),
                 (at, _velocity(at, LAGS_S)),
                 attitude=(often, attitude(often).as_quat()),
             )
@@ -84,7 +85,16 @@ def test_derivatives_are_those_of_what_is_followed_between_samples(dvl_hz, name)
         step[number] = 0.01
         ends = [problem.residual(problem.all_seen(about.moved(sign * step))) for sign in (-1.0, 1.0)]
         expected = (ends[1] - ends[0]) / 0.02
-        assert _rms(columns[:, :, number] - expected) < 0.1 * _rms(expected), number
+        # those of a slow DVL are of its smoothed velocity, which takes a little off its heave
+        assert _rms(columns[:, :, number] - expected) < 0.12 * _rms(expected), number
+
+
+def test_derivatives_beside_a_lag_hold_no_more_of_the_noise_of_a_slow_dvl():
+    """A lag of 7 ms, by itself nothing, made scales of sway and heave of 3 and 6 that fitted the DVL's noise."""
+    problem = _problem(1.0, noise_mps=0.02)
+    brief = LAGGING.with_effects([LAG], 1, {LAG.name: ({"time_constant_s": 1e-6},)})
+    with_it, without = (problem.calibration_columns(each, problem.all_seen(each)) for each in (brief, no_effect()))
+    np.testing.assert_allclose(with_it[1:], without[1:], atol=1e-5)
 
 
 def test_over_a_gap_nothing_is_told_of_what_was_between():
