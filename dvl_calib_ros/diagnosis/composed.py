@@ -158,7 +158,8 @@ class Seen:
     (F, 3) m/s smoothed DVL velocity, its frame. error: (F, 3) e, body frame.
     angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
     dvl_stamps, reference_stamps: (F,) s that these give the same times. projection: (F, A, 3) or (1, A, 3) from the
-    body frame to the axes that are compared. change: makes `rate_of_change`. closely: makes `close`.
+    body frame to the axes that are compared. change: makes `rate_of_change`. closely: makes `close`,
+    or, of True, `close_as_it_is`.
     """
 
     motion: EffectInput

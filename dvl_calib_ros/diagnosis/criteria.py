@@ -94,10 +94,7 @@ def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "", 
     is_asked = np.array([not name or each.spec.name == name for each in own])
     at, defaults = at[is_asked], np.array([each.spec.default for each in own])[is_asked]
     values = fit.hypothesis.vector()[at] - defaults
-    covariance = fit.covariance(block)
-    if isinstance(moved, np.ndarray):
-        covariance = covariance + np.outer(moved, moved)
-    covariance = covariance[np.ix_(at, at)]
+    covariance = (fit.covariance(block) + np.outer(moved, moved))[np.ix_(at, at)]
     wald = float(values @ np.linalg.solve(covariance, values)) / len(at)
     blocks = int(block.max()) + 1
     return float(f_sf(wald, len(at), max(blocks - len(at), 2)))

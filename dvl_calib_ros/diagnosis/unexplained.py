@@ -410,14 +410,13 @@ def _coloured_anew(noise: Noise, known: FittedBeside, raw: Array, residual: Arra
     joined = np.concatenate([known.columns, raw], axis=2)
     size = np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
     joined = joined / size
-    scale = size[: len(known.std)]
-    std = known.std * scale
+    std = known.std * size[: len(known.std)]
     held = np.eye(joined.shape[2])[: len(std)] / std[:, None]
     left, colour = residual, noise.white
     for _ in range(2):
         white = colour.whiten(joined)
         rows = np.concatenate([white, held])
-        series = np.concatenate([colour.whiten(residual), known.centre * scale / std])
+        series = np.concatenate([colour.whiten(residual), known.centre / known.std])
         left = residual - joined @ np.linalg.lstsq(rows, series, rcond=INDEPENDENT)[0]
         colour = noise.like(left)
     return _Coloured(colour.deviance(left), _orthonormal(white).shape[1], colour)
