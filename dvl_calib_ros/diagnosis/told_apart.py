@@ -26,7 +26,7 @@ from .clock_or_arm import (
 from .composed import Hypothesis
 from .criteria import blocks_of, fit_without, log_p_in_place, log_p_value, robust_p
 from .fitting import Fit, Fitter, n_amplitudes
-from .proposing import combined, straight_lines, told_by_other_clocks
+from .proposing import combined, straight_lines
 from .registered import FirstGuess
 from .settings import SETTINGS
 
@@ -84,12 +84,7 @@ def tell_apart(
         ]
     fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
-        selected = [
-            _or_else(each, TWO_CLOCKS)
-            if each.effect.name in TWO_CLOCKS and _could_be_the_other(fitter, fit, each, effects)
-            else each
-            for each in selected
-        ]
+        selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
     return ToldApart(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
 
 
@@ -155,22 +150,12 @@ def _clock_or_arm(
     selected = [each for each in selected if each not in beside]
     if is_shown(arm) and is_shown(clock):
         return selected
-    if arm.effect not in called_for and is_shown(clock):  # with that arm beside, which the data does not call for
-        return [each for each in selected if each is not arm]
     one, other = (arm, clock) if is_shown(arm) else (clock, arm)
     rest = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
     without = fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
     log_p = log_p_value(fit.gain_over(without), fit.dof - without.dof)
     equivalent = dict.fromkeys((other.effect.name, *one.equivalent))
     return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
-
-
-def _could_be_the_other(fitter: Fitter, fit: Fit, clock: Selected, effects: Mapping[str, Effect]) -> bool:
-    """Whether the other of two clocks in the place of one explains the data as well, with all else in."""
-    other = {*TWO_CLOCKS} - {clock.effect.name}
-    rivals = [each for each in told_by_other_clocks(fitter, fit, effects) if {*TWO_CLOCKS} & {*each.values} == other]
-    left = [fitter.fit(each, fit.noise).deviance for each in rivals]
-    return min(left, default=-np.inf) < fit.deviance + SETTINGS.indistinguishable
 
 
 def _or_else(selected: Selected, names: Sequence[str]) -> Selected:

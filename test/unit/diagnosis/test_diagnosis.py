@@ -35,7 +35,7 @@ from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings,
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm, started
 from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
-from dvl_calib_ros.diagnosis.told_apart import _clock_or_arm, _selected, tell_apart
+from dvl_calib_ros.diagnosis.told_apart import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.twice import happening_again, is_taken_back
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.base import ActsOn
@@ -207,27 +207,6 @@ def test_a_clock_that_only_stands_beside_an_arm_is_not_named_unless_it_is_shown(
     selected = [_selected(fitter, fit, effect, EFFECTS) for effect in fit.effects]
     kept = _clock_or_arm(fitter, fit, selected, len(EFFECTS), [EFFECTS["reference_time_offset"]], None)
     assert [each.effect.name for each in kept] == ["reference_time_offset"]
-
-
-def test_an_arm_that_only_stands_beside_a_clock_that_is_shown_is_not_named_in_its_place():
-    """A DVL early by 2.7 s was a clock or a lever arm, though with the arm alone 50 times as much is left."""
-    late = {"dvl_time_offset": {"seconds": -2.7}}
-    given = scenario(effects=["dvl_time_offset:seconds=-2.7"])
-    fitter, fit, _ = fitted(given, {"lever_arm": {"x_m": 0.0, "y_m": 0.0, "z_m": 0.0}, **late})
-    selected = [_selected(fitter, fit, effect, EFFECTS) for effect in fit.effects]
-    (kept,) = _clock_or_arm(fitter, fit, selected, len(EFFECTS), [EFFECTS["dvl_time_offset"]], None)
-    assert kept.effect.name == "dvl_time_offset" and "lever_arm" not in kept.equivalent
-
-
-def test_a_clock_that_the_fit_tells_from_the_other_is_not_that_one_where_registration_does_not_tell():
-    """Of a DVL late by 2.65 s with a compass error beside, the other clock leaves 18 times as much."""
-    given = scenario(effects=[LEVER, "dvl_time_offset:seconds=2.65"])
-    fitter, fit, _ = fitted(given, {"lever_arm": {"x_m": -1.9, "y_m": 0.4}, "dvl_time_offset": {"seconds": 2.65}})
-    doubt = SimpleNamespace(not_told_apart="by registration", left_open=np.zeros((7, 7)), offsets={})
-    guesses: Any = [SimpleNamespace(registration=doubt)]
-    selected = tell_apart(fitter, fit, guesses, EFFECTS, {}).selected
-    (clock,) = (each for each in selected if each.effect.name == "dvl_time_offset")
-    assert "reference_time_offset" not in clock.equivalent
 
 
 def test_the_times_of_a_water_lock_are_found_where_noise_with_a_memory_hides_all_but_the_exact_ones():
