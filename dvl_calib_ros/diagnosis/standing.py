@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Set
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from .criteria import blocks_of, price, robust_p
 from .fitting import Fit, Fitter
 from .selection import EffectSelection
 from .settings import SETTINGS
-from .unexplained import FittedBeside, Unexplained, matters, moved_by, predicted_elsewhere, told_elsewhere, unexplained
+from .unexplained import FittedBeside, Unexplained, matters, moved_by, surprise_elsewhere, told_elsewhere, unexplained
 
 # p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
 WEAK = 1e-3
@@ -50,7 +49,7 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
         other = unexplained(fitter, reduced, asked=min(wanted + lost, TOLD_FROM * drop) - ROUNDING)
         if not other.found:
             continue
-        elsewhere = _better_elsewhere(fitter, fit, reduced, names, other)
+        elsewhere = _better_elsewhere(fitter, fit, reduced, other)
         gain = max(
             (other.clear_energy - other.price) - lost - wanted,
             elsewhere - SETTINGS.indistinguishable - OF_INEXACT * drop,
@@ -86,16 +85,14 @@ def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectS
     return selection, rest
 
 
-def _better_elsewhere(fitter: Fitter, fit: Fit, reduced: Fit, names: Set[str], other: Unexplained) -> float:
-    """By how much better, in deviance, an unknown cause predicts than effects of a fit, by name, on stretches that
-    neither was fitted to. reduced: the fit without these."""
-    own = [parameter.effect.name in names for parameter in fit.hypothesis.parameters()]
-    known = FittedBeside.of(fitter.problem, reduced.hypothesis, reduced.seen, reduced.columns)
-    unknown, effects = (
-        predicted_elsewhere(fitter.problem, fit.noise, known, columns, reduced.residual)
-        for columns in (other.clearest, fit.columns[:, :, 6:][:, :, own])
-    )
-    return unknown - effects
+def _better_elsewhere(fitter: Fitter, fit: Fit, reduced: Fit, other: Unexplained) -> float:
+    """By how much better, in deviance, an unknown cause beside a reduced fit predicts stretches that it was not fitted
+    to than the fit does."""
+    problem = fitter.problem
+    whole, rest = (FittedBeside.of(problem, each.hypothesis, each.seen, each.columns) for each in (fit, reduced))
+    rest = rest.and_rest(other.clearest, reduced.residual)
+    effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
+    return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
 
 
 def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:

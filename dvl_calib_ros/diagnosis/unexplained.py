@@ -87,6 +87,14 @@ class FittedBeside(NamedTuple):
         std, centre = np.append(prior_std(hypothesis)[:k], sizes), np.append(hypothesis.vector()[:k], none)
         return FittedBeside(np.concatenate([columns, unshown], axis=2), std, centre)
 
+    def and_rest(self, raw: Array, residual: Array) -> FittedBeside:
+        """And columns raw (M, A, c), of unit size, of what a residual (M, A) follows."""
+        size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
+        # all together are no larger than the residual: else stretches without a turn would be told of any size
+        std, none = np.full(raw.shape[2], _likely(raw, residual)), np.zeros(raw.shape[2])
+        columns = np.concatenate([self.columns, raw / size], axis=2)
+        return FittedBeside(columns, np.append(self.std, std), np.append(self.centre, none))
+
 
 def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
     """Look for what the residual of a fit still follows.
@@ -309,10 +317,8 @@ def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     noise, raw, known = fit.noise, rest.clearest, FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
     if noise.is_coloured:
         noise = _coloured_anew(noise, known, raw, fit.residual).noise
-    size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
-    white = noise.whiten(np.concatenate([known.columns, raw / size], axis=2))
-    std = np.append(known.std, np.full(raw.shape[2], _likely(raw, fit.residual)))
-    return _solved(white, noise.whiten(-fit.residual), std)[: fit.columns.shape[2]]
+    both = known.and_rest(raw, fit.residual)
+    return _solved(noise.whiten(both.columns), noise.whiten(-fit.residual), both.std)[: fit.columns.shape[2]]
 
 
 def _likely(raw: Array, residual: Array) -> float:
@@ -328,40 +334,30 @@ def told_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Arr
     what is there tells of itself elsewhere. Known ones have a prior, without which the scale of a heave that is hardly
     there would take in what is left.
     """
-    white, series, std, centre = _beside(noise, known, raw, residual)
-    gain, k = 0.0, len(known.std)
+    both, series = known.and_rest(raw, residual), noise.whiten(residual)
+    white, k = noise.whiten(both.columns), len(known.std)
+    gain = 0.0
     for train in _trained(problem, residual):
-        system = WhitenedLeastSquares.of(white[train], series[train], std, centre)
+        system = WhitenedLeastSquares.of(white[train], series[train], both.std, both.centre)
         base = system.part(np.arange(k)).solution()
         left = series[~train] - white[~train][:, :k] @ base
         gain += float(left @ left - np.sum((series[~train] - white[~train] @ system.solution()) ** 2))
     return gain
 
 
-def predicted_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> float:
-    """By how much better, in deviance, a residual (M, A) is predicted with columns raw (M, A, c), beside known ones, on
-    stretches of time that they were not fitted to.
+def surprise_elsewhere(problem: Problem, noise: Noise, fitted: FittedBeside, residual: Array) -> float:
+    """How unlikely a residual (M, A) is, as deviance, on stretches of time that columns were not fitted to: of the same
+    data it is the lower, the better it is predicted.
 
-    As they are known there: of the only dive of a run, held out, no other stretch tells what an effect of the pitch
-    does, and none claims to.
+    By how well the columns are known there: of the only dive of a run, held out, no other stretch tells what an effect
+    of the pitch does, and none claims to.
     """
-    white, series, std, centre = _beside(noise, known, raw, residual)
-    whole, calibration = WhitenedLeastSquares.of(white, series, std, centre), np.arange(len(known.std))
-    gain = 0.0
-    for train in _trained(problem, residual):
-        part = WhitenedLeastSquares.of(white[train], series[train], std, centre)
-        without = whole.part(calibration).surprise() - part.part(calibration).surprise()
-        gain += without - (whole.surprise() - part.surprise())
-    return gain
-
-
-def _beside(noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> tuple[Array, Array, Array, Array]:
-    """Whitened columns (M A, k + c), known ones first, and residual (M A,); std and centre (k + c,) of their prior."""
-    size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
-    white = noise.whiten(np.concatenate([known.columns, raw / size], axis=2))
-    # all together are no larger than the residual: else stretches without a turn would be told of any size
-    std = np.append(known.std, np.full(raw.shape[2], _likely(raw, residual)))
-    return white, noise.whiten(residual), std, np.append(known.centre, np.zeros(raw.shape[2]))
+    white, series = noise.whiten(fitted.columns), noise.whiten(residual)
+    whole = WhitenedLeastSquares.of(white, series, fitted.std, fitted.centre).surprise()
+    return sum(
+        whole - WhitenedLeastSquares.of(white[train], series[train], fitted.std, fitted.centre).surprise()
+        for train in _trained(problem, residual)
+    )
 
 
 def _trained(problem: Problem, residual: Array) -> Iterator[NDArray[np.bool_]]:

@@ -22,7 +22,7 @@ from dvl_calib_ros.diagnosis.unexplained import (
     FittedBeside,
     holds_out,
     matters,
-    predicted_elsewhere,
+    surprise_elsewhere,
     told_elsewhere,
     unexplained,
 )
@@ -207,9 +207,10 @@ def test_what_one_stretch_alone_tells_of_an_effect_is_not_held_against_it_where_
     residual = (3.0 * column + rng.standard_normal(len(time)))[:, None]
     noise = white_noise(rng.standard_normal((len(time), 1)), (slice(0, len(time)),), None, 0.5)
     known = FittedBeside(np.ones((len(time), 1, 1)), np.ones(1), np.zeros(1))
-    asked = SimpleNamespace(time=time), noise, known, column[:, None, None], residual
-    assert told_elsewhere(*asked) < 0.0
-    explained = float(
-        np.sum((noise.whiten(residual)) ** 2) - np.sum(noise.whiten(residual - 3.0 * column[:, None]) ** 2)
-    )
-    assert predicted_elsewhere(*asked) == pytest.approx(explained, abs=20.0)
+    problem, raw = SimpleNamespace(time=time), column[:, None, None]
+    assert told_elsewhere(problem, noise, known, raw, residual) < 0.0
+    left = noise.whiten(residual - 3.0 * column[:, None])
+    explained = float(np.sum(noise.whiten(residual) ** 2) - np.sum(left**2))
+    with_it = surprise_elsewhere(problem, noise, known.and_rest(raw, residual), residual)
+    predicted = surprise_elsewhere(problem, noise, known, residual) - with_it
+    assert predicted == pytest.approx(explained, abs=20.0)
