@@ -20,9 +20,10 @@ WEAK = 1e-3
 # Deviance that all effects together explain, up to which they must explain this share of it on stretches that they were
 # not fitted to as well: pairs that cancel but for noise do not, of real ones nine in ten do with a signal-to-noise of 5
 FAINT, BORNE_OUT = 200.0, 0.25
-# Of what effects explain, the share that an unknown cause must explain beyond its price to be asked whether it predicts
-# better elsewhere; and the share that curves between samples leave
-TOLD_FROM, OF_INEXACT = 0.5, 0.02
+# Of what effects explain, the shares that an unknown cause must explain to be asked whether it predicts better: at
+# first sight, beyond its price, and beyond what made-up recordings show to be chance; and what curves between samples
+# leave
+TOLD_FROM, AS_MUCH, OF_INEXACT = 0.5, 0.8, 0.02
 # Deviance by which a bound on another may be off as numbers are rounded
 ROUNDING = 1e-3
 
@@ -49,11 +50,10 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
         other = unexplained(fitter, reduced, asked=min(wanted + lost, TOLD_FROM * drop) - ROUNDING)
         if not other.found:
             continue
-        elsewhere = _better_elsewhere(fitter, fit, reduced, other)
-        gain = max(
-            (other.clear_energy - other.price) - lost - wanted,
-            elsewhere - SETTINGS.indistinguishable - OF_INEXACT * drop,
-        )
+        gain = (other.clear_energy - other.price) - lost - wanted
+        if other.clear_energy > AS_MUCH * drop:
+            better = _better_elsewhere(fitter, fit, reduced, other)
+            gain = max(gain, better - SETTINGS.indistinguishable - OF_INEXACT * drop)
         if gain < 0.0 or not matters(fitter.problem, reduced, other):
             continue
         if best is None or gain > best[0]:

@@ -10,6 +10,7 @@ import pytest
 from test_diagnosis import LEVER, fitted, recording_of, scenario, with_added
 
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.diagnosis import standing
 from dvl_calib_ros.diagnosis import unexplained as looking
 from dvl_calib_ros.diagnosis.composed import Offsets, _by_turn, make_problem, no_effect
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
@@ -214,3 +215,22 @@ def test_what_one_stretch_alone_tells_of_an_effect_is_not_held_against_it_where_
     with_it = surprise_elsewhere(problem, noise, known.and_rest(raw, residual), residual)
     predicted = surprise_elsewhere(problem, noise, known, residual) - with_it
     assert predicted == pytest.approx(explained, abs=20.0)
+
+
+@pytest.mark.parametrize(("share", "kept"), [(0.66, True), (0.9, False)])
+def test_an_unknown_cause_that_explains_much_less_than_effects_do_is_not_in_their_place(
+    stepped, monkeypatch, share, kept
+):
+    """Functions of the speed, 66 % of a bias of 5 cm/s, predicted better, by what noise in the motion makes."""
+    fitter, fit = stepped
+    drift = EFFECTS["misalignment_drift"]
+    fitted_with = fitter.fit(no_effect().with_effects([drift], 1, {drift.name: (drift.defaults,)}), fit.noise)
+    nothing = fit.columns[:, :, :0]
+    told = share * (fit.deviance - fitted_with.deviance)
+    cause = looking.Unexplained(-50.0, told, "speed", nothing, nothing, told, told)
+    monkeypatch.setattr(standing, "unexplained", lambda *_, **__: cause)
+    monkeypatch.setattr(standing, "matters", lambda _, of, __: of.effects == ())
+    monkeypatch.setattr(standing, "_better_elsewhere", lambda *_: 1000.0)
+    selected = (Selected(drift, -50.0, ()),)
+    left, _ = settled(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS), len(EFFECTS))
+    assert bool(left.selected) == kept
