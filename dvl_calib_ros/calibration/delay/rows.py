@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from ..frames import Array, Vector, cross, rotation_from_quaternion, skew, slerps
+from ..frames import Array, Vector, cross, rotation_from_quaternion, skew, slerps, squared
 from ..kalman import whitening
 from ..models.own import g1_errors, g1_heave_errors
 from ..robust import median, steps
@@ -254,9 +254,9 @@ def matched(
     times, block = reference.times, reference_parts.number
     turning, turning_noise = angular_velocity_at(turns, times, imu_gap_s, reference_parts)
     body, noise = seen.velocity, seen.noise
-    moving = (body**2).sum(axis=1) >= min_speed**2
+    moving = squared(body) >= min_speed**2
     if max_turn_rate > 0.0:
-        moving &= (turning**2).sum(axis=1) <= max_turn_rate**2
+        moving &= squared(turning) <= max_turn_rate**2
     read = _read(dvl, dvl_parts, times, reference_parts, steps)
     use = seen.known & ~np.isnan(turning[:, 0]) & moving & read.known
     white = whitening(noise + np.where(reference.claimed[:, None, None], noise_dvl[block], 0.0))

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..delay.rows import attitude_at
 from ..extrinsics import rotation_of, turn_between
-from ..frames import Array, cross, nearest_rotation, skew
+from ..frames import Array, cross, nearest_rotation, skew, squared
 from ..robust import median
 from ..samples import Index, Mask
 from ..time_blocks import TimeBlocks
@@ -157,7 +157,7 @@ class MotionFit:
         self._motion, self._lever_arm, self._curves = motion, lever_arm, curves
         self.is_turned = motion.in_earth and motion.has_attitude
         m = motion
-        moving = np.flatnonzero((m.reference**2).sum(axis=1) >= SLOW_MPS**2)
+        moving = np.flatnonzero(squared(m.reference) >= SLOW_MPS**2)
         if len(moving) > most:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self.times, self._velocity = m.reference_times[moving], m.reference[moving]
@@ -210,7 +210,7 @@ class MotionFit:
         if rows is None or solved is None:
             return None
         _, information, level, weight = self._solved(x, rows, nominal, rotation, in_time)
-        squares, axes = (rows.residual**2).sum(axis=1), rows.residual.shape[1]
+        squares, axes = squared(rows.residual), rows.residual.shape[1]
         claims = cache(partial(_claimed, rows, information, level, weight))
         return Fitted(x, rotation, level, len(rows.at), rows.speed, squares, axes, rows.at, claims)
 
@@ -219,7 +219,7 @@ class MotionFit:
         rows = self._rows(x, rotation, None)
         if rows is None:
             return np.zeros(0, dtype=np.intp), np.zeros(0)
-        return rows.at, _robust((rows.residual**2).sum(axis=1), rows.residual.shape[1], level)
+        return rows.at, _robust(squared(rows.residual), rows.residual.shape[1], level)
 
     def _streams(self, reference: float, apart: float, among: Fitted | None = None) -> _Compared | None:
         """Which references (J,), and B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), noise gain of
@@ -279,7 +279,7 @@ class MotionFit:
                 residual = np.einsum("nij,nj->ni", attitude, residual)
                 jacobian = attitude @ jacobian
             residual, jacobian = residual[:, measured], jacobian[:, measured]
-        speed = float(np.sqrt((body**2).sum(axis=1).mean()))
+        speed = float(np.sqrt(squared(body).mean()))
         return _Rows(residual, jacobian, at, gain * self.dvl_noise * residual.shape[1], speed)
 
     def _solved(
@@ -287,7 +287,7 @@ class MotionFit:
     ) -> tuple[Array, Array, float, Array]:
         """The step (9,), its information (9, 9), the level of noise (m/s), and the weight of each row (J,)."""
         axes = rows.residual.shape[1]
-        squares = (rows.residual**2).sum(axis=1)
+        squares = squared(rows.residual)
         level2 = max(float(median(squares)) / _MEDIAN_CHI2[axes - 1], 1e-8)
         weight = 1.0 / (1.0 + squares / (HALF_AT**2 * axes * level2))
         h = rows.jacobian.reshape(-1, N)

@@ -25,6 +25,7 @@ from ..frames import (
     nearest_rotation,
     quaternion_from_rotation,
     rpy_from_rotation,
+    squared,
     whole_degrees,
 )
 from ..imu_alignment import quaternion_product
@@ -114,7 +115,7 @@ class Readings:
         self._motions: dict[Reading, MotionStreams] = {}
         self._fits: dict[Reading, MotionFit] = {}
         times, dvl = motion.dvl
-        use = covered(motion.reference_times, times) & ((dvl * dvl).sum(axis=1) > SLOW_MPS**2)
+        use = covered(motion.reference_times, times) & (squared(dvl) > SLOW_MPS**2)
         if motion.has_attitude:
             use &= attitude_at(motion.imu, times, GAP_S)[1]
         self._at, self._dvl = times[use], dvl[use]
@@ -126,7 +127,7 @@ class Readings:
 
     def beside_noise(self, left: float) -> float:
         """Of a share of the speed that is left what is not the reference's own noise."""
-        square = float((self._dvl**2).sum(axis=1).mean())
+        square = float(squared(self._dvl).mean())
         return math.sqrt(max(left**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
 
     def agreements(self, readings: Sequence[Reading], rotation_dvl_from_body: Array | None) -> list[Agreement]:
@@ -154,7 +155,7 @@ class Readings:
             speed = _rms(dvl)
             best = best_rotation(dvl, body, likely)
             # a second time without the worst
-            errors = ((dvl - body @ best.T) ** 2).sum(axis=1)
+            errors = squared(dvl - body @ best.T)
             kept = errors <= np.sort(errors)[int(KEPT_SHARE * (len(errors) - 1))]
             best = best_rotation(dvl[kept], body[kept], likely)
             best_left = _rms(dvl - body @ best.T) / speed
@@ -250,7 +251,7 @@ def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> b
 
 def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
     """The rotation M (3, 3) that minimises mean |a - M b|² + AS_IT_IS |b|² |M - as_it_is|²; a, b: (N, 3)."""
-    square = float((b**2).sum(axis=1).mean())
+    square = float(squared(b).mean())
     return nearest_rotation(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
 
 
@@ -273,7 +274,7 @@ def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:
 
 
 def _rms(difference: Array) -> float:
-    return math.sqrt(float(_better((difference**2).sum(axis=1)).mean()))
+    return math.sqrt(float(_better(squared(difference)).mean()))
 
 
 def _better(squares: Array) -> Array:

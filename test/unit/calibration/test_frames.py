@@ -17,6 +17,7 @@ from dvl_calib_ros.calibration.frames import (
     rpy_from_rotation,
     skew,
     slerps,
+    squared,
 )
 
 RPY = np.array([0.4, -0.7, 2.1])
@@ -25,6 +26,14 @@ RPY = np.array([0.4, -0.7, 2.1])
 def test_skew_is_the_cross_product(rng):
     a, b = rng.normal(size=(2, 7, 3))
     np.testing.assert_allclose(np.einsum("nij,nj->ni", skew(a), b), np.cross(a, b))
+
+
+@pytest.mark.parametrize("shape", [(3,), (500, 3), (500, 4), (20, 30, 2), (0, 3), (7, 1)])
+def test_squared_is_the_sum_of_squares_to_the_last_bit(rng, shape):
+    a = rng.normal(size=shape)
+    for each in (a, np.asfortranarray(a), a[..., ::-1]):
+        np.testing.assert_array_equal(squared(each), (each**2).sum(axis=-1))
+    assert squared(np.array([np.nan, 1.0, 2.0])) != 5.0
 
 
 def test_rpy_turns_about_fixed_axes_x_then_y_then_z_as_in_urdf():
