@@ -73,7 +73,7 @@ def driven(
     yaw = lfilter([dt / 3.0], [1.0, dt / 3.0 - 1.0], wanted - wanted[0]) + wanted[0]
     pitch = 0.02 * np.sin(time / 7.0) + (0.15 * np.sin(time / 90.0) if depths else 0.0)
     roll = 0.03 * np.sin(time / 5.0)
-    rotation = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
+    rotation = Rotation.from_quat(_quaternions(yaw, pitch, roll))
     # moves where it points, with some sway in turns
     body = np.column_stack([np.full(len(time), speed), 0.1 * np.gradient(yaw, dt), np.zeros(len(time))])
     position = np.cumsum(rotation.apply(body), axis=0) * dt
@@ -104,8 +104,21 @@ def driven(
     return Driven(
         stamps[at],
         velocity,
-        Rotation.from_euler("ZYX", told[at]).as_quat(),
+        _quaternions(*told[at].T),
         Fixes(stamps[fix_at] + round(truth.late_s * 1e9), fixes, variance),
+    )
+
+
+def _quaternions(yaw: Array, pitch: Array, roll: Array) -> Array:
+    """(N, 4), x y z w, of angles (N,) rad: a tenth of the time of SciPy's `from_euler`, which takes any axes."""
+    (cy, cp, cr), (sy, sp, sr) = (of(0.5 * np.stack([yaw, pitch, roll])) for of in (np.cos, np.sin))
+    return np.column_stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ]
     )
 
 
