@@ -47,6 +47,9 @@ class SampleWriter:
     def __init__(self, bag: BagWriter) -> None:
         self._bag = bag
         self._types: Any = bag.typestore.types
+        # what no message has anything of its own in is made once
+        self._still = self._types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        self._exact, self._unknown = np.zeros(9), np.array([-1.0, *[0.0] * 8])
 
     def recording(self, *sensors: Iterable[Sample | SatelliteFix]) -> None:
         """Write the samples of any sensors, each in order of time, to the node's topics in order of time."""
@@ -85,15 +88,14 @@ class SampleWriter:
     def imu(self, topic: str, sample: ImuSample, frame_id: str = "base_link") -> None:
         """Write attitude and angular velocity as Imu, with covariance -1 where there is none."""
         quaternion, vector = self._types["geometry_msgs/msg/Quaternion"], self._types["geometry_msgs/msg/Vector3"]
-        unknown = np.array([-1.0, *[0.0] * 8])
         message = self._types[IMU_TYPE](
             header=self._header(sample.stamp_ns, frame_id),
             orientation=quaternion(*(sample.orientation or (0.0, 0.0, 0.0, 1.0))),
-            orientation_covariance=np.zeros(9) if sample.orientation else unknown,
-            angular_velocity=vector(*(sample.angular_velocity or (0.0, 0.0, 0.0))),
-            angular_velocity_covariance=np.zeros(9) if sample.angular_velocity else unknown,
-            linear_acceleration=vector(0.0, 0.0, 0.0),
-            linear_acceleration_covariance=unknown,
+            orientation_covariance=self._exact if sample.orientation else self._unknown,
+            angular_velocity=vector(*sample.angular_velocity) if sample.angular_velocity else self._still,
+            angular_velocity_covariance=self._exact if sample.angular_velocity else self._unknown,
+            linear_acceleration=self._still,
+            linear_acceleration_covariance=self._unknown,
         )
         self._bag.message(topic, IMU_TYPE, sample.stamp_ns, message)
 
@@ -118,7 +120,7 @@ class SampleWriter:
         covariance = np.zeros((6, 6))
         if sample.covariance is not None:
             covariance[:3, :3] = sample.covariance
-        twist = types["geometry_msgs/msg/Twist"](vector(*sample.velocity), vector(0.0, 0.0, 0.0))
+        twist = types["geometry_msgs/msg/Twist"](vector(*sample.velocity), self._still)
         inner = types["geometry_msgs/msg/TwistWithCovariance"](twist, covariance.ravel())
         return types[TWIST_TYPE](self._header(sample.stamp_ns, frame_id), inner)
 
