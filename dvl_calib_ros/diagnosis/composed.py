@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from typing import Any, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,8 +158,8 @@ class Seen:
     (F, 3) m/s smoothed DVL velocity, its frame. error: (F, 3) e, body frame.
     angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
     dvl_stamps, reference_stamps: (F,) s that these give the same times. projection: (F, A, 3) or (1, A, 3) from the
-    body frame to the axes that are compared. change: makes `rate_of_change`. closely: makes `close`,
-    or, of True, `close_as_it_is`.
+    body frame to the axes that are compared. change, closely, as_it_is: make `rate_of_change`, `close` and
+    `close_as_it_is`.
     """
 
     motion: EffectInput
@@ -172,7 +172,8 @@ class Seen:
     reference_stamps: Array
     projection: Array
     change: Callable[[], Array] = field(repr=False)
-    closely: Callable[[bool], tuple[Seen, NDArray[np.intp]] | None] = field(repr=False)
+    closely: Callable[[], tuple[Seen, NDArray[np.intp]] | None] = field(repr=False)
+    as_it_is: Callable[[], tuple[EffectInput, NDArray[np.intp]] | None] = field(repr=False)
 
     @cached_property
     def rate_of_change(self) -> Array:
@@ -182,25 +183,42 @@ class Seen:
     @cached_property
     def close(self) -> tuple[Seen, NDArray[np.intp] | slice]:
         """The same without effects that have a memory, at times so close that these miss nothing, and which are its."""
-        return self.closely(False) or (self, slice(None))
+        return self.closely() or (self, slice(None))
 
     @cached_property
-    def close_as_it_is(self) -> tuple[Seen, NDArray[np.intp] | slice]:
-        """`close` of a motion that is not smoothed, which would lack what a filter takes off."""
-        return self.closely(True) or (self, slice(None))
+    def close_as_it_is(self) -> tuple[EffectInput, NDArray[np.intp] | slice]:
+        """The motion of `close` not smoothed: smoothed, it would lack what a filter takes off."""
+        return self.as_it_is() or (self.motion, slice(None))
 
     def on_reference(self, injections: Sequence[Injection]) -> Array:
         """(F, 3) m/s, traces on REFERENCE, body frame."""
         lagging = [each for each in injections if isinstance(each.effect, EffectWithMemory)]
-        if not lagging or self.close_as_it_is[0] is self:
+        if not lagging or self.close_as_it_is[0] is self.motion:
             return traces(injections, self.motion, ActsOn.REFERENCE)
         close, own = self.close_as_it_is
         found = traces([each for each in injections if each not in lagging], self.motion, ActsOn.REFERENCE)
-        return np.asarray(found + traces(lagging, close.motion, ActsOn.REFERENCE)[own])
+        return np.asarray(found + traces(lagging, close, ActsOn.REFERENCE)[own])
 
     def compared(self, body: Array) -> Array:
         """(F, 3) or (F, 3, p) of the body frame along the axes that are compared, (F, A) or (F, A, p)."""
         return self.projection @ body if body.ndim > 2 else _turned(self.projection, body)
+
+
+class _Moved(NamedTuple):
+    """What a DVL says of the motion at F times. motion, at_dvl, angles, body_from_measured, dvl_stamps: as of `Seen`.
+    raw, smooth: (F, 3) m/s, what it measured, its frame. added: (F, 3) m/s that a lever arm that is known, and effects
+    before the reference, add to the motion, body frame. attitude_stamps: (F,) s.
+    """
+
+    motion: EffectInput
+    at_dvl: EffectInput
+    raw: Array
+    smooth: Array
+    added: Array
+    angles: Array
+    body_from_measured: Array
+    dvl_stamps: Array
+    attitude_stamps: Array
 
 
 class SeenAgain(Sequence[Seen]):
@@ -412,57 +430,72 @@ class Problem:
 
     # ------------------------------------------------------------------ the model
 
-    def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None, as_it_is: bool = False) -> Seen:
-        """A recording through a hypothesis; at: true times (F,) s, by default those of the grid. as_it_is: its motion
-        is that of a slow DVL as it is: smoothed, it lacks what a filter would take off."""
+    def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None) -> Seen:
+        """A recording through a hypothesis; at: true times (F,) s, by default those of the grid."""
         stream, injections = self.recordings[recording], hypothesis.injections(recording)
         time = self.grids[recording].true_time(injections) if at is None else at
-        dvl, reference, attitude = (
-            time + late(injections, clock, time)
-            for clock in (ActsOn.DVL_CLOCK, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_CLOCK)
-        )
+        reference = time + late(injections, ActsOn.REFERENCE_CLOCK, time)
         by_dvl = self.grids[recording].clock is ActsOn.DVL_CLOCK
-        rotation, rates = self._oriented(stream, attitude)
         curve = stream.reference.quiet if by_dvl else stream.reference
         g = curve.kept.at("values", reference, lambda: curve(reference))
+        moved = self._moved(hypothesis, recording, time)
+        rotation = moved.motion.rotation_enu_from_body
         if stream.frame is not VelocityFrame.BODY and rotation is not None:
             g = np.einsum("nji,nj->ni", rotation, g)
-        raw, smooth = _measured(stream.dvl, dvl, by_dvl)
-        moving = stream.dvl.smooth
-        if as_it_is and stream.dvl.interval > FAST_ENOUGH_S:
-            moving, smooth = stream.dvl, raw
+        error = _turned(moved.body_from_measured, moved.raw) - moved.added - g
+        found = Seen(
+            motion=moved.motion,
+            at_dvl=moved.at_dvl,
+            measured=moved.smooth,
+            error=error,
+            angles=moved.angles,
+            body_from_measured=moved.body_from_measured,
+            dvl_stamps=moved.dvl_stamps,
+            reference_stamps=reference,
+            projection=self._kept_projection(stream, rotation, moved.attitude_stamps),
+            change=partial(_change, stream.dvl.smooth, moved.dvl_stamps),
+            closely=partial(self._close, hypothesis, recording, time),
+            as_it_is=partial(self._close_as_it_is, hypothesis, recording, time),
+        )
+        error -= found.on_reference(injections)  # in place: what it is seen as close by is kept
+        for lag, values in hypothesis.lags(recording):
+            error -= lag.of_before(found.motion, error, values)
+        return found
+
+    def _moved(self, hypothesis: Hypothesis, recording: int, time: Array, as_it_is: bool = False) -> _Moved:
+        """What a DVL says of the motion at true times (F,) s; as_it_is: not smoothed, of a slow one."""
+        stream, injections = self.recordings[recording], hypothesis.injections(recording)
+        dvl, attitude = (time + late(injections, clock, time) for clock in (ActsOn.DVL_CLOCK, ActsOn.ATTITUDE_CLOCK))
+        rotation, rates = self._oriented(stream, attitude)
+        raw, smooth = _measured(stream.dvl, dvl, self.grids[recording].clock is ActsOn.DVL_CLOCK)
+        followed = raw if as_it_is and stream.dvl.interval > FAST_ENOUGH_S else smooth
         lever = np.zeros(3) if rates is None or not self.lever_arm.any() else cross(rates, self.lever_arm)
         nominal = self.rotation_dvl_from_body
         turn: Array = np.zeros(3)
         matrix = hypothesis.body_from_measured(nominal)
-        measured = EffectInput(time, _turned(matrix, smooth), nominal, rotation, rates, stream.frame, 0.0)
+        measured = EffectInput(time, _turned(matrix, followed), nominal, rotation, rates, stream.frame, 0.0)
         if any(each.effect.acts_on is ActsOn.MOUNTING for each in injections):
             # turned a little otherwise, it is as fast
             turn = turns(injections, _undone(injections, measured, ActsOn.DVL, matrix @ nominal)[0])
             matrix = hypothesis.body_from_measured(nominal, turn)
-            measured = replace(measured, velocity_body=_turned(matrix, smooth))
+            measured = replace(measured, velocity_body=_turned(matrix, followed))
         at_dvl, of_dvl = _undone(injections, measured, ActsOn.DVL, matrix @ nominal)
         motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
         motion, of_motion = _undone(injections, motion, ActsOn.MOTION, None)
-        error = _turned(matrix, raw) - of_dvl - of_motion - lever - g
-        projection = self._kept_projection(stream, rotation, attitude)
-        angles = hypothesis.phi + turn
-        change = partial(_change, moving, dvl)
-        closely = partial(self._close, hypothesis, recording, time)
-        found = Seen(motion, at_dvl, smooth, error, angles, matrix, dvl, reference, projection, change, closely)
-        error -= found.on_reference(injections)  # in place: what it is seen as close by is kept
-        for lag, values in hypothesis.lags(recording):
-            error -= lag.of_before(motion, error, values)
-        return found
+        added = of_dvl + of_motion + lever
+        return _Moved(motion, at_dvl, raw, smooth, added, hypothesis.phi + turn, matrix, dvl, attitude)
 
-    def _close(
-        self, hypothesis: Hypothesis, recording: int, time: Array, as_it_is: bool
-    ) -> tuple[Seen, NDArray[np.intp]] | None:
+    def _close(self, hypothesis: Hypothesis, recording: int, time: Array) -> tuple[Seen, NDArray[np.intp]] | None:
         """For `Seen.close`; None where the times are close."""
         between = self.grids[recording].between(time)
-        if between is None:
-            return None
-        return self.seen(hypothesis.without_memory, recording, between[0], as_it_is), between[1]
+        return between and (self.seen(hypothesis.without_memory, recording, between[0]), between[1])
+
+    def _close_as_it_is(
+        self, hypothesis: Hypothesis, recording: int, time: Array
+    ) -> tuple[EffectInput, NDArray[np.intp]] | None:
+        """For `Seen.close_as_it_is`; None where the times are close."""
+        between = self.grids[recording].between(time)
+        return between and (self._moved(hypothesis.without_memory, recording, between[0], True).motion, between[1])
 
     def _kept_projection(self, stream: RecordedStreams, rotation: Array | None, at: Array) -> Array:
         """`projection` at times (F,) s of the attitude, of which the last few are kept."""
@@ -545,8 +578,10 @@ class Problem:
             of_motion = lags if effect.acts_on is not ActsOn.REFERENCE else []
             close, own = each.close if of_motion else (each, slice(None))
             if isinstance(effect, EffectWithMemory):
-                close, own = each.close_as_it_is
-            body = self._derivatives(hypothesis, close, effect, values[recording])
+                as_it_is, own = each.close_as_it_is
+                body = _of_trace(effect, as_it_is, values[recording])
+            else:
+                body = self._derivatives(hypothesis, close, effect, values[recording])
             per_recording.append(_begun(lags, each, _lagging(of_motion, close, body)[own]))
         joined = self.binned(per_recording, seen)
         if not effect.of_the_day or len(seen) == 1:
@@ -595,20 +630,10 @@ class Problem:
             by_turn = _by_turn(hypothesis, seen, seen.measured)
             stacked = np.stack([np.broadcast_to(slope, seen.error.shape) for slope in slopes], axis=2)
             return np.asarray(by_turn @ stacked)
-        motion = seen.at_dvl if effect.acts_on is ActsOn.DVL else seen.motion
-        if all(spec.linear for spec in specs):
-            none = {**values, **{spec.name: 0.0 for spec in specs}}
-            slopes = [effect.trace(motion, {**none, spec.name: 1.0}) for spec in specs]
-            own = {spec.name for spec in effect.parameters}
-            if any(value for name, value in none.items() if name not in own):  # a height that is known and not fitted
-                still = effect.trace(motion, none)
-                slopes = [slope - still for slope in slopes]
-        else:
-            slopes = [_difference(spec, values, lambda at: effect.trace(motion, at)) for spec in specs]
-        stacked = -np.stack(slopes, axis=2)
         if effect.acts_on is not ActsOn.DVL:
-            return stacked
-        return np.asarray(seen.body_from_measured @ self.rotation_dvl_from_body @ stacked)
+            return _of_trace(effect, seen.motion, values)
+        of_dvl = _of_trace(effect, seen.at_dvl, values)
+        return np.asarray(seen.body_from_measured @ self.rotation_dvl_from_body @ of_dvl)
 
     def _by_late(self, seen: Seen, clock: ActsOn) -> Array:
         """(F, 3) d e / d lateness of a clock, m/s per s, body frame."""
@@ -707,6 +732,21 @@ def _left_jacobian(angles: Array) -> Array:
     cross = skew(angles)
     once, twice = (1.0 - np.cos(size)) / square, (size - np.sin(size)) / (square * size)
     return np.asarray(np.eye(3) + once * cross + twice * (cross @ cross))
+
+
+def _of_trace(effect: Effect, motion: EffectInput, values: Values) -> Array:
+    """(F, 3, p) d e / d parameters of an effect of its trace on a motion, in the frame of that."""
+    specs = amplitudes(effect)
+    if all(spec.linear for spec in specs):
+        none = {**values, **{spec.name: 0.0 for spec in specs}}
+        slopes = [effect.trace(motion, {**none, spec.name: 1.0}) for spec in specs]
+        own = {spec.name for spec in effect.parameters}
+        if any(value for name, value in none.items() if name not in own):  # a height that is known and not fitted
+            still = effect.trace(motion, none)
+            slopes = [slope - still for slope in slopes]
+    else:
+        slopes = [_difference(spec, values, lambda at: effect.trace(motion, at)) for spec in specs]
+    return -np.stack(slopes, axis=2)
 
 
 def _difference(spec: EffectParameter, values: Values, of: Callable[[Values], Array]) -> Array:

@@ -48,10 +48,14 @@ class WhitenedLeastSquares:
         right = self.gram[:-1, -1] + self.centre / self.std**2
         return np.linalg.solve(self._normal, right)
 
+    def squares(self, x: Array) -> float:
+        """‖target - columns x‖², at x (n,)."""
+        extended = np.append(-x, 1.0)
+        return float(extended @ self.gram @ extended)
+
     def misfit(self, x: Array) -> float:
         """What is minimised, at x (n,)."""
-        extended = np.append(-x, 1.0)
-        return float(extended @ self.gram @ extended + np.sum(((x - self.centre) / self.std) ** 2))
+        return self.squares(x) + float(np.sum(((x - self.centre) / self.std) ** 2))
 
     def surprise(self) -> float:
         """-2 log of how likely the target was, but for what columns have no part in and for the prior's own size."""

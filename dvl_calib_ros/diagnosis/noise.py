@@ -28,6 +28,8 @@ ORDERS = ((0, 0), (1, 0), (1, 1))
 MAX_FREQUENCIES = 300
 # Share of a frequency that a fit takes in, from which on the rest tells nothing of the noise
 MOST_TAKEN = 0.99
+# m/s: less than any instrument writes. Of streams that are alike to rounding, calibrations would have no other end
+LEAST_MPS = 1e-6
 Integers = NDArray[np.intp]
 
 
@@ -201,7 +203,7 @@ def segments_of(times: Sequence[Array]) -> tuple[slice, ...]:
 def white_noise(residual: Array, segments: tuple[slice, ...], rotation: Array | None, interval: float = 1.0) -> Noise:
     """White noise with the standard deviation per axis that a residual (M, A) has, robustly. interval: s."""
     scaled = residual if rotation is None else np.einsum("mij,mj->mi", rotation, residual)
-    stds = np.maximum(robust_std(scaled), 1e-9)
+    stds = np.maximum(robust_std(scaled), LEAST_MPS)
     axes = tuple(Arma(np.zeros(0), 0.0, float(std), 1.0) for std in stds)
     return Noise(segments, rotation, np.ones_like(residual), axes, float(np.exp(-interval / LONGEST_S)))
 
@@ -234,7 +236,7 @@ def _fit_arma(
     arma = Arma(coefficients, ma, 1.0, _ratio(coefficients, ma))
     left = 1.0 if taken is None else 1.0 - (2.0 * taken.sum() - taken[0] - (taken[-1] if n % 2 == 0 else 0.0)) / n
     std = float(np.sqrt(np.mean(arma.innovations(series, _starts_of(segments)) ** 2) / left))
-    return replace(arma, std=max(std, 1e-12))
+    return replace(arma, std=max(std, LEAST_MPS))
 
 
 def _periodogram(series: Array, taken: Array | None) -> tuple[Array, Array, Array, Array]:

@@ -8,7 +8,7 @@ winner it is asked again, with the noise that is left by everything together: so
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -61,6 +61,13 @@ class EffectSelection:
     testable: Mapping[str, Effect]
     opened: OpenArm | None = None
     moved: Mapping[str, float] = field(default_factory=dict)
+
+    def without(self, names: Collection[str]) -> EffectSelection:
+        """Without some effects, the others fitted anew."""
+        kept = [effect for effect in self.fit.effects if effect.name not in names]
+        hypothesis = self.fit.hypothesis.with_effects(kept, len(self.fit.seen), {})
+        selected = tuple(each for each in self.selected if each.effect.name not in names)
+        return replace(self, selected=selected, fit=self.fitter.fit(hypothesis, self.fit.noise))
 
     def withdrawn(self) -> EffectSelection:
         """Without any effect."""

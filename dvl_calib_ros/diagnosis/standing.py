@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
 
 import numpy as np
 
 from ..effects.base import Effect
 from .closure import Gap
+from .composed import Problem
 from .criteria import blocks_of, price, robust_p
-from .fitting import Fit, Fitter
+from .fitting import Fit
 from .selection import EffectSelection
 from .settings import SETTINGS
 from .unexplained import FittedBeside, Unexplained, matters, moved_by, surprise_elsewhere, told_elsewhere, unexplained
@@ -39,26 +39,23 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
     rest = unexplained(fitter, fit)
     best: tuple[float, EffectSelection, Unexplained] | None = None
     for out in _subsets(selection):
-        names = {effect.name for effect in out}
-        kept = [effect for effect in fit.effects if effect.name not in names]
-        reduced = fitter.fit(fit.hypothesis.with_effects(kept, len(fit.seen), {}), fit.noise)
-        drop = reduced.deviance - fit.deviance
+        reduced = selection.without({effect.name for effect in out})
+        drop = reduced.fit.deviance - fit.deviance
         if drop > SETTINGS.instead_of:
             continue
         lost = drop - sum(price(effect, n_tested, len(fit.seen)) for effect in out)
         wanted = SETTINGS.indistinguishable + SETTINGS.instead_share * drop
-        other = unexplained(fitter, reduced, asked=min(wanted + lost, TOLD_FROM * drop) - ROUNDING)
+        other = unexplained(fitter, reduced.fit, asked=min(wanted + lost, TOLD_FROM * drop) - ROUNDING)
         if not other.found:
             continue
         gain = (other.clear_energy - other.price) - lost - wanted
         if other.clear_energy > AS_MUCH * drop:
-            better = _better_elsewhere(fitter, fit, reduced, other)
+            better = _better_elsewhere(fitter.problem, fit, reduced.fit, other)
             gain = max(gain, better - SETTINGS.indistinguishable - OF_INEXACT * drop)
-        if gain < 0.0 or not matters(fitter.problem, reduced, other):
+        if gain < 0.0 or not matters(fitter.problem, reduced.fit, other):
             continue
         if best is None or gain > best[0]:
-            chosen = tuple(each for each in selection.selected if each.effect.name not in names)
-            best = gain, replace(selection, selected=chosen, fit=reduced), other
+            best = gain, reduced, other
     return _sure_beside(*((selection, rest) if best is None else best[1:]))
 
 
@@ -75,21 +72,18 @@ def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectS
         worst = max(p_values, key=lambda name: p_values[name])
         if p_values[worst] < SETTINGS.robust_level:
             break
-        kept = [effect for effect in fit.effects if effect.name != worst]
-        reduced = fitter.fit(fit.hypothesis.with_effects(kept, len(fit.seen), {}), fit.noise)
-        other = unexplained(fitter, reduced)
-        if not matters(fitter.problem, reduced, other):
+        reduced = selection.without({worst})
+        other = unexplained(fitter, reduced.fit)
+        if not matters(fitter.problem, reduced.fit, other):
             break
-        chosen = tuple(each for each in selection.selected if each.effect.name != worst)
-        selection, rest = replace(selection, selected=chosen, fit=reduced), other
+        selection, rest = reduced, other
     return selection, rest
 
 
-def _better_elsewhere(fitter: Fitter, fit: Fit, reduced: Fit, other: Unexplained) -> float:
+def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
     """By how much better, in deviance, an unknown cause beside a reduced fit predicts stretches that it was not fitted
     to than the fit does."""
-    problem = fitter.problem
-    whole, rest = (FittedBeside.of(problem, each.hypothesis, each.seen, each.columns) for each in (fit, reduced))
+    whole, rest = (FittedBeside.of_fit(problem, each) for each in (fit, reduced))
     rest = rest.and_rest(other.clearest, reduced.residual)
     effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
     return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
@@ -114,6 +108,6 @@ def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
         if told < BORNE_OUT * (explained - len(values)):
             return False
     p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
-    if gap.interval[0] <= 0.0:  # whatever its p, it does not hold elsewhere
-        return False
-    return gap.interval[0] > 0.0 if p > WEAK else gap.after < gap.before  # where there is no interval
+    if np.isnan(gap.interval[0]):
+        return p <= WEAK and gap.after < gap.before
+    return gap.interval[0] > 0.0  # else, whatever its p, it does not hold elsewhere

@@ -87,6 +87,11 @@ class FittedBeside(NamedTuple):
         std, centre = np.append(prior_std(hypothesis)[:k], sizes), np.append(hypothesis.vector()[:k], none)
         return FittedBeside(np.concatenate([columns, unshown], axis=2), std, centre)
 
+    @staticmethod
+    def of_fit(problem: Problem, fit: Fit) -> FittedBeside:
+        """All parameters of a fit, and what is not shown."""
+        return FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
+
     def and_rest(self, raw: Array, residual: Array) -> FittedBeside:
         """And columns raw (M, A, c), of unit size, of what a residual (M, A) follows."""
         size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
@@ -122,7 +127,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
             return Unexplained(0.0, 0.0, "", nothing, nothing)
     recoloured: list[FollowTest] = []
     if noise.is_coloured:  # what changes with time alone may as well be noise
-        beside = FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
+        beside = FittedBeside.of_fit(problem, fit)
         alone = _coloured_anew(noise, beside, nothing, fit.residual)
         for name, columns in raw.items():
             if name != "time":
@@ -299,7 +304,7 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
 
 def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     """Deviance that what the rest follows most clearly explains where it was not fitted to (`told_elsewhere`)."""
-    noise, known = fit.noise, FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
+    noise, known = fit.noise, FittedBeside.of_fit(problem, fit)
     if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
         noise = _coloured_anew(noise, known, rest.clearest, fit.residual).noise
     return told_elsewhere(problem, noise, known, rest.clearest, fit.residual)
@@ -314,7 +319,7 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     """(6 + p,) by how much the parameters of a fit move with what the rest follows most clearly fitted beside them."""
-    noise, raw, known = fit.noise, rest.clearest, FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
+    noise, raw, known = fit.noise, rest.clearest, FittedBeside.of_fit(problem, fit)
     if noise.is_coloured:
         noise = _coloured_anew(noise, known, raw, fit.residual).noise
     both = known.and_rest(raw, fit.residual)
@@ -334,14 +339,10 @@ def told_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Arr
     what is there tells of itself elsewhere. Known ones have a prior, without which the scale of a heave that is hardly
     there would take in what is left.
     """
-    both, series = known.and_rest(raw, residual), noise.whiten(residual)
-    white, k = noise.whiten(both.columns), len(known.std)
-    gain = 0.0
-    for train in _trained(problem, residual):
-        system = WhitenedLeastSquares.of(white[train], series[train], both.std, both.centre)
-        base = system.part(np.arange(k)).solution()
-        left = series[~train] - white[~train][:, :k] @ base
-        gain += float(left @ left - np.sum((series[~train] - white[~train] @ system.solution()) ** 2))
+    of_known, gain = np.arange(len(known.std)), 0.0
+    for held, trained in _held_out(problem, noise, known.and_rest(raw, residual), residual):
+        base = trained.part(of_known)
+        gain += held.part(of_known).squares(base.solution()) - held.squares(trained.solution())
     return gain
 
 
@@ -352,20 +353,23 @@ def surprise_elsewhere(problem: Problem, noise: Noise, fitted: FittedBeside, res
     By how well the columns are known there: of the only dive of a run, held out, no other stretch tells what an effect
     of the pitch does, and none claims to.
     """
+    folds = list(_held_out(problem, noise, fitted, residual))
+    held, trained = folds[0]
+    whole = replace(held, gram=held.gram + trained.gram).surprise()
+    return sum(whole - trained.surprise() for _, trained in folds)
+
+
+def _held_out(
+    problem: Problem, noise: Noise, fitted: FittedBeside, residual: Array
+) -> Iterator[tuple[WhitenedLeastSquares, WhitenedLeastSquares]]:
+    """Of each fold, the least squares of the stretches held out, and of those that are fitted to."""
     white, series = noise.whiten(fitted.columns), noise.whiten(residual)
-    whole = WhitenedLeastSquares.of(white, series, fitted.std, fitted.centre).surprise()
-    return sum(
-        whole - WhitenedLeastSquares.of(white[train], series[train], fitted.std, fitted.centre).surprise()
-        for train in _trained(problem, residual)
-    )
-
-
-def _trained(problem: Problem, residual: Array) -> Iterator[NDArray[np.bool_]]:
-    """Of each fold, which of the M A rows of a residual are fitted to."""
-    fold = stretch_of(problem.time) % SETTINGS.folds
-    rows = np.repeat(fold, residual.shape[1])
-    for held in np.unique(fold):
-        yield rows != held
+    rows = np.repeat(stretch_of(problem.time) % SETTINGS.folds, residual.shape[1])
+    parts = [(white[rows == fold], series[rows == fold]) for fold in np.unique(rows)]
+    each = [WhitenedLeastSquares.of(*part, fitted.std, fitted.centre) for part in parts]
+    for held in each:
+        trained = sum((other.gram for other in each if other is not held), start=np.zeros_like(held.gram))
+        yield held, replace(held, gram=trained)
 
 
 def _solved(white: Array, series: Array, std: Array) -> Array:
