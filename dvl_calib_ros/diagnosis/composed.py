@@ -309,7 +309,7 @@ class Problem:
     """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare.
     bursts: of how many samples an instrument was far off, which are left out. shown_turns: (3, 3) projection of φ on
     the turns of the mounting that a reference without a vertical shows; by the others it is not turned. unshown: what
-    it does not show of effects that every vehicle has a little of.
+    it does not show of effects that every vehicle has a little of, and of turns of the mounting.
     """
 
     recordings: tuple[RecordedStreams, ...]
@@ -603,12 +603,29 @@ class Problem:
             parts.append(turned @ turns[:, held > 0.5])
             sizes.append(np.full(parts[-1].shape[2], SETTINGS.prior_angle))
         for effect in self.unshown:
+            if isinstance(effect, MountingEffect):
+                if effect.name in hypothesis.values:  # and only then
+                    parts += self._of_unshown_turns(hypothesis, seen, effect)
+                    sizes += [np.full(parts[-2].shape[2], SETTINGS.prior_angle)]
+                    sizes += [np.full(parts[-1].shape[2], 0.5 * SETTINGS.prior_angle**2)]
+                continue
             parts.append(self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen)))
             own = [spec.typical for spec in amplitudes(effect)]
             sizes.append(np.tile(own, parts[-1].shape[2] // len(own)))
         if not parts:
             return np.zeros((len(self.time), self.axes, 0)), np.zeros(0)
         return np.concatenate(parts, axis=2), np.concatenate(sizes)
+
+    def _of_unshown_turns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect) -> list[Array]:
+        """(M, A, t) d e / d turns of the mounting that are not shown, and (M, A, r) d e / d half their square, by
+        recording: by its cosine a turn of 4° makes all velocities of a day slower by a quarter of a per cent."""
+        turned = self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen))
+        slower = self.binned([-each.motion.velocity_body for each in seen], seen)[:, :, None]
+        whose = whose_parameters(effect, len(seen))
+        if whose == [None]:
+            return [turned, slower]
+        of_each = [np.where((self.recording_of == one)[:, None, None], slower, 0.0) for one in whose]
+        return [turned, np.concatenate(of_each, axis=2)]
 
     def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """(M, A) m/s that an effect adds to the residual of a hypothesis that has not got it."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..calibration.frames import Array
-from ..effects.base import Effect
+from ..effects.base import Effect, MountingEffect
 from .clock_or_arm import ARM
 from .composed import Problem, Seen, Values, amplitudes, is_time_of_run, no_effect
 from .fitting import Fit
@@ -32,9 +32,10 @@ def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Ef
 
 
 def unshown_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect]) -> tuple[Effect, ...]:
-    """What is not shown of effects that every vehicle has a little of: where its DVL sits, and the DVL's bias."""
-    of_every = [(effects[name], {spec.name for spec in shown[name].parameters}) for name in OF_EVERY if name in effects]
-    left_out = (effect.without(names) for effect, names in of_every)
+    """What is not shown of effects that every vehicle has a little of, where its DVL sits, and the DVL's bias; and of
+    turns of the mounting, which one that turned in yaw has as well."""
+    looked = [effect for name, effect in effects.items() if name in OF_EVERY or isinstance(effect, MountingEffect)]
+    left_out = (effect.without({spec.name for spec in shown[effect.name].parameters}) for effect in looked)
     return tuple(effect for effect in left_out if effect.parameters)
 
 

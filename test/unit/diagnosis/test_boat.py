@@ -9,9 +9,12 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.diagnosis.composed import no_effect
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.recordings import make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
+from dvl_calib_ros.diagnosis.selection import started
+from dvl_calib_ros.effects.registry import EFFECTS
 
 pytestmark = pytest.mark.slow
 
@@ -137,3 +140,28 @@ def test_a_mounting_that_moved_is_named_in_yaw_alone_where_the_same_headings_con
     for day, true in (("day1", 0.0), ("day2", np.radians(2.0))):
         _, low, high = moved.by_recording[day]["z_rad"]
         assert low - 0.001 < true < high + 0.001
+
+
+def test_what_a_mounting_that_moved_turned_in_pitch_as_well_is_known_beside_it():
+    """A horizontal reference does not show the pitch. Its cosine makes all velocities of the day slower, which was an
+    unknown cause in a case of the trial."""
+    recordings = [boat(day, 0.3, name=f"day{day}") for day in range(2)]
+    usual = {name: EFFECTS[name].usual for name in ("lever_arm", "velocity_bias", "mounting_moved")}
+    problem, _, _, shown = started(recordings, Parameters().rotation_dvl_from_body, np.zeros(3), usual)
+    moved = shown["mounting_moved"]
+    assert [spec.name for spec in moved.parameters] == ["z_rad"]
+
+    def turned(effect, **values):
+        days = (effect.defaults, effect.defaults | {"z_rad": 0.02} | values)
+        return no_effect().with_effects([effect], 2, {effect.name: days})
+
+    by_yaw = turned(moved)
+    seen = problem.all_seen(by_yaw)
+    of_pitch = problem.residual(problem.all_seen(turned(usual["mounting_moved"], y_rad=0.07))) - problem.residual(seen)
+    left = [of_pitch.ravel()]
+    for hypothesis in (no_effect(), by_yaw):
+        columns, sizes = problem.unshown_columns(hypothesis, seen)
+        own = columns.reshape(-1, len(sizes)) * sizes
+        left.append(of_pitch.ravel() - own @ np.linalg.lstsq(own, of_pitch.ravel(), rcond=None)[0])
+    nothing, of_others, with_it = (float(each @ each) for each in left)
+    assert with_it < 0.01 * nothing < 0.2 * of_others
