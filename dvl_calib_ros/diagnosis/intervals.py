@@ -8,12 +8,15 @@ from __future__ import annotations
 import numpy as np
 
 from ..calibration.frames import Array
-from .composed import is_time_of_run
+from ..effects.base import MountingEffect
+from .composed import Problem, is_time_of_run
 from .criteria import blocks_of
 from .fitting import Fit, Fitter
 from .leaps import LEAP, time_by_stamps
+from .least_squares import WhitenedLeastSquares
 from .made_up import made_up
 from .selection import EffectSelection
+from .unexplained import FittedBeside
 
 Triple = tuple[float, float, float]
 Times = dict[tuple[str, int, str], Triple]
@@ -32,7 +35,7 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     covariance = fit.covariance(blocks_of(fitter.problem))
     if not selection.selected:
         return covariance, {}
-    covariance = _with_samples(fitter, fit, covariance)
+    covariance = with_unshown_turns(fitter.problem, fit, _with_samples(fitter, fit, covariance))
     times: Times = {}
     for effect in fit.effects:
         for spec in filter(is_time_of_run, effect.parameters):
@@ -54,3 +57,18 @@ def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
     off = np.where(np.abs(off) > OFF_BY * std, HALF_WAY * off, 0.0)
     grown = np.where(scatter > SCATTER, scatter, 1.0)
     return np.asarray(covariance * np.outer(grown, grown) + np.outer(off, off))
+
+
+def with_unshown_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:
+    """A covariance (n, n) with what the turns that are not shown of a mounting that turns, beside the fit, make of it.
+
+    A mounting that turned by 4 degrees in pitch takes yaw and arm along by a few tenths of a degree and centimetres.
+    """
+    if not any(isinstance(effect, MountingEffect) for effect in fit.effects):
+        return covariance
+    beside, own = FittedBeside.of_fit(problem, fit), np.arange(fit.columns.shape[2])
+    white = fit.noise.whiten(beside.columns)
+    both = WhitenedLeastSquares.of(white, -fit.noise.whiten(fit.residual), beside.std, -beside.centre)
+    alone = both.part(own)
+    moved = both.solution()[own] - alone.solution()
+    return np.asarray(covariance + both.covariance()[np.ix_(own, own)] - alone.covariance() + np.outer(moved, moved))

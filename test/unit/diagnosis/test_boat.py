@@ -10,7 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.diagnosis.composed import no_effect
+from dvl_calib_ros.diagnosis.criteria import blocks_of
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
+from dvl_calib_ros.diagnosis.fitting import Fitter
+from dvl_calib_ros.diagnosis.intervals import with_unshown_turns
+from dvl_calib_ros.diagnosis.noise import white_noise
 from dvl_calib_ros.diagnosis.recordings import make_recording
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.selection import started
@@ -165,3 +169,7 @@ def test_what_a_mounting_that_moved_turned_in_pitch_as_well_is_known_beside_it()
         left.append(of_pitch.ravel() - own @ np.linalg.lstsq(own, of_pitch.ravel(), rcond=None)[0])
     nothing, of_others, with_it = (float(each @ each) for each in left)
     assert with_it < 0.01 * nothing < 0.2 * of_others
+    fit = Fitter(problem).fit(by_yaw, white_noise(problem.residual(seen), problem.segments, None, problem.interval))
+    covariance = fit.covariance(blocks_of(problem))
+    grown = np.diag(with_unshown_turns(problem, fit, covariance)) / np.diag(covariance)
+    assert grown[-1] > 1.4 and grown.min() > 0.99  # so an interval of the yaw holds what is not shown
