@@ -55,7 +55,7 @@ def cross(a: Array, b: Array) -> Array:
 def squared(a: Array) -> Array:
     """Squares of the lengths of vectors (..., k), k >= 1: (...).
 
-    To the last bit ``(a**2).sum(axis=-1)``, which takes seven times as long of many short vectors.
+    To the last bit ``(a**2).sum(axis=-1)``, which of 4000 x 3 takes seven times as long.
     """
     squares = a * a
     total: Array = squares[..., 0].copy()

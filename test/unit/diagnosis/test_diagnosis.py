@@ -813,6 +813,15 @@ def test_a_mounting_that_moved_between_days_is_named_with_its_size():
 # ------------------------------------------------------------------ what cannot be said
 
 
+@pytest.mark.parametrize("of_time", [lambda t: 1.0 + 0.3 * np.sin(0.1 * t), lambda t: np.where(t > 100.0, 1.0, 2.0)])
+def test_streams_that_are_alike_to_rounding_have_an_answer(of_time):
+    """As of two logs of one estimate. Noise of nothing made every column infinite: a LinAlgError."""
+    time = np.arange(200.0)
+    velocity = np.column_stack([of_time(time), 0.0 * time, 0.0 * time])
+    alike = make_recording("alike", (time, velocity), (time + 0.3, velocity))
+    assert diagnose_recordings([alike], Parameters()).verdict is not DiagnosisVerdict.NO_GAP  # a reference 0.3 s late
+
+
 def test_a_straight_run_at_one_speed_makes_no_confident_claim_about_a_bias():
     diagnosis = diagnosed("straight", effects=["velocity_bias:x_mps=0.1"])
     assert diagnosis.verdict not in (DiagnosisVerdict.KNOWN, DiagnosisVerdict.NO_GAP)
