@@ -133,11 +133,12 @@ class Hypothesis:
         )
 
     def with_effects(self, effects: Sequence[Effect], n: int, start: Mapping[str, tuple[Values, ...]]) -> Hypothesis:
-        """Of other effects, with values of `start`, else their own, else the defaults; of n recordings."""
-        values = {
-            effect.name: start.get(effect.name) or self.values.get(effect.name) or (effect.defaults,) * n
-            for effect in effects
-        }
+        """Of other effects, with values of `start`, else their own, else the defaults; of n recordings.
+
+        What a value has no word of, as a leap that came once has none of a second, is at its default.
+        """
+        given = {effect.name: start.get(effect.name) or self.values.get(effect.name) or ({},) * n for effect in effects}
+        values = {effect.name: tuple({**effect.defaults, **each} for each in given[effect.name]) for effect in effects}
         return replace(self, effects=tuple(effects), values=values)
 
     def body_from_measured(self, rotation_dvl_from_body: Array, turn: Array | None = None) -> Array:

@@ -813,6 +813,14 @@ def test_a_mounting_that_moved_between_days_is_named_with_its_size():
 # ------------------------------------------------------------------ what cannot be said
 
 
+def test_a_leap_that_came_once_is_one_of_an_effect_that_may_come_twice():
+    """`diagnose --simulator` ended in a KeyError wherever it had found a leap."""
+    leap = EFFECTS["time_offset_jump"]
+    once = no_effect().with_effects([leap.once], 1, {leap.name: ({"seconds": 0.4, "at_s": 50.0},)})
+    (injected,) = once.with_effects([leap], 1, {}).injections(0)
+    assert leap.late(np.array([0.0, 60.0, 600.0]), injected.values) == pytest.approx([0.0, 0.4, 0.4])
+
+
 @pytest.mark.parametrize("of_time", [lambda t: 1.0 + 0.3 * np.sin(0.1 * t), lambda t: np.where(t > 100.0, 1.0, 2.0)])
 def test_streams_that_are_alike_to_rounding_have_an_answer(of_time):
     """As of two logs of one estimate. Noise of nothing made every column infinite: a LinAlgError."""
