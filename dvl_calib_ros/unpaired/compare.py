@@ -21,8 +21,8 @@ from .shrink import AS_IT_IS, NOISE, Shrunk, models, shrink
 from .sizes import (
     Size,
     common_names,
+    compared_names,
     fitted,
-    is_testable,
     is_there,
     lies,
     p_alike,
@@ -65,7 +65,6 @@ def compare(
 
 def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> UnpairedComparison:
     """`compare`, of sides that are read and explained already."""
-    effects = {name: effect.usual for name, effect in effects.items()}
     selections = vehicle.selection, simulator.selection
     if selections[0] is None or selections[1] is None:
         return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
@@ -80,7 +79,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
     noise.sort(key=lambda each: (ORDER.index(each.status), each.p))
     status = {each.name: each.status for each in found}
     both = {name: (*compared.sizes[name], status[name]) for name in compared.p}
-    own = [effects[name] for name in names[0].values() if name in compared.sizes]
+    own = [compared.sizes[name][0].effect for name in names[0].values() if name in compared.sizes]
     shrunk = shrink(vehicle, simulator, models(both, own))
     levels = [levels_by_regime(log) for log in (vehicle, simulator)]
     verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
@@ -134,14 +133,16 @@ class _Compared:
     ) -> None:
         self.names, self._effects = names, effects
         self._selections, self._logs, self._renamed = selections, logs, renamed
-        self._fits = tuple(fitted(selection, names, effects) for selection in selections)
+        self._fits = tuple(fitted(selection, names) for selection in selections)
         per_side = [
             sizes(selection, fit, list(own.values()))
             for selection, fit, own in zip(selections, self._fits, renamed, strict=True)
         ]
         self._per_side = per_side
         self.sizes: dict[str, tuple[Size, Size]] = {
-            name: (per_side[0][name], per_side[1][name]) for name in names if all(name in side for side in per_side)
+            name: (per_side[0][name], per_side[1][name])
+            for name in names
+            if all(name in side for side in per_side) and compared_names(*(side[name] for side in per_side))
         }
         self.p = {name: p_alike(*both) for name, both in self.sizes.items()}
 
@@ -160,7 +161,7 @@ class _Compared:
                 f"{self._effects[name].manoeuvre}"
             )
         side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not there[0] else 0
-        trace = trace_of(self._selections[side], self._fits[side], self._effects[name])
+        trace = trace_of(self._selections[side], self._fits[side], self.sizes[name][side].effect)
         adds = float(np.sqrt((trace**2).sum(axis=1).mean()))
         where = lies(self._selections[side], self._fits[side], trace)
         return ComparedEffect(
@@ -168,19 +169,18 @@ class _Compared:
         )
 
     def untested(self, name: str) -> ComparedEffect:
-        """One that the recordings of one side cannot be tested for."""
+        """One that the recordings of one side cannot be tested for, or of which they show other parts."""
         shown = [side[name].intervals() if name in side else {} for side in self._per_side]
-        lacking = next(
-            side
-            for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True)
-            if not is_testable(self._effects[name], selection)
-        )
         effect = self._effects[name]
-        what = "a second recording" if effect.relative_to_first else ", ".join(sorted(n.value for n in effect.needs))
+        needs = f"the two logs show nothing of it that is the same: {effect.manoeuvre}"
+        for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True):
+            if name not in selection.testable:
+                lacks = ", ".join(sorted(need.value for need in effect.needs))
+                needs = f"the {side}'s log lacks {'a second recording' if effect.relative_to_first else lacks}"
+                break
         return ComparedEffect(
-            name, ComparisonStatus.CANNOT_TELL, self._equivalent(name), shown[0], shown[1], float("nan"),
-            needs=f"the {lacking}'s log lacks {what}",
-        )  # fmt: skip
+            name, ComparisonStatus.CANNOT_TELL, self._equivalent(name), shown[0], shown[1], float("nan"), needs=needs
+        )
 
     def _equivalent(self, name: str) -> tuple[str, ...]:
         others: list[str] = []

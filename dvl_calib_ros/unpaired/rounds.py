@@ -33,6 +33,7 @@ from ..verdict.reasons import Reason, finding
 from .compare import compare, compare_logs
 from .logs import RecordedSide, read_log
 from .results import ComparedEffect, Triple, UnpairedComparison, unpaired_document
+from .shrink import is_of_every_run
 
 MOST_ROUNDS = 9
 # The simulator's velocity is its truth: no more is taken off it than the corners between its samples
@@ -192,16 +193,18 @@ def put_right(
     corrected: dict[str, Any] = deepcopy(dict(document))
     by_name = {each["name"]: each for each in corrected["effects"]}
     for compared in (each for each in comparison.effects if each.status.is_claim):
-        effect = effects[compared.name].usual
-        if effect.relative_to_first or any(" of " in key for key in compared.vehicle):
-            continue  # another size every day, of which a simulator has one
+        effect = effects[compared.name]
+        if not is_of_every_run(effect) or any(" of " in key for key in compared.vehicle):
+            continue  # another size every day, or at a time of a run that may be none of the simulator's
         entry = by_name.get(effect.name)
         if entry is None:
-            entry = {"name": effect.name, "equivalent_to": [], "parameters": _parameters(effect.defaults)}
+            entry = {"name": effect.name, "equivalent_to": [], "parameters": {}}
             corrected["effects"].append(entry)
         for spec in amplitudes(effect):
+            if not (difference := _difference(compared, spec.name)):
+                continue
             at = entry["parameters"].setdefault(spec.name, {"value": spec.default})
-            value = at["value"] + _difference(compared, spec.name)
+            value = at["value"] + difference
             entry["parameters"][spec.name] = {"value": min(max(value, spec.low), spec.high)}
     dvl = corrected["dvl"]
     differ = {each.name: each for each in comparison.noise if each.status.is_claim}
@@ -216,17 +219,13 @@ def put_right(
 
 
 def _difference(compared: ComparedEffect, name: str) -> float:
-    """By how much the vehicle has more of a parameter; of several recordings by their means."""
+    """By how much the vehicle has more of a parameter; of several recordings by their means. 0 where one shows none."""
 
-    def mean(side: Mapping[str, Triple]) -> float:
-        values = [value for key, (value, _, _) in side.items() if key == name or key.startswith(f"{name} of ")]
-        return sum(values) / len(values) if values else 0.0
+    def of(side: Mapping[str, Triple]) -> list[float]:
+        return [value for key, (value, _, _) in side.items() if key == name or key.startswith(f"{name} of ")]
 
-    return mean(compared.vehicle) - mean(compared.simulator)
-
-
-def _parameters(values: Mapping[str, float]) -> dict[str, Any]:
-    return {name: {"value": value} for name, value in values.items()}
+    vehicle, simulator = of(compared.vehicle), of(compared.simulator)
+    return sum(vehicle) / len(vehicle) - sum(simulator) / len(simulator) if vehicle and simulator else 0.0
 
 
 def _simulated(

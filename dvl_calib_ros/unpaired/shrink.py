@@ -51,7 +51,7 @@ def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Se
     kept = {
         name: (simulator.effect, _values(simulator))
         for name, (_, simulator, status) in sizes.items()
-        if status is not ComparisonStatus.MISSING and simulator.found and _always(simulator.effect)
+        if status is not ComparisonStatus.MISSING and simulator.found and is_of_every_run(simulator.effect)
     }
     lacking = [
         sizes[name][0].effect
@@ -68,7 +68,7 @@ def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Se
     return [*ladder, SimulatedModel(NOISE, tuple(vehicle), {}, vehicle_noise=True)]
 
 
-def _always(effect: Effect) -> bool:
+def is_of_every_run(effect: Effect) -> bool:
     """Whether what a simulator has of it, it has on every run."""
     return not effect.relative_to_first and not any(is_time_of_run(spec) for spec in effect.parameters)
 

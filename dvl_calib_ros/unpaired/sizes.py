@@ -1,8 +1,9 @@
 """Effect by effect: the size on both sides, whether they differ, and where the difference lies.
 
 All effects that either side was found to have are fitted to both, together: so the other side gives an interval for an
-effect that it was not found to have, which is wide where its motions do not show it. Sizes are compared by Wald's test
-with the covariance that the scatter of blocks of time shows on each side.
+effect that it was not found to have, which is wide where its motions do not show it. Each side has an effect as it was
+found there: a leap that came once or twice, a lever arm without what is not shown of it. Sizes are compared by Wald's
+test with the covariance that the scatter of blocks of time shows on each side.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from scipy.stats import norm, t
 
 from ..calibration.frames import Array
 from ..diagnosis.clock_or_arm import ATTITUDE_CLOCK, CLOCKS
-from ..diagnosis.composed import Values, amplitudes, is_time_of_run, whose_parameters
+from ..diagnosis.composed import Values, amplitudes, whose_parameters
 from ..diagnosis.criteria import blocks_of
 from ..diagnosis.fitting import Fit
 from ..diagnosis.selection import EffectSelection
+from ..diagnosis.shown import somewhere
 from ..diagnosis.where import BANDS_HZ, regimes
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
@@ -53,6 +55,15 @@ class Size:
     recordings: tuple[str, ...] = ()
 
     @property
+    def names(self) -> list[str]:
+        """Of its parameters."""
+        return [spec.name for spec in amplitudes(self.effect)]
+
+    def taking(self, names: Sequence[str]) -> Array:
+        """(q, p) that makes parameters of other names of its own; one that it has not is 0."""
+        return np.array([[float(name == own) for own in self.names] for name in names])
+
+    @property
     def mean(self) -> tuple[Array, Array]:
         """(p,) weighted mean over recordings and its covariance (p, p)."""
         r, p = self.stacked.shape
@@ -67,7 +78,7 @@ class Size:
         dof = max(self.dof - CALIBRATION - len(self.covariance), FEWEST_DOF)
         reach = t.ppf(0.975, dof) * np.sqrt(np.diag(self.covariance))
         whose = [f" of {name}" for name in self.recordings] or [""]
-        names = [f"{spec.name}{of}" for of in whose for spec in amplitudes(self.effect)]
+        names = [f"{name}{of}" for of in whose for name in self.names]
         return {
             name: (float(v), float(v - w), float(v + w))
             for name, v, w in zip(names, self.stacked.ravel(), reach, strict=True)
@@ -79,13 +90,23 @@ class Size:
         return _wald(self.stacked.ravel() - np.tile(defaults, len(self.stacked)), self.covariance, self.dof)
 
 
+def compared_names(vehicle: Size, simulator: Size) -> list[str]:
+    """Parameters by which both sides are compared: what both have; where both were found to have the effect and one of
+    them twice, also those of the second time, of which the other has none."""
+    own = [*dict.fromkeys([*vehicle.names, *simulator.names])]
+    again = vehicle.effect.again if vehicle.found and simulator.found else ()
+    return [name for name in own if name in again or (name in vehicle.names and name in simulator.names)]
+
+
 def p_alike(vehicle: Size, simulator: Size) -> float:
     """p of an effect having one size on both sides; of the day's, of every day having the simulator's."""
+    names = compared_names(vehicle, simulator)
     mean, covariance = simulator.mean
     n = len(vehicle.stacked)
-    design = np.tile(np.eye(len(mean)), (n, 1))
-    apart = vehicle.stacked.ravel() - design @ mean
-    return _wald(apart, vehicle.covariance + design @ covariance @ design.T, min(vehicle.dof, simulator.dof))
+    each, design = np.kron(np.eye(n), vehicle.taking(names)), np.tile(simulator.taking(names), (n, 1))
+    apart = each @ vehicle.stacked.ravel() - design @ mean
+    covariance = each @ vehicle.covariance @ each.T + design @ covariance @ design.T
+    return _wald(apart, covariance, min(vehicle.dof, simulator.dof))
 
 
 def _wald(values: Array, covariance: Array, dof: int) -> float:
@@ -105,9 +126,10 @@ def is_there(own: Size, other: Size) -> bool:
 
 def smallest_difference(vehicle: Size, simulator: Size, n_claims: int) -> dict[str, float]:
     """Difference of each parameter that would be found in four of five recordings, where so many are claimed."""
-    std = np.sqrt(np.diag(vehicle.mean[1]) + np.diag(simulator.mean[1]))
+    names = compared_names(vehicle, simulator)
+    std = np.sqrt(sum(side.taking(names) @ np.diag(side.mean[1]) for side in (vehicle, simulator)))
     factor = float(norm.isf(0.005 / max(n_claims, 1)) + norm.ppf(0.8))
-    return {spec.name: factor * float(s) for spec, s in zip(amplitudes(vehicle.effect), std, strict=True)}
+    return {name: factor * float(s) for name, s in zip(names, std, strict=True)}
 
 
 # ------------------------------------------------------------------ the same names on both sides
@@ -138,29 +160,17 @@ def union(vehicle: Mapping[str, str], simulator: Mapping[str, str]) -> list[str]
     return [name for name in EFFECTS if name in both] + sorted(both - set(EFFECTS))
 
 
-def fitted(selection: EffectSelection, names: Sequence[str], effects: Mapping[str, Effect]) -> Fit:
-    """All effects of these names that the recordings can be tested for, fitted together."""
+def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:
+    """All effects of these names that the recordings can be tested for, fitted together: as they were found, and others
+    as they were looked for."""
     fitter, fit = selection.fitter, selection.fit
-    problem = fitter.problem
-    n = len(problem.recordings)
-    chosen = [effects[name] for name in names if is_testable(effects[name], selection)]
-    start: dict[str, tuple[Values, ...]] = {}
-    for effect in chosen:
-        if effect not in fit.effects:
-            start[effect.name] = tuple(_some_time(effect, recording.seconds) for recording in problem.recordings)
-    return fitter.fit(fit.hypothesis.with_effects(chosen, n, start), fit.noise)
-
-
-def is_testable(effect: Effect, selection: EffectSelection) -> bool:
-    """Whether recordings hold what an effect needs."""
-    problem = selection.fitter.problem
-    return effect.needs <= problem.available and not (effect.relative_to_first and len(problem.recordings) < 2)
-
-
-def _some_time(effect: Effect, seconds: float) -> Values:
-    """Defaults; what begins in the midst of a run is tried in its middle."""
-    times = [spec.name for spec in effect.once.parameters if is_time_of_run(spec)]
-    return effect.defaults | ({times[0]: 0.5 * seconds} if len(times) == 1 else {})
+    found = {effect.name: effect for effect in fit.effects}
+    known = {**selection.testable, **found}
+    chosen = [known[name] for name in names if name in known]
+    start: dict[str, tuple[Values, ...]] = {
+        effect.name: tuple(somewhere(effect, fitter.problem)) for effect in chosen if effect.name not in found
+    }
+    return fitter.fit(fit.hypothesis.with_effects(chosen, len(fit.seen), start), fit.noise)
 
 
 def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[str, Size]:
@@ -176,6 +186,8 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
         p, r = len(amplitudes(effect)), len(whose)
         part = slice(at, at + p * r)
         at += p * r
+        if not p:  # nothing of it is shown
+            continue
         stacked = vector[part].reshape(r, p)
         own = tuple(selection.fitter.problem.recordings[i].name for i in whose if i is not None)
         result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found, own)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -27,13 +28,13 @@ from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
-from dvl_calib_ros.unpaired.compare import compare
-from dvl_calib_ros.unpaired.logs import RecordedSide, is_copied
+from dvl_calib_ros.unpaired.compare import compare, compare_logs
+from dvl_calib_ros.unpaired.logs import Log, RecordedSide, is_copied, read_log
 from dvl_calib_ros.unpaired.noise import Scatter, at_one_motion, block_levels, slopes_of
-from dvl_calib_ros.unpaired.results import ComparisonStatus, SimulatorVerdict, unpaired_document
+from dvl_calib_ros.unpaired.results import ComparedEffect, ComparisonStatus, SimulatorVerdict, unpaired_document
 from dvl_calib_ros.unpaired.rounds import close_gap, closed_gap_document, put_right
 from dvl_calib_ros.unpaired.shrink import AS_IT_IS, NOISE, turned_over, two_samples
-from dvl_calib_ros.unpaired.sizes import Size, is_there, p_alike
+from dvl_calib_ros.unpaired.sizes import Size, compared_names, is_there, p_alike, smallest_difference
 from dvl_calib_ros.unpaired.stream_facts import facts_of
 
 SECOND_NS = 1_000_000_000
@@ -169,6 +170,75 @@ def test_what_is_of_one_vehicle_is_refused_beside_a_simulator(bags, tmp_path, ca
     assert option in fail(capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], option, tmp_path / "x")
 
 
+# ------------------------------------------------------------------ a leap, as it was found
+
+LEAP = "time_offset_jump"
+
+
+@pytest.fixture(scope="module")
+def leaps(tmp_path_factory) -> dict[str, Log]:
+    """Of a clock that never leaps, of two that leap once, in a vehicle and a simulator, and of one that does twice."""
+    folder = tmp_path_factory.mktemp("leaps")
+    plain = {"errors": DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.005)}
+    made = plain | {"gnss_rate": 10.0, "gnss_std": 0.0}
+    once = f"{LEAP}:seconds=0.6,at_s=130"
+    bags = {
+        "never": bag(folder / "never", seed=2, **made),
+        "once": bag(folder / "once", (once,), seed=1, **plain),
+        "made_once": bag(folder / "made_once", (once,), seed=4, **made),
+        "twice": bag(
+            folder / "twice", (f"{LEAP}:seconds=0.6,at_s=60,again_seconds=0.5,again_at_s=140",), seed=3, **plain
+        ),
+    }
+    return {name: read_log(source(path)) for name, path in bags.items()}
+
+
+def compared_leap(leaps: dict[str, Log], vehicle: str, simulator: str) -> ComparedEffect:
+    (leap,) = compare_logs(leaps[vehicle], leaps[simulator]).effects
+    assert leap.name == LEAP
+    return leap
+
+
+def found_seconds(log: Log) -> float:
+    (leap,) = log.diagnosis.effects
+    return leap.parameters["seconds"][0]
+
+
+@pytest.mark.slow
+def test_a_leap_that_came_once_is_compared_as_one_where_it_was_found(leaps):
+    """It was fitted as one of two, in the middle of the run: `again 0 s (-21 to 21)`, and 0.58 s for 0.60 s."""
+    leap = compared_leap(leaps, "once", "never")
+    assert leap.status is ComparisonStatus.MISSING
+    assert leap.vehicle.keys() == leap.simulator.keys() == {"seconds"}
+    assert leap.vehicle["seconds"][0] == pytest.approx(found_seconds(leaps["once"]), abs=1e-3)
+    assert leap.simulator["seconds"][1] < 0.0 < leap.simulator["seconds"][2]
+
+
+@pytest.mark.slow
+def test_a_leap_that_came_once_on_both_sides_is_alike(leaps):
+    leap = compared_leap(leaps, "once", "made_once")
+    assert leap.status is ComparisonStatus.ALIKE
+    assert leap.vehicle.keys() == leap.simulator.keys() == {"seconds"}
+    assert leap.simulator["seconds"][0] == pytest.approx(found_seconds(leaps["made_once"]), abs=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sides", [("twice", "made_once"), ("made_once", "twice")])
+def test_a_leap_that_came_twice_is_of_another_size_than_one_as_large_as_its_first(leaps, sides):
+    leap = compared_leap(leaps, *sides)
+    assert leap.status is ComparisonStatus.OTHER_SIZE
+    twice, once = (leap.vehicle, leap.simulator) if sides[0] == "twice" else (leap.simulator, leap.vehicle)
+    assert once.keys() == {"seconds"} and once["seconds"][1] < twice["seconds"][0] < once["seconds"][2]
+    assert twice["again_seconds"][1] < 0.5 < twice["again_seconds"][2]
+
+
+@pytest.mark.slow
+def test_a_leap_that_came_twice_is_missing_where_none_came(leaps):
+    leap = compared_leap(leaps, "twice", "never")
+    assert leap.status is ComparisonStatus.MISSING
+    assert leap.simulator.keys() == {"seconds"} and leap.vehicle.keys() == {"seconds", "again_seconds"}
+
+
 # ------------------------------------------------------------------ round by round
 
 
@@ -214,6 +284,26 @@ def test_a_round_changes_sizes_noise_and_rate_by_as_much_as_they_differ(compared
     before, after = document["dvl"]["noise_std_mps"][0], right["dvl"]["noise_std_mps"][0]
     assert after == pytest.approx(before * level.vehicle[0] / level.simulator[0])
     assert document["effects"] == [] and put_right(right, compared)["dvl"]["rate_hz"] == document["dvl"]["rate_hz"]
+
+
+def test_no_round_changes_a_leap_which_is_of_a_time_of_the_vehicles_run(compared):
+    """The simulator's may end before: then its leap, doubled from round to round, would still be missing."""
+    document = diagnosis_document(compared.vehicle)
+    leap = {"seconds": {"value": 0.6}, "at_s": {"value": 130.0}}
+    document["effects"] = [{"name": LEAP, "equivalent_to": [], "parameters": leap}]
+    missing = ComparedEffect(
+        LEAP, ComparisonStatus.MISSING, (), {"seconds": (0.6, 0.5, 0.7)}, {"seconds": (0.0, -0.1, 0.1)}, 0.0
+    )
+    assert put_right(document, replace(compared, effects=(missing,)))["effects"] == document["effects"]
+
+
+def test_a_round_leaves_a_part_of_an_effect_as_it_is_that_one_side_does_not_show(compared):
+    document = diagnosis_document(compared.vehicle)
+    document["effects"] = []
+    vehicle, simulator = {"x_m": (0.8, 0.7, 0.9)}, {"x_m": (0.0, -0.1, 0.1), "z_m": (0.5, 0.4, 0.6)}
+    missing = ComparedEffect("lever_arm", ComparisonStatus.MISSING, (), vehicle, simulator, 0.0)
+    (arm,) = put_right(document, replace(compared, effects=(missing,)))["effects"]
+    assert arm["parameters"] == {"x_m": {"value": 0.8}}
 
 
 @pytest.mark.slow
@@ -262,6 +352,28 @@ def test_p_of_alike_sizes_is_even():
     rng = np.random.default_rng(0)
     p = np.array([p_alike(size(rng.normal(0.3, 0.1), 0.1), size(rng.normal(0.3, 0.05), 0.05)) for _ in range(400)])
     assert np.mean(p < 0.05) < 0.09 and np.mean(p < 0.5) == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_size_is_compared_by_the_parts_that_both_sides_show():
+    """A boat's reference shows no height of its DVL, a simulator's does."""
+    arm = EFFECTS["lever_arm"]
+    level = Size(arm.without({"z_m"}), np.array([[0.8, 0.1]]), np.diag([0.01, 0.01]), 60, True)
+    whole = Size(arm, np.array([[0.8, 0.1, 0.5]]), np.diag([0.01, 0.01, 1e-4]), 60, True)
+    for sides in ((level, whole), (whole, level)):
+        assert compared_names(*sides) == ["x_m", "y_m"] == [*smallest_difference(*sides, 1)]
+        assert p_alike(*sides) == pytest.approx(1.0)
+    assert not compared_names(Size(arm.without({"x_m", "y_m"}), np.zeros((1, 1)), np.eye(1), 60, True), level)
+
+
+def test_a_second_leap_is_none_only_where_the_other_side_was_found_to_leap():
+    """A side that shows no leap may have one where its motion does not show it."""
+    leap = EFFECTS[LEAP]
+    twice = Size(leap, np.array([[0.6, 0.5]]), np.diag([0.01, 0.01]), 60, True)
+    once = Size(leap.once, np.array([[0.6]]), np.eye(1) * 0.01, 60, True)
+    for sides in ((once, twice), (twice, once)):
+        assert p_alike(*sides) < 1e-3
+    assert compared_names(twice, replace(once, found=False)) == ["seconds"]
+    assert p_alike(twice, replace(once, found=False)) == pytest.approx(1.0)
 
 
 def test_a_trace_of_an_effect_that_was_not_named_is_none_of_it():
