@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
 from ..calibration.frames import Array
 from ..effects.base import Effect
+from .beside import FittedBeside
 from .composed import Problem, is_time_of_run
 from .fitting import Fit, Fitter, n_amplitudes
 from .settings import SETTINGS
@@ -75,8 +76,19 @@ def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
 
 def log_p_in_place(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> float:
     """log p of an effect of a fit, given all others and what is not shown. rest: the fit without it."""
-    gain = fit.gain_over(rest) - max(fitter.told_by_unshown(rest) - fitter.told_by_unshown(fit), 0.0)
+    problem = fitter.problem
+    gain = fit.gain_over(rest) - max(_told_by_unshown(problem, rest) - _told_by_unshown(problem, fit), 0.0)
     return log_p_value(gain, fit.dof - rest.dof, times_tried(effect))
+
+
+def _told_by_unshown(problem: Problem, fit: Fit) -> float:
+    """Deviance that what is not shown, and not fitted, would explain beside a fit, as straight lines tell it."""
+    beside, own = FittedBeside.of_fit(problem, fit), fit.columns.shape[2]
+    if len(beside.std) == own:
+        return 0.0
+    both = beside.step(fit.noise, fit.residual)
+    alone = both.part(np.arange(own))
+    return alone.misfit(alone.solution()) - both.misfit(both.solution())
 
 
 def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "", moved: Array | float = 0.0) -> float:

@@ -320,17 +320,6 @@ class Fitter:
         step = system.solution()
         return system.misfit(step), start.moved(step)
 
-    def told_by_unshown(self, fit: Fit) -> float:
-        """Deviance that what is not shown, and not fitted, would explain beside a fit, as straight lines tell it."""
-        columns, std = self.problem.unshown_columns(fit.hypothesis, fit.seen)
-        if not columns.shape[2]:
-            return 0.0
-        white = self._white(fit.noise, np.concatenate([fit.columns, columns], axis=2))
-        std, centre = np.append(prior_std(fit.hypothesis), std), np.append(-fit.hypothesis.vector(), np.zeros(len(std)))
-        system = WhitenedLeastSquares.of(white, -self._white(fit.noise, fit.residual), std, centre)
-        own = system.part(np.arange(fit.columns.shape[2]))
-        return own.misfit(own.solution()) - system.misfit(system.solution())
-
     def refined(self, fit: Fit, steps: Sequence[float]) -> Fit:
         """A fit with the times at which its effects begin and end made finer than the grid they were found on."""
         for step in steps:

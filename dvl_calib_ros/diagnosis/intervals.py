@@ -9,14 +9,13 @@ import numpy as np
 
 from ..calibration.frames import Array
 from ..effects.base import MountingEffect
+from .beside import FittedBeside
 from .composed import Problem, is_time_of_run
 from .criteria import blocks_of
 from .fitting import Fit, Fitter
 from .leaps import LEAP, time_by_stamps
-from .least_squares import WhitenedLeastSquares
 from .made_up import made_up
 from .selection import EffectSelection
-from .unexplained import FittedBeside
 
 Triple = tuple[float, float, float]
 Times = dict[tuple[str, int, str], Triple]
@@ -67,8 +66,9 @@ def with_unshown_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:
     if not any(isinstance(effect, MountingEffect) for effect in fit.effects):
         return covariance
     beside, own = FittedBeside.of_fit(problem, fit), np.arange(fit.columns.shape[2])
-    white = fit.noise.whiten(beside.columns)
-    both = WhitenedLeastSquares.of(white, -fit.noise.whiten(fit.residual), beside.std, -beside.centre)
+    if len(beside.std) == len(own):
+        return covariance
+    both = beside.step(fit.noise, fit.residual)
     alone = both.part(own)
     moved = both.solution()[own] - alone.solution()
     return np.asarray(covariance + both.covariance()[np.ix_(own, own)] - alone.covariance() + np.outer(moved, moved))

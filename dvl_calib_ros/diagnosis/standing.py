@@ -7,13 +7,14 @@ import itertools
 import numpy as np
 
 from ..effects.base import Effect
+from .beside import FittedBeside
 from .closure import Gap
 from .composed import Problem
 from .criteria import blocks_of, price, robust_p
 from .fitting import Fit
 from .selection import EffectSelection
 from .settings import SETTINGS
-from .unexplained import FittedBeside, Unexplained, matters, moved_by, surprise_elsewhere, told_elsewhere, unexplained
+from .unexplained import Unexplained, matters, moved_by, surprise_elsewhere, told_elsewhere, unexplained
 
 # p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
 WEAK = 1e-3

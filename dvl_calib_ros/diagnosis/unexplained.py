@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from ..calibration.distributions import chi2_isf, chi2_logsf
 from ..calibration.frames import Array
 from ..verdict.reasons import Reason, finding
-from .composed import Hypothesis, Problem, Seen
+from .beside import FittedBeside
+from .composed import Problem, Seen
 from .dictionary import ALTERNATIVES, dictionary
-from .fitting import Fit, Fitter, prior_std
+from .fitting import Fit, Fitter
 from .folds import stretch_of
 from .least_squares import WhitenedLeastSquares
 from .made_up import made_up
@@ -68,37 +69,6 @@ class Unexplained:
         if isinstance(self.about, float):
             return finding("REST_FOLLOWS_PERIOD", seconds=self.about)
         return finding("REST_FOLLOWS", about=self.about)
-
-
-class FittedBeside(NamedTuple):
-    """What is fitted beside what is looked for. columns: (M, A, k) d residual / d parameters. std, centre: (k,), of the
-    prior of what they explain of a fit's residual.
-    """
-
-    columns: Array
-    std: Array
-    centre: Array
-
-    @staticmethod
-    def of(problem: Problem, hypothesis: Hypothesis, seen: Sequence[Seen], columns: Array) -> FittedBeside:
-        """Columns (M, A, k) of the first k parameters of a hypothesis, and those of what is not shown (u more)."""
-        unshown, sizes = problem.unshown_columns(hypothesis, seen)
-        k, none = columns.shape[2], np.zeros(len(sizes))
-        std, centre = np.append(prior_std(hypothesis)[:k], sizes), np.append(hypothesis.vector()[:k], none)
-        return FittedBeside(np.concatenate([columns, unshown], axis=2), std, centre)
-
-    @staticmethod
-    def of_fit(problem: Problem, fit: Fit) -> FittedBeside:
-        """All parameters of a fit, and what is not shown."""
-        return FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
-
-    def and_rest(self, raw: Array, residual: Array) -> FittedBeside:
-        """And columns raw (M, A, c), of unit size, of what a residual (M, A) follows."""
-        size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
-        # all together are no larger than the residual: else stretches without a turn would be told of any size
-        std, none = np.full(raw.shape[2], _likely(raw, residual)), np.zeros(raw.shape[2])
-        columns = np.concatenate([self.columns, raw / size], axis=2)
-        return FittedBeside(columns, np.append(self.std, std), np.append(self.centre, none))
 
 
 def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
@@ -323,12 +293,8 @@ def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     if noise.is_coloured:
         noise = _coloured_anew(noise, known, raw, fit.residual).noise
     both = known.and_rest(raw, fit.residual)
-    return _solved(noise.whiten(both.columns), noise.whiten(-fit.residual), both.std)[: fit.columns.shape[2]]
-
-
-def _likely(raw: Array, residual: Array) -> float:
-    """Size of each of columns (M, A, c) of unit size that all together are no larger than a residual (M, A)."""
-    return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
+    stands = both._replace(centre=np.zeros_like(both.centre))  # about where the fit stands, whatever its prior
+    return stands.step(noise, fit.residual).solution()[: fit.columns.shape[2]]
 
 
 def told_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> float:
@@ -370,10 +336,6 @@ def _held_out(
     for held in each:
         trained = sum((other.gram for other in each if other is not held), start=np.zeros_like(held.gram))
         yield held, replace(held, gram=trained)
-
-
-def _solved(white: Array, series: Array, std: Array) -> Array:
-    return WhitenedLeastSquares.of(white, series, std, np.zeros_like(std)).solution()
 
 
 def _chance(fitter: Fitter, fit: Fit, name: str) -> float:

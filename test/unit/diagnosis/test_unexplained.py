@@ -12,6 +12,7 @@ from test_diagnosis import LEVER, fitted, recording_of, scenario, with_added
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.diagnosis import standing
 from dvl_calib_ros.diagnosis import unexplained as looking
+from dvl_calib_ros.diagnosis.beside import FittedBeside
 from dvl_calib_ros.diagnosis.composed import Offsets, _by_turn, make_problem, no_effect
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import NEARBY, SURELY, Fitter
@@ -20,7 +21,6 @@ from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.selection import EffectSelection, Selected
 from dvl_calib_ros.diagnosis.standing import is_borne_out, settled
 from dvl_calib_ros.diagnosis.unexplained import (
-    FittedBeside,
     holds_out,
     matters,
     surprise_elsewhere,
