@@ -9,9 +9,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
 
 from ..calibration.frames import Array
 from ..calibration.robust import robust_std
@@ -112,10 +114,17 @@ class Noise:
     def _starts(self) -> Integers:
         return _starts_of(self.segments)
 
+    @cached_property
+    def _levelled(self) -> Array | None:
+        """(M, A, A) the rotation with the level taken off, in one."""
+        return None if self.rotation is None else self.rotation / self.level[:, :, None]
+
     def _scaled(self, values: Array) -> Array:
-        if self.rotation is not None:
-            values = np.einsum("mij,mj...->mi...", self.rotation, values)
-        return values / self.level.reshape(*self.level.shape, *[1] * (values.ndim - 2))
+        if self._levelled is None:
+            return values / self.level.reshape(*self.level.shape, *[1] * (values.ndim - 2))
+        if values.ndim == 2:
+            return np.asarray(np.einsum("mij,mj->mi", self._levelled, values))
+        return self._levelled @ values  # of several columns in a fifth of the time
 
     def refitted(
         self, residual: Array, orders: Sequence[tuple[int, int]] = ORDERS, taken: Array | None = None
@@ -139,13 +148,14 @@ class Noise:
         too little colour, and a slow effect is found in it.
         """
         white = self.whiten(columns)
-        covariance = np.linalg.inv(white.T @ white + np.diag(std**-2.0))
         m = len(columns)
-        shares = []
-        for axis in range(len(self.axes)):
-            waves = np.fft.rfft(white.reshape(m, -1, len(std))[:, axis], axis=0)
-            shares.append(np.einsum("fp,pq,fq->f", waves, covariance, waves.conj(), optimize=True).real / m)
-        return np.clip(np.array(shares), 0.0, MOST_TAKEN)
+        # Of columns made orthonormal it is the sum of their power. Two of them in one complex series have the mean of
+        # its powers at a frequency and at minus that
+        basis = solve_triangular(np.linalg.cholesky(white.T @ white + np.diag(std**-2.0)), white.T, lower=True)
+        each = np.concatenate([basis, np.zeros((len(basis) % 2, len(white)))]).reshape(-1, 2, m, len(self.axes))
+        power = (np.abs(np.fft.fft(each[:, 0] + 1j * each[:, 1], axis=1)) ** 2).sum(axis=0).T / m
+        half = np.arange(m // 2 + 1)
+        return np.clip(0.5 * (power[:, half] + power[:, -half]), 0.0, MOST_TAKEN)
 
     @property
     def is_coloured(self) -> bool:
