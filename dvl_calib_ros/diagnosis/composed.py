@@ -693,14 +693,17 @@ def _undone(
     Where an effect is not small against the motion, as of a spike of 7 m/s, a pass may lead further off than the one
     before; it is not taken there.
     """
+    here = [each for each in injections if each.effect.acts_on is acts_on]
     after, added = motion.velocity_body, np.zeros_like(motion.velocity_body)
-    if not any(each.effect.acts_on is acts_on for each in injections):
+    if not here:
         return motion, added
     moved_before = np.full(len(after), np.inf)
     for _ in range(_PASSES):
-        before, added = added, traces(injections, motion, acts_on)
+        before, added = added, traces(here, motion, acts_on)
         added = added if turned is None else _turned(turned, added)
-        if np.array_equal(added, before):  # they do not depend on the velocity
+        if not any(isinstance(each.effect, Effect) and each.effect.of_velocity for each in here):  # that is all
+            return replace(motion, velocity_body=after - added), added
+        if np.array_equal(added, before):
             break
         moved = np.linalg.norm(added - before, axis=1)
         added = np.where((moved <= moved_before)[:, None], added, before)

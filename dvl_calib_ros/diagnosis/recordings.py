@@ -97,7 +97,7 @@ class RecordedStreams:
         attitude = self.attitude
 
         def rotation() -> Array:
-            q = attitude.kept.at("quaternion", at, lambda: attitude(at))
+            q = attitude(at)
             return rotation_from_quaternion(q / np.sqrt((q * q).sum(axis=1))[:, None])
 
         return np.asarray(attitude.kept.at("rotation", at, rotation))

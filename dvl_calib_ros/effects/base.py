@@ -173,7 +173,8 @@ class Effect(AnyEffect, ABC):
     vehicle. relative_to_first: whether it is a change against the first of several recordings. bends_arm: whether
     little of it, left out, moves the lever arm by decimetres, as a clock's delay does beside an arm of metres. again:
     parameters of a second time that it happens, which is looked for where a first was found -> those of the first.
-    rarer: parameters that are looked for where several recordings ask for them.
+    rarer: parameters that are looked for where several recordings ask for them. of_velocity: whether the trace depends
+    on the velocity of the motion.
     """
 
     remedy: ClassVar[str] = ""
@@ -183,6 +184,7 @@ class Effect(AnyEffect, ABC):
     bends_arm: ClassVar[bool] = False
     again: ClassVar[Mapping[str, str]] = {}
     rarer: ClassVar[frozenset[str]] = frozenset()
+    of_velocity: ClassVar[bool] = True
 
     @property
     def usual(self) -> Effect:

@@ -35,15 +35,17 @@ class WaterLock(Effect):
     )
     of_the_day = True
     acts_on = ActsOn.MOTION
+    of_velocity = False
     needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("heading_error", "velocity_bias")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """R_body_from_enu c while from_s <= t < to_s."""
-        east, north = motion.attitude[:, 0], motion.attitude[:, 1]  # of each axis of the body
-        locked = (motion.elapsed >= values["from_s"]) & (motion.elapsed < values["to_s"])
-        added: Array = values["east_mps"] * east + values["north_mps"] * north
-        return np.where(locked[:, None], added, 0.0)
+        locked = slice(*np.searchsorted(motion.elapsed, [values["from_s"], values["to_s"]]))
+        east, north = motion.attitude[locked, 0], motion.attitude[locked, 1]  # of each axis of the body
+        added = np.zeros_like(motion.velocity_body)
+        added[locked] = values["east_mps"] * east + values["north_mps"] * north
+        return added
 
 
 class HeadingError(Effect):

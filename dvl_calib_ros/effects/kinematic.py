@@ -21,6 +21,7 @@ class LeverArm(Effect):
     acts_on = ActsOn.MOTION
     needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
     bends_arm = True
+    of_velocity = False
     confounded_with = ("sideslip", "reference_time_offset", "reference_lag")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
@@ -78,6 +79,7 @@ class TiltCoupling(Effect):
         EffectParameter("z_per_roll", "m/s/rad", 0.5, -20.0, 20.0, "heave error per roll", said="z per roll"),
     )
     acts_on = ActsOn.DVL
+    of_velocity = False
     needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("velocity_bias", "lever_arm")
 

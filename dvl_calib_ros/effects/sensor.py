@@ -19,6 +19,7 @@ class VelocityBias(Effect):
     manoeuvre = "straight legs at two speeds or more, one of them slow"
     parameters = along_axes("mps", "m/s", 0.02, 1.0, "bias of the DVL's axis {}")
     acts_on = ActsOn.DVL
+    of_velocity = False
     confounded_with = ("quadratic_scale", "mount_flexure", "water_lock")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:

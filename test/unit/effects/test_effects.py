@@ -163,6 +163,14 @@ def test_the_trace_is_linear_in_the_parameters_that_are_called_linear(name, rng)
     assert effect.linear == (len(linear) == len(effect.parameters))
 
 
+@pytest.mark.parametrize("name", [name for name in OWN_EFFECTS if EFFECTS[name].acts_on in (ActsOn.MOTION, ActsOn.DVL)])
+def test_a_trace_says_whether_it_depends_on_the_velocity(name):
+    effect, motion = EFFECTS[name], some_motion()
+    faster = replace(motion, velocity_body=1.3 * motion.velocity_body + 0.1)
+    traces = [effect.trace(each, typical(effect)) for each in (motion, faster)]
+    assert np.array_equal(*traces) is not effect.of_velocity
+
+
 @pytest.mark.parametrize("name", OWN_EFFECTS)
 def test_an_effect_works_without_what_it_does_not_need_and_refuses_without_what_it_does(name):
     effect = EFFECTS[name]
