@@ -8,12 +8,12 @@ from functools import cache, partial
 import numpy as np
 
 from ..effects.base import Effect
-from .clock_or_arm import DVL_CLOCK
+from .clock_or_arm import DVL_CLOCK, LAG, lag_not_taken_back
 from .criteria import blocks_of, finer_steps, fit_without, log_p_in_place, robust_p
 from .fitting import Fit, Fitter
 from .leaps import LEAP
 from .settings import SETTINGS
-from .twice import TAKEN_BACK, TAKEN_BACK_EXACTLY, apart_and_undone, either_alone, is_taken_back
+from .twice import MUCH, TAKEN_BACK, TAKEN_BACK_EXACTLY, apart_and_undone, either_alone, is_taken_back
 from .unexplained import Unexplained, matters, unexplained
 
 # A clock that explains less than this share of what two leaps do, and makes them cancel, is not late before them
@@ -35,6 +35,7 @@ def only_called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             if log_p_in_place(fitter, fit, rest, effect) > threshold
             or is_taken_back(fitter, fit, effect.name, drops[effect.name], rest)
             or _makes_leaps_cancel(fit, effect, drops)
+            or _only_smooths(fitter, fit, rest, effect)
             or (
                 _is_ghost(effect, drops[effect.name], explained, fit.deviance)
                 and not _is_late_before_a_leap(fit, effect)
@@ -55,6 +56,19 @@ def _makes_leaps_cancel(fit: Fit, effect: Effect, drops: Mapping[str, float]) ->
     if effect.name != DVL_CLOCK or LEAP not in fit.values or apart_and_undone(fit, LEAP)[1] > TAKEN_BACK_EXACTLY:
         return False
     return drops[DVL_CLOCK] < LITTLE_OF_LEAPS * drops[LEAP]
+
+
+def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> bool:
+    """Whether an effect is a lag that clocks take back, and explains no more than smoothing does. rest: without it.
+
+    The two leave the motion where it is, but for its corners, and take noise off the DVL. That of a slow one is known
+    by its claims, which may be anything up to its roughness.
+    """
+    if effect.name != LAG or lag_not_taken_back(fit) >= TAKEN_BACK:
+        return False
+    smoothed = [float(each.own_noise @ each.own_noise) for each in (rest, fit)]
+    more = (smoothed[0] - smoothed[1]) * (fitter.problem.rougher_than_claimed**2 - 1.0)
+    return rest.deviance - fit.deviance - more < MUCH
 
 
 def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:

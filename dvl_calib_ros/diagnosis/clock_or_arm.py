@@ -74,6 +74,15 @@ def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, t
     ]
 
 
+def lag_not_taken_back(fit: Fit) -> float:
+    """The share of a reference's lag, or of how early its stamps are beside the DVL's, that the other does not take
+    back, of the larger; the most of all recordings."""
+    of_none = ({"seconds": 0.0},) * len(fit.seen)
+    dvl, reference = (np.array([each["seconds"] for each in fit.values.get(name, of_none)]) for name in TWO_CLOCKS)
+    lag, late = np.array([each["time_constant_s"] for each in fit.values[LAG]]), reference - dvl
+    return float((np.abs(lag + late) / np.maximum(np.maximum(lag, np.abs(late)), 1e-9)).max())
+
+
 def is_open(guesses: Sequence[FirstGuess]) -> bool:
     """Whether registration leaves open how much of a clock is a lever arm."""
     return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)

@@ -41,6 +41,12 @@ def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0)
     return float(chi2_isf(SETTINGS.level / n_effects / tried, dof))
 
 
+def price_of_a_time(effect: Effect, n_effects: int) -> float:
+    """Deviance that the best of the times at which an effect may begin explains by chance, once in 1 / level data
+    sets, beyond what is there from the beginning."""
+    return float(chi2_isf(SETTINGS.level / n_effects / times_tried(effect), 1))
+
+
 def criterion(fit: Fit, n_effects: int) -> float:
     """Deviance and the price of every effect."""
     n = len(fit.seen)

@@ -149,6 +149,15 @@ def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, f
     return None
 
 
+def is_shown_by_stamps(fitter: Fitter, fit: Fit) -> bool:
+    """Whether the stamps of the DVL of one recording show one of the leaps of a fit, where they are next to it."""
+    if len(fit.seen) > 1 or LEAP not in fit.values:
+        return False
+    beside = in_gaps(fitter, fit)
+    times = [name for name in ("at_s", "again_at_s") if np.isfinite(beside.values[LEAP][0].get(name, np.inf))]
+    return any(time_by_stamps(fitter, beside, name) is not None for name in times)
+
+
 def _hypotheses(
     fit: Fit, rest: Sequence[Effect], once: Mapping[str, Effect], leap: Effect, values: Values, before: float
 ) -> list[Hypothesis]:

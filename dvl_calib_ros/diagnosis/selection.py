@@ -25,7 +25,7 @@ from .clock_or_arm import (
 from .compass import HEADING, heading_first, with_two_cycles
 from .composed import Hypothesis, Problem, Values, make_problem, no_effect
 from .contradicted import without_contradicted
-from .criteria import best_of, criterion, finer_steps
+from .criteria import best_of, criterion, finer_steps, price_of_a_time
 from .fitting import Fit, Fitter
 from .leaps import LEAP, in_gaps, leaping
 from .least_squares import WhitenedLeastSquares
@@ -204,6 +204,10 @@ def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) ->
     others = [
         fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in told_by_other_clocks(fitter, fit, effects)
     ]
+    if others and leaps_at_the_beginning(fitter, fit):  # a clock that is late throughout has no time to choose
+        throughout = best_of(others, effects)
+        if throughout.deviance < fit.deviance + price_of_a_time(effects[LEAP], len(effects)):
+            return throughout
     return best_of([fit, *others], effects)
 
 

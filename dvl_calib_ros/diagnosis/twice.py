@@ -10,7 +10,7 @@ from ..effects.base import Effect
 from .composed import Hypothesis, is_time_of_run
 from .criteria import WINDOW_STEPS, best_of, price, step_of_times, times_tried
 from .fitting import Fit, Fitter
-from .leaps import LEAP, gaps
+from .leaps import LEAP, gaps, is_shown_by_stamps
 from .proposing import KEPT_VARIANTS
 from .settings import SETTINGS
 from .unexplained import unexplained
@@ -103,12 +103,16 @@ def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | 
     """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording.
 
     drop: deviance that it explains. What explains much may be undone where an unknown cause in its place (rest: without
-    it) explains less. That is asked of what explains more than such causes do unseen only if it is undone exactly.
+    it) explains less. That is asked of what explains more than such causes do unseen only if it is undone exactly. A
+    clock that is set back and then put right shows that by its stamps.
     """
     apart, share = apart_and_undone(fit, name)
-    at_once = apart < step_of_times(fitter.problem)
-    if at_once or share >= TAKEN_BACK or drop < MUCH:
-        return at_once or share < TAKEN_BACK
+    if apart < step_of_times(fitter.problem):
+        return True
+    if share >= TAKEN_BACK or (name == LEAP and is_shown_by_stamps(fitter, fit)):
+        return False
+    if drop < MUCH:
+        return True
     if rest is None or (drop > SETTINGS.instead_of and share >= TAKEN_BACK_EXACTLY):
         return False
     other = unexplained(fitter, rest)
