@@ -205,7 +205,7 @@ def noise_floor(selection: EffectSelection) -> Array:
     problem, fit = selection.fitter.problem, selection.fit
     left = problem.errors(fit.seen)
     floor = np.zeros_like(left)
-    claimed = claimed_std(problem)
+    claimed, slow = claimed_std(problem), _made_slow(problem, fit)
     parameters = fit.columns.shape[2]
     of_sample = problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
@@ -213,11 +213,29 @@ def noise_floor(selection: EffectSelection) -> Array:
         high, error = high_frequency_variance(problem.sample_time[at], left[at])
         if claimed is not None:
             high = np.minimum(high, WORSE_THAN_CLAIMED**2 * claimed[recording] ** 2)
+        high = high + slow[recording]
         n = int(at.sum())
         own = left[at] ** 2 * (1.0 + 2.0 * parameters / (3.0 * max(n, 1)))
         is_noise = own.mean(axis=0).sum() <= high.sum() * (1.0 + SETTINGS.noise_tolerance * error)
         floor[at] = own if is_noise else high
     return floor
+
+
+def _made_slow(problem: Problem, fit: Fit) -> list[Array]:
+    """(3,) (m/s)² per recording: variance of the velocities' own noise, as made-up noise shows it, that a lag of the
+    fit has made slow, and high frequencies so do not show."""
+    slow = [np.zeros(3)] * len(problem.recordings)
+    if not fit.hypothesis.lags(0):
+        return slow
+    left = problem.errors(fit.seen)
+    of_sample = problem.recording_of[problem.bin_of]
+    for shaken in problem.shaken:
+        own = shaken.errors(shaken.all_seen(fit.hypothesis)) - left
+        for recording, before in enumerate(slow):
+            at = of_sample == recording
+            high, _ = high_frequency_variance(problem.sample_time[at], own[at])
+            slow[recording] = before + np.maximum((own[at] ** 2).mean(axis=0) - high, 0.0)
+    return slow
 
 
 def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:
