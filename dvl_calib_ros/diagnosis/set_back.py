@@ -16,6 +16,8 @@ TWO_STEPS, FEWEST = 1.25, 4
 TO_AND_FRO = 2.0
 # A step shorter than this share of the usual one tells of a clock where all but so many are within this of it
 SHORT, RARE, REGULAR = 0.8, 3, 0.1
+# Of two samples nearer than this share of the usual step, measured a while apart, a curve through both would ring
+TOO_SHORT = 0.5
 # By as much at most, s, is a clock set back of which the stamps do not tell by how much; and of which they do
 UP_TO_S, LONGEST_S = 2.0, 5.0
 
@@ -29,11 +31,11 @@ class SetBack(NamedTuple):
 
 
 def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray[np.bool_]]:
-    """Where a clock was set back, and which samples were stamped in no time that was stamped once, (N,).
+    """Where a clock was set back, and which samples (N,) are to be kept: stamped in a time that was stamped once.
 
     time: (N,) s, stamps in order. velocity: (N, 3) m/s, of the same samples. A clock that is set back by two seconds
     stamps two seconds once more; or a driver that wants stamps in order throws two seconds away, which leaves one step
-    that is short. A DVL that pings faster for a while has short steps as well, but for longer, and its velocity goes on
+    that is short, of which one sample at most is kept. A DVL that pings faster for a while has short steps as well, but for longer, and its velocity goes on
     as smoothly.
     """
     once = np.ones(len(time), dtype=bool)
@@ -54,4 +56,5 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
     short = odd[steps[odd] < SHORT * usual]
     if not found and len(short) > 0 and len(odd) <= RARE:
         found = [SetBack(float(time[at]), float(time[at + 1]), UP_TO_S) for at in short.tolist()]
+        once[short[steps[short] < TOO_SHORT * usual] + 1] = False
     return tuple(found), once
