@@ -224,7 +224,7 @@ def noise_floor(selection: EffectSelection) -> Array:
 def _made_slow(problem: Problem, fit: Fit) -> list[Array]:
     """(3,) (m/s)² per recording: variance of the velocities' own noise, as made-up noise shows it, that a lag of the
     fit has made slow, and high frequencies so do not show."""
-    slow = [np.zeros(3)] * len(problem.recordings)
+    slow: list[Array] = [np.zeros(3)] * len(problem.recordings)
     if not fit.hypothesis.lags(0):
         return slow
     left = problem.errors(fit.seen)

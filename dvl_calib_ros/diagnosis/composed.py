@@ -48,6 +48,8 @@ _PASSES = 3
 # Seconds between the times of a motion that a filter follows as it was, where it is looked at more seldom than
 # `FAST_ENOUGH_S`: by its slopes at 1 Hz a wave of 5 s is a quarter too small
 CLOSE_S = 0.1
+# Effects of which every vehicle has a little: where its DVL sits, and the DVL's bias
+OF_EVERY = "lever_arm", "velocity_bias"
 
 
 def is_time_of_run(spec: EffectParameter) -> bool:
@@ -310,7 +312,7 @@ class Problem:
     """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare.
     bursts: of how many samples an instrument was far off, which are left out. shown_turns: (3, 3) projection of φ on
     the turns of the mounting that a reference without a vertical shows; by the others it is not turned. unshown: what
-    it does not show of effects that every vehicle has a little of, and of turns of the mounting.
+    it does not show of effects; where one of these is in a hypothesis, or on every vehicle, there may be some of that.
     """
 
     recordings: tuple[RecordedStreams, ...]
@@ -610,13 +612,16 @@ class Problem:
             parts.append(turned @ turns[:, held > 0.5])
             sizes.append(np.full(parts[-1].shape[2], SETTINGS.prior_angle))
         for effect in self.unshown:
-            if isinstance(effect, MountingEffect):
-                if effect.name in hypothesis.values:  # and only then
-                    parts += self._of_unshown_turns(hypothesis, seen, effect)
-                    sizes += [np.full(parts[-2].shape[2], SETTINGS.prior_angle)]
-                    sizes += [np.full(parts[-1].shape[2], 0.5 * SETTINGS.prior_angle**2)]
+            named = hypothesis.values.get(effect.name)
+            if named is None and effect.name not in OF_EVERY:
                 continue
-            parts.append(self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen)))
+            if isinstance(effect, MountingEffect):
+                parts += self._of_unshown_turns(hypothesis, seen, effect)
+                sizes += [np.full(parts[-2].shape[2], SETTINGS.prior_angle)]
+                sizes += [np.full(parts[-1].shape[2], 0.5 * SETTINGS.prior_angle**2)]
+                continue
+            values = [{**effect.defaults, **own} for own in named or ({},) * len(seen)]
+            parts.append(self.columns(hypothesis, seen, effect, values))
             own = [spec.typical for spec in amplitudes(effect)]
             sizes.append(np.tile(own, parts[-1].shape[2] // len(own)))
         if not parts:

@@ -35,8 +35,8 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
 
     time: (N,) s, stamps in order. velocity: (N, 3) m/s, of the same samples. A clock that is set back by two seconds
     stamps two seconds once more; or a driver that wants stamps in order throws two seconds away, which leaves one step
-    that is short, of which one sample at most is kept. A DVL that pings faster for a while has short steps as well, but for longer, and its velocity goes on
-    as smoothly.
+    that is short, of which one sample at most is kept. A DVL that pings faster for a while has short steps as well, but
+    for longer, and its velocity goes on as smoothly.
     """
     once = np.ones(len(time), dtype=bool)
     if len(time) < 4 * FEWEST:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..calibration.frames import Array
-from ..effects.base import Effect, MountingEffect
+from ..effects.base import Effect
 from .clock_or_arm import ARM
 from .composed import Problem, Seen, Values, amplitudes, is_time_of_run, no_effect
 from .fitting import Fit
@@ -19,8 +19,6 @@ SHOWN_FROM, USUAL_MPS = 0.2, 0.02
 # A part of the lever arm is looked for where so much of it (m) would do as much, since metres left out turn all the
 # rest: an AUV that rolls at 0.5°/s. It stands if it is so many times what a model lacks makes of it
 ARM_FROM_M, FAINT = 0.6, 2.0
-# Every DVL has a little of these
-OF_EVERY = ARM, "velocity_bias"
 
 
 def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
@@ -32,10 +30,8 @@ def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Ef
 
 
 def unshown_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect]) -> tuple[Effect, ...]:
-    """What is not shown of effects that every vehicle has a little of, where its DVL sits, and the DVL's bias; and of
-    turns of the mounting, which one that turned in yaw has as well."""
-    looked = [effect for name, effect in effects.items() if name in OF_EVERY or isinstance(effect, MountingEffect)]
-    left_out = (effect.without({spec.name for spec in shown[effect.name].parameters}) for effect in looked)
+    """What is not shown of effects: who has what is shown of one has the other parts as well."""
+    left_out = (effect.without({spec.name for spec in shown[name].parameters}) for name, effect in effects.items())
     return tuple(effect for effect in left_out if effect.parameters)
 
 

@@ -9,10 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.diagnosis.clock_or_arm import moved_lag, with_moved
+from dvl_calib_ros.diagnosis.closure import high_frequency_variance, noise_floor
 from dvl_calib_ros.diagnosis.composed import Offsets, Problem, make_problem, no_effect
-from dvl_calib_ros.diagnosis.fitting import Fit
+from dvl_calib_ros.diagnosis.fitting import Fit, Fitter
 from dvl_calib_ros.diagnosis.made_up import _reference
+from dvl_calib_ros.diagnosis.noise import white_noise
 from dvl_calib_ros.diagnosis.recordings import make_recording
+from dvl_calib_ros.diagnosis.selection import EffectSelection
 from dvl_calib_ros.effects.registry import EFFECTS
 
 LAG, LAGS_S = EFFECTS["reference_lag"], 1.2
@@ -128,3 +131,18 @@ def test_made_up_recordings_lag_as_the_fit_does():
     (recording,) = problem.recordings
     made = _reference(problem, LAGGING, 0)
     assert _rms(made - recording.reference.values) < 0.01 * _rms(recording.reference.values)
+
+
+@pytest.mark.parametrize("noise_mps", [0.005, 0.02])
+def test_noise_that_a_lag_has_made_slow_is_noise(noise_mps):
+    """High frequencies show a fifth of it: what was found was right, and unknown for four times the noise left."""
+    problem = _problem(1.0, noise_mps=noise_mps)
+    fitter = Fitter(problem)
+    noise = white_noise(fitter.evaluated(LAGGING)[1], problem.segments, None, problem.interval)
+    fit = fitter.fit(LAGGING, noise)
+    left = problem.errors(fit.seen)
+    high, _ = high_frequency_variance(problem.sample_time, left)
+    selection = Mock(spec=EffectSelection, fitter=fitter, fit=fit)
+    squares = (left**2).sum(axis=1).mean()
+    assert high.sum() < 0.5 * squares
+    assert noise_floor(selection).sum(axis=1).mean() == pytest.approx(squares, rel=0.2)

@@ -37,6 +37,18 @@ def test_a_short_step_is_where_a_driver_threw_away_what_came_twice():
     assert [(each.before, each.by) for each in events] == [(pytest.approx(59.8), UP_TO_S)] and once.all()
 
 
+def test_of_two_samples_that_are_stamped_as_one_and_measured_a_second_apart_one_is_kept():
+    """A curve through both rang by metres a second: of what that made of noise a second leap was told, of 0.24 s."""
+    stamps = TRUE - 1.199 * (TRUE >= 60.0)
+    kept = np.maximum.accumulate(np.append(-1.0, stamps[:-1])) < stamps
+    dvl = stamps[kept], sailed(TRUE)[kept]
+    ((before, after, _),), once = set_back(*dvl)
+    assert after - before == pytest.approx(0.001) and np.count_nonzero(~once) == 1
+    recording = make_recording("run", dvl, (TRUE, sailed(TRUE)), dvl_std=np.full((len(once), 3), 0.01))
+    assert np.diff(recording.dvl.time).min() > 0.1
+    assert np.abs(recording.dvl(np.arange(50.0, 70.0, 0.01))).max() < 1.3
+
+
 @pytest.mark.parametrize(
     "time",
     [
