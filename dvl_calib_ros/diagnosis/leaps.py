@@ -23,8 +23,9 @@ from .settings import SETTINGS
 
 LEAP = "time_offset_jump"
 # Effects of time, of which one is wrong where a clock leaps, and of these such as stand in for a leap
-OF_TIME = (*CLOCKS, LAG, "clock_drift", LEAP)
-STANDS_IN = (DVL_CLOCK, "clock_drift", LEAP)
+MOVING_CLOCK = ("clock_drift", LEAP)
+OF_TIME = (*CLOCKS, LAG, *MOVING_CLOCK)
+STANDS_IN = (DVL_CLOCK, *MOVING_CLOCK)
 # Delays that are tried, s, about those of the fit; parts of the run between which one leap may lie, and of how many of
 # them a delay is, or it is not to be told from how a run begins or ends
 DELAYS = np.arange(-4.0, 4.01, 0.25)

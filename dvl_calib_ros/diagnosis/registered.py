@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,10 +14,15 @@ from ..calibration.register.far import far_clocks
 from ..calibration.register.motion import MotionStreams, make_motion
 from ..calibration.register.registration import Registration, register
 from ..calibration.samples import VelocityFrame
-from ..effects.base import EffectNeeds
+from ..effects.base import ActsOn, EffectNeeds
+from ..effects.composition import Injection, late
 from ..errors import InputError
 from .composed import Offsets
+from .curve import Curve
 from .recordings import RecordedStreams
+
+# Passes in which the true time of a late stamp is found
+_PASSES = 3
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,21 @@ def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever
         return FirstGuess(Offsets(), np.zeros(3), np.zeros(3))
     phi = turn_between(rotation_dvl_from_body, found.rotation_body_from_dvl.T)
     return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi, found)
+
+
+def guess_beside(
+    recording: RecordedStreams, moved: Sequence[Injection], rotation_dvl_from_body: Array, lever_arm: Array
+) -> FirstGuess | None:
+    """The guess of a recording whose DVL's clock moves as was found: what is open about that clock as it moves is not
+    about one that stands. moved: leaps and drifts of it. None where its samples then are in no order."""
+    curve = recording.dvl
+    time = curve.time
+    for _ in range(_PASSES):
+        time = curve.time - late(moved, ActsOn.DVL_CLOCK, time)
+    if not (np.diff(time) > 0.0).all():
+        return None
+    dvl = Curve(time, curve.values, curve.claimed, claims=curve.claims)
+    return first_guess(replace(recording, dvl=dvl, registration=None), rotation_dvl_from_body, lever_arm)
 
 
 def _motion(recording: RecordedStreams) -> MotionStreams | None:

@@ -27,13 +27,13 @@ from .composed import Hypothesis, Problem, Values, make_problem, no_effect
 from .contradicted import without_contradicted
 from .criteria import best_of, criterion, finer_steps, price_of_a_time
 from .fitting import Fit, Fitter
-from .leaps import LEAP, in_gaps, leaping
+from .leaps import LEAP, MOVING_CLOCK, in_gaps, leaping
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
 from .proposing import coming_and_going, leaps_at_the_beginning, proposed, told_by_other_clocks, variants_about
 from .recordings import RecordedStreams
-from .registered import FirstGuess, first_guess
+from .registered import FirstGuess, first_guess, guess_beside
 from .shown import shown_parts, unshown_parts, without_faint
 from .told_apart import Selected, tell_apart
 from .twice import happening_again, is_taken_back
@@ -146,9 +146,21 @@ def select(
     fit = without_nothing(fitter, fit, len(effects))
     fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
+    guesses = _beside_moving_clocks(fitter, fit, guesses)
     told = tell_apart(fitter, fit, guesses, effects, alike)
     base = fitter.fit_kept(told.fit.hypothesis.with_effects([], len(recordings), {}), told.fit.noise)
     return EffectSelection(told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved)
+
+
+def _beside_moving_clocks(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess]) -> tuple[FirstGuess, ...]:
+    """Guesses of recordings whose DVL's clock leaps or drifts in a fit once more, with that taken off."""
+    problem, found = fitter.problem, list(guesses)
+    for number, recording in enumerate(problem.recordings):
+        moved = [each for each in fit.hypothesis.injections(number) if each.effect.name in MOVING_CLOCK]
+        if moved:
+            again = guess_beside(recording, moved, problem.rotation_dvl_from_body, problem.lever_arm)
+            found[number] = again or found[number]
+    return tuple(found)
 
 
 def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
