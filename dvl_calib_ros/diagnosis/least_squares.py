@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from ..calibration.frames import Array
 
+# Share of a direction's squares from which on it is mostly noise
+MOSTLY = 0.5
+
 
 @dataclass(frozen=True)
 class WhitenedLeastSquares:
@@ -47,6 +50,14 @@ class WhitenedLeastSquares:
         """x (n,)."""
         right = self.gram[:-1, -1] + self.centre / self.std**2
         return np.linalg.solve(self._normal, right)
+
+    def solution_without(self, noise: Array) -> Array:
+        """x (n,), with what noise makes of `gram`, (n + 1, n + 1), taken off; zero along what is mostly noise."""
+        root = np.linalg.inv(np.linalg.cholesky(self._normal))
+        shares, along = np.linalg.eigh(root @ noise[:-1, :-1] @ root.T)
+        right = along.T @ root @ (self.gram[:-1, -1] - noise[:-1, -1] + self.centre / self.std**2)
+        signal = np.where(shares < MOSTLY, right / np.maximum(1.0 - shares, 1.0 - MOSTLY), 0.0)
+        return np.asarray(root.T @ along @ signal)
 
     def squares(self, x: Array) -> float:
         """‖target - columns x‖², at x (n,)."""

@@ -8,7 +8,7 @@ winner it is asked again, with the noise that is left by everything together: so
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from .clock_or_arm import (
     guessed_arm,
 )
 from .compass import HEADING, heading_first, with_two_cycles
-from .composed import Hypothesis, Problem, Values, make_problem, no_effect
+from .composed import Hypothesis, Problem, Values, is_time_of_run, make_problem, no_effect
 from .contradicted import without_contradicted
 from .criteria import best_of, criterion, finer_steps, price_of_a_time
 from .fitting import Fit, Fitter
@@ -179,14 +179,17 @@ def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
 def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit]:
     """A fit once more with the noise that everything together leaves, and outliers about that."""
     problem = fitter.problem
-    columns = np.concatenate(
-        [fit.columns, *(v.columns for v in variants_about(fitter, fit, effects) if v.tried == 1.0)], axis=2
-    )
+    columns = _always_there(fitter, fit, effects)
     noise = fit.noise
     raw = fit.residual + fitter.outliers
-    columns = columns / np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
+    size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
+    columns = columns / size
+    own = [
+        np.concatenate([each / size - columns, (residual - raw)[:, :, None]], axis=2)
+        for each, residual in _shaken(fitter, fit, effects)
+    ]
     for _ in range(2):
-        explained, std = _explained(noise, columns, raw - fitter.outliers)
+        explained, std = _explained(noise, columns, raw - fitter.outliers, own)
         left = raw - explained
         noise, robust = min(
             (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in _frames(problem)),
@@ -196,17 +199,36 @@ def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fit
     return fitter, fitter.fit(fit.hypothesis, noise)
 
 
+def _always_there(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Array:
+    """(M, A, p) columns of a fit, and of every other effect that is there from the beginning to the end."""
+    others = {name: effect for name, effect in effects.items() if not any(map(is_time_of_run, effect.parameters))}
+    return np.concatenate([fit.columns, *(each.columns for each in variants_about(fitter, fit, others))], axis=2)
+
+
+def _shaken(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator[tuple[Array, Array]]:
+    """The same columns (M, A, p), and the residual (M, A), with made-up noise in one velocity and then in the other."""
+    for problem in fitter.problem.shaken:
+        other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
+        again = replace(fit, seen=seen, columns=other.columns(fit.hypothesis, seen))
+        yield _always_there(other, again, effects), problem.residual(seen)
+
+
 def _frames(problem: Problem) -> list[Array | None]:
     return [None] if problem.earth_from_compared is None else [problem.earth_from_compared, None]
 
 
-def _explained(noise: Noise, columns: Array, residual: Array) -> tuple[Array, Array]:
+def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Array]) -> tuple[Array, Array]:
     """(M, A) what all columns of unit size explain of a residual, with a ridge that keeps those apart that are alike;
-    and that ridge, (p,)."""
+    and that ridge, (p,).
+
+    own: (M, A, p + 1) each, what the velocities' own noise makes in columns and residual, which is taken off: they
+    would explain that of the residual by that in them, and what then is left is slower than any noise.
+    """
     white = noise.whiten(columns)
     ridge = np.full(columns.shape[2], 10.0 * np.sqrt(float((noise.whiten(residual) ** 2).sum())) / np.sqrt(len(white)))
-    solution = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge)).solution()
-    return np.asarray(columns @ solution), ridge
+    system = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge))
+    of_noise = sum((joined.T @ joined for joined in map(noise.whiten, own)), np.zeros_like(system.gram))
+    return np.asarray(columns @ system.solution_without(of_noise)), ridge
 
 
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
