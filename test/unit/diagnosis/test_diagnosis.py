@@ -37,6 +37,7 @@ from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
 from dvl_calib_ros.diagnosis.proposing import coming_and_going, told_by_other_clocks
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
+from dvl_calib_ros.diagnosis.registered import first_guess, guess_beside
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm, started
 from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
@@ -314,6 +315,20 @@ def test_a_turn_that_is_not_shown_and_that_the_mounting_found_has_is_not_left_at
     assert guess.phi[1] == pytest.approx(-0.2, abs=0.05) and np.trace(problem.shown_turns) < 1.5
     np.testing.assert_allclose(problem.shown_turns @ start.phi, start.phi, atol=1e-12)
     assert start.phi[2] == pytest.approx(-0.01, abs=0.02)
+
+
+def test_what_is_open_of_clocks_is_not_what_a_leap_that_is_known_leaves_open():
+    """A leap of 1.9 s left an arm open by 0.7 m: of three that were found the late reference was not named."""
+    given = scenario(effects=["time_offset_jump:seconds=1.9,at_s=101.3", LEVER], gnss_std=0.02)
+    recording = recording_of(simulate(given))
+    leap = [injection("time_offset_jump:seconds=1.9,at_s=101.3")]
+    guesses = first_guess(recording, np.eye(3), np.zeros(3)), guess_beside(recording, leap, np.eye(3), np.zeros(3))
+    still, beside = (np.sqrt(np.trace(each.registration.left_open[3:6, 3:6])) for each in guesses if each is not None)
+    assert beside < 0.1 < still
+    assert abs(guesses[1].offsets.dvl) < 0.05
+    np.testing.assert_allclose(guesses[1].lever_arm, [-1.9, 0.4, -0.3], atol=0.1)
+    without = recording_of(simulate(scenario(effects=[LEVER])))  # whose samples then would be in another order
+    assert guess_beside(without, leap, np.eye(3), np.zeros(3)) is None
 
 
 def test_what_is_not_shown_of_an_effect_is_its_where_it_is_named():
@@ -989,6 +1004,38 @@ def test_whitened_least_squares_is_least_squares_with_a_prior(rng):
     two = np.concatenate([columns[:, [1, 3]], np.diag(1.0 / std[[1, 3]])])
     right = np.concatenate([target, (centre / std)[[1, 3]]])
     np.testing.assert_allclose(alone.solution(), np.linalg.lstsq(two, right, rcond=None)[0], rtol=1e-9)
+
+
+def test_what_noise_makes_of_least_squares_is_taken_off_and_what_is_mostly_noise_is_left_alone(rng):
+    """Scale for noise (errors in variables): of a column that is noise to a third, two thirds were found."""
+    m, std = 100_000, np.full(2, 1e3)
+    clean, noise = np.column_stack([rng.normal(size=m), 0.3 * rng.normal(size=m)]), rng.normal(size=(m, 3))
+    noise[:, 0] *= np.sqrt(0.5)
+    target = clean @ [2.0, 1.0] - noise[:, 1] + 0.1 * noise[:, 2]  # of the second the target has the noise as well
+    seen = WhitenedLeastSquares.of(clean + noise[:, :2], target, std, np.zeros(2))
+    again = np.column_stack([np.sqrt(0.5) * rng.normal(size=m), other := rng.normal(size=m), -other])
+    assert seen.solution()[0] == pytest.approx(4.0 / 3.0, abs=0.02) and seen.solution()[1] < -0.5
+    found = seen.solution_without(again.T @ again)
+    assert found[0] == pytest.approx(2.0, abs=0.03) and found[1] == pytest.approx(0.0, abs=0.03)
+    np.testing.assert_allclose(seen.solution_without(np.zeros((3, 3))), seen.solution())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_noise_is_no_slower_for_what_columns_explain_of_it_by_their_own(seed):
+    """A third of a DVL's noise was all that was left of it here; of a boat's, slow noise of three times as much, so an
+    arm of 3 m was noise in the next round, and at the end nothing was found."""
+    errors = DvlErrors((0.0, 0.0, 0.0), (0.0,) * 3, beam_std=0.012)
+    given = scenario("box", gnss_std=0.004, seed=seed, dvl_rate=2.0, gnss_rate=5.0, errors=errors, seconds=500.0)
+    every = {name: effect.usual for name, effect in EFFECTS.items() if not effect.relative_to_first}
+    recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
+    problem, start, _, _ = started([recording], np.eye(3), np.zeros(3), every)
+    fitter = Fitter(problem)
+    noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
+    _, fit = _about(fitter, fitter.fit(start, noise), every)
+    left = np.sqrt(np.mean(fit.residual**2, axis=0))
+    loud = [axis.std * axis.ratio for axis in fit.noise.axes]
+    np.testing.assert_allclose(loud, left, rtol=0.1)
+    assert max(axis.ratio for axis in fit.noise.axes) < 1.1
 
 
 def test_holms_p_values_are_those_worked_out_by_hand():
