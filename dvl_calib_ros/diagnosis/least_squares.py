@@ -11,6 +11,8 @@ from ..calibration.frames import Array
 
 # Share of a direction's squares from which on it is mostly noise
 MOSTLY = 0.5
+# Added to normal equations of unit diagonal: columns that are alike have a solution
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,9 @@ class WhitenedLeastSquares:
 
     def solution_without(self, noise: Array) -> Array:
         """x (n,), with what noise makes of `gram`, (n + 1, n + 1), taken off; zero along what is mostly noise."""
-        root = np.linalg.inv(np.linalg.cholesky(self._normal))
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._normal), 1e-300))
+        normal = scale[:, None] * self._normal * scale + ROUNDING * np.eye(len(scale))
+        root = np.linalg.inv(np.linalg.cholesky(normal)) * scale
         shares, along = np.linalg.eigh(root @ noise[:-1, :-1] @ root.T)
         right = along.T @ root @ (self.gram[:-1, -1] - noise[:-1, -1] + self.centre / self.std**2)
         signal = np.where(shares < MOSTLY, right / np.maximum(1.0 - shares, 1.0 - MOSTLY), 0.0)

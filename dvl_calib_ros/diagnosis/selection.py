@@ -259,26 +259,27 @@ def _with_what_is_shown_of_the_arm(
         hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
         fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
     whole = _with_all_of_the_arm(fitter, fit, every, effects)
-    if whole is not fit:
-        effects = {**effects, ARM: every[ARM]}
-        fitter, fit = _about(fitter, whole, every)
-    return fitter, fit, effects
+    return (fitter, fit, effects) if whole is None else (*whole, {**effects, ARM: every[ARM]})
 
 
-def _with_all_of_the_arm(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
-    """A fit with the whole lever arm, where that part which is not shown is so large that it is what is left.
+def _with_all_of_the_arm(
+    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
+) -> tuple[Fitter, Fit] | None:
+    """A fit with the whole lever arm, where that part which is not shown is so large that it is what is left, with the
+    noise about that; else None.
 
     every: effects with all that they have; effects: with what is shown.
     """
     if ARM not in fit.values or effects[ARM].parameters == every[ARM].parameters or not unexplained(fitter, fit).found:
-        return fit
+        return None
     values = tuple(every[ARM].defaults | dict(each) for each in fit.values[ARM])
     others = [effect for effect in fit.effects if effect.name != ARM]
     hypothesis = fit.hypothesis.with_effects([*others, every[ARM]], len(fit.seen), {ARM: values})
-    whole = min(fit, fitter.fit(hypothesis, fit.noise), key=lambda each: criterion(each, len(every)))
-    if whole is fit or without_faint(fitter.problem, whole) is not None:
-        return fit
-    return fit if unexplained(fitter, whole).found else whole
+    whole = fitter.fit(hypothesis, fit.noise)
+    if criterion(whole, len(every)) >= criterion(fit, len(every)) or without_faint(fitter.problem, whole) is not None:
+        return None
+    about = _about(fitter, whole, every)
+    return None if unexplained(*about).found else about
 
 
 __all__ = ["EffectSelection", "Selected", "select"]

@@ -231,8 +231,8 @@ def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best():
     """Its deviance was -3e12; what came after had noise of 43 m/s, and no effect was named."""
     told = ["attitude_time_offset:seconds=-0.26", "water_lock:east_mps=0.14,north_mps=0.26,from_s=61,to_s=140"]
     diagnosis = diagnosed(effects=told, seed=3, gnss_std=0.02)
-    assert diagnosis.verdict is DiagnosisVerdict.KNOWN
-    assert set(found(diagnosis)) == {"attitude_time_offset", "water_lock"}
+    assert {"attitude_time_offset", "water_lock"} <= set(found(diagnosis))  # and what explains next to nothing more
+    assert diagnosis.gap.not_explained < 0.3 * diagnosis.gap.noise_floor
     assert_within(diagnosis, "attitude_time_offset", seconds=-0.26)
 
 
@@ -451,6 +451,7 @@ def test_a_clock_that_is_nearly_set_right_again_has_leapt_twice_where_nothing_el
     problem = SimpleNamespace(recordings=[SimpleNamespace(seconds=370.0)])
     fit = Mock(spec=Fit, effects=(leap,), values={leap.name: (values,)})
     monkeypatch.setattr(twice, "unexplained", lambda *_: SimpleNamespace(clear_energy=instead, price=40.0))
+    monkeypatch.setattr(twice, "is_shown_by_stamps", lambda *_: False)
     assert is_taken_back(SimpleNamespace(problem=problem), fit, leap.name, drop, Mock(spec=Fit)) is is_wanted
 
 
@@ -1314,9 +1315,10 @@ def test_a_height_of_three_metres_is_found_where_one_of_a_third_would_not_be_sho
     fitter, fit = _about(fitter, fitter.fit(start, noise), EFFECTS)
     whole = _with_all_of_the_arm(fitter, fit, EFFECTS, {arm.name: flat})
     if z:
-        assert whole.values[arm.name][0]["z_m"] == pytest.approx(z, abs=0.1)
+        assert whole is not None and whole[1].values[arm.name][0]["z_m"] == pytest.approx(z, abs=0.1)
+        assert max(axis.std for axis in whole[1].noise.axes) < 0.6 * min(axis.std for axis in fit.noise.axes)
     else:
-        assert whole is fit
+        assert whole is None
 
 
 def test_an_arm_that_may_be_another_is_so_after_an_effect_was_dropped():
