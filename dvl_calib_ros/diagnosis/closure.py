@@ -29,6 +29,7 @@ class Gap:
     is none; interval: its 95 per cent. not_explained: what of `after` is not noise. reported: noise that the messages
     claim, None where they do not. by_recording: before and after of each of several. left_open: what of
     `not_explained` is in stretches that alone tell a part of the effects, and no more than was to be expected there.
+    shown_from: the lower end of `interval` but for that.
     """
 
     before: float
@@ -40,6 +41,12 @@ class Gap:
     reported: float | None = None
     by_recording: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     left_open: float = 0.0
+    shown_from: float = np.nan
+
+    @property
+    def shown(self) -> float:
+        """Closure, but for what is left open."""
+        return float(self.closure + (self.not_explained**2 - self.not_expected**2) / max(self.beyond_noise**2, 1e-300))
 
     @property
     def not_expected(self) -> float:
@@ -69,12 +76,11 @@ class HeldOutResiduals:
         """Squares of before, after and floor summed over each block (B,), (m/s)²."""
         return self._summed(self.before**2), self._summed(self.after**2), self._summed(self.floor)
 
-    @property
-    def square_left_open(self) -> float:
-        """(m/s)², mean of what is left open, of each block no more than it has beyond the noise."""
+    def open_of_blocks(self) -> Array:
+        """(B,) (m/s)², sums of what is left open, of each block no more than it has beyond the noise."""
         _, after, floor = self.squares()
         left_open = np.bincount(self.block, np.broadcast_to(self.left_open, len(self.block)))
-        return float(np.minimum(left_open, np.maximum(after - floor, 0.0)).sum()) / len(self.block)
+        return np.asarray(np.minimum(left_open, np.maximum(after - floor, 0.0)))
 
     def _summed(self, squares: Array) -> Array:
         return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
@@ -142,18 +148,18 @@ def only(problem: Problem, recording: int) -> Problem:
 def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
     """Held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
     before, after, floor = residuals.squares()
-    n = len(residuals.before)
+    left_open, n = residuals.open_of_blocks(), len(residuals.before)
 
-    def closure(at: Integers) -> Array:
+    def closure(at: Integers, left: Array) -> Array:
         gap = np.maximum((before - floor)[at].sum(axis=-1), 1e-300)
-        return np.asarray(1.0 - np.maximum((after - floor)[at].sum(axis=-1), 0.0) / gap)
+        return np.asarray(1.0 - np.maximum((left - floor)[at].sum(axis=-1), 0.0) / gap)
 
-    rng = np.random.default_rng(0)
-    resampled = closure(rng.integers(0, len(before), (RESAMPLES, len(before))))
-    low, high = np.percentile(np.clip(resampled, -1.0, 1.0), [2.5, 97.5]).tolist()
+    drawn = np.random.default_rng(0).integers(0, len(before), (RESAMPLES, len(before)))
+    low, high = np.percentile(np.clip(closure(drawn, after), -1.0, 1.0), [2.5, 97.5]).tolist()
+    shown_from = float(np.percentile(np.clip(closure(drawn, after - left_open), -1.0, 1.0), 2.5))
     squares = [float(part.sum()) / n for part in (before, after, floor)]
     is_gap = bool(selection.fit.effects) and squares[0] > squares[2]
-    value = min(1.0, float(closure(np.arange(len(before))))) if is_gap else np.nan
+    value = min(1.0, float(closure(np.arange(len(before)), after))) if is_gap else np.nan
     return Gap(
         before=float(np.sqrt(squares[0])),
         after=float(np.sqrt(squares[1])),
@@ -163,7 +169,8 @@ def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
         not_explained=float(np.sqrt(max(0.0, squares[1] - squares[2]))),
         reported=_reported(selection.fitter.problem),
         by_recording=_by_recording(selection.fitter.problem, residuals),
-        left_open=float(np.sqrt(residuals.square_left_open)),
+        left_open=float(np.sqrt(left_open.sum() / n)),
+        shown_from=shown_from if is_gap else np.nan,
     )
 
 

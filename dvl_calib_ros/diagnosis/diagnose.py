@@ -225,7 +225,7 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
     if matters(selection.fitter.problem, selection.fit, rest):
         return DiagnosisVerdict.UNKNOWN
     # effects that leave more on held-out data than there is noise explain it no better than what they stand in for
-    if selection.selected and (gap.not_expected > gap.noise_floor or gap.closure < MATERIAL):
+    if selection.selected and (gap.not_expected > gap.noise_floor or gap.shown < MATERIAL):
         return DiagnosisVerdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)

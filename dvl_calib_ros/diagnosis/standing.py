@@ -111,4 +111,5 @@ def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
     p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
     if np.isnan(gap.interval[0]):
         return p <= WEAK and gap.after < gap.before
-    return gap.interval[0] > 0.0  # else, whatever its p, it does not hold elsewhere
+    # Whatever its p, it has to hold elsewhere; what explains much may be told by one stretch alone: a leap, by one turn
+    return gap.interval[0] > 0.0 or (explained >= FAINT and gap.shown_from > 0.0)
