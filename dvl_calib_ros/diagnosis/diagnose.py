@@ -35,9 +35,9 @@ from .selection import EffectSelection, Selected, select
 from .series import collect_series
 from .settings import SETTINGS
 from .shown import somewhere, with_shown
-from .standing import is_borne_out, settled
+from .standing import borne_out, settled
 from .twin import twins
-from .unexplained import Unexplained, matters, moved_by, unexplained
+from .unexplained import Unexplained, matters, moved_by
 from .where import places
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
@@ -103,9 +103,9 @@ def diagnose_recordings(
     selection, rest = settled(selection, len(testable))
     residuals = held_out(selection)
     gap = measure_gap(selection, residuals)
-    if selection.selected and not is_borne_out(selection, gap, len(testable)):
-        selection = selection.withdrawn()
-        rest = unexplained(selection.fitter, selection.fit)
+    stands, rest = borne_out(selection, rest, gap, len(testable))
+    if stands is not selection:
+        selection = stands
         residuals = held_out(selection)
         gap = measure_gap(selection, residuals)
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}

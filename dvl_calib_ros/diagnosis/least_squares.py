@@ -15,6 +15,13 @@ MOSTLY = 0.5
 ROUNDING = 1e-9
 
 
+def root_of_inverse(normal: Array) -> Array:
+    """(n, n) with root.T @ root the inverse of a normal matrix (n, n), whose columns may be alike to rounding."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    rounded = scale[:, None] * normal * scale + ROUNDING * np.eye(len(scale))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(rounded)) * scale)
+
+
 @dataclass(frozen=True)
 class WhitenedLeastSquares:
     """Minimise ‖target - columns x‖² + Σ ((x - centre) / std)², all of it whitened.
@@ -55,9 +62,7 @@ class WhitenedLeastSquares:
 
     def solution_without(self, noise: Array) -> Array:
         """x (n,), with what noise makes of `gram`, (n + 1, n + 1), taken off; zero along what is mostly noise."""
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(self._normal), 1e-300))
-        normal = scale[:, None] * self._normal * scale + ROUNDING * np.eye(len(scale))
-        root = np.linalg.inv(np.linalg.cholesky(normal)) * scale
+        root = root_of_inverse(self._normal)
         shares, along = np.linalg.eigh(root @ noise[:-1, :-1] @ root.T)
         right = along.T @ root @ (self.gram[:-1, -1] - noise[:-1, -1] + self.centre / self.std**2)
         signal = np.where(shares < MOSTLY, right / np.maximum(1.0 - shares, 1.0 - MOSTLY), 0.0)

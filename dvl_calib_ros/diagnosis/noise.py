@@ -13,11 +13,11 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from ..calibration.frames import Array
 from ..calibration.robust import robust_std
 from ..effects.along_time import recursion
+from .least_squares import root_of_inverse
 
 # Innovations beyond so many standard deviations pull no harder than at it (Huber)
 HUBER = 2.5
@@ -151,7 +151,7 @@ class Noise:
         m = len(columns)
         # Of columns made orthonormal it is the sum of their power. Two of them in one complex series have the mean of
         # its powers at a frequency and at minus that
-        basis = solve_triangular(np.linalg.cholesky(white.T @ white + np.diag(std**-2.0)), white.T, lower=True)
+        basis = root_of_inverse(white.T @ white + np.diag(std**-2.0)) @ white.T
         each = np.concatenate([basis, np.zeros((len(basis) % 2, len(white)))]).reshape(-1, 2, m, len(self.axes))
         power = (np.abs(np.fft.fft(each[:, 0] + 1j * each[:, 1], axis=1)) ** 2).sum(axis=0).T / m
         half = np.arange(m // 2 + 1)

@@ -95,6 +95,23 @@ def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
 
+def borne_out(
+    selection: EffectSelection, rest: Unexplained, gap: Gap, n_tested: int
+) -> tuple[EffectSelection, Unexplained]:
+    """A selection and what it leaves, as they are if it is borne out; else none of its effects, and what is left then.
+
+    What explains much may be told by one stretch alone, as a leap by one turn. It stands if no unknown cause does.
+    """
+    if not selection.selected or is_borne_out(selection, gap, n_tested):
+        return selection, rest
+    none = selection.withdrawn()
+    left = unexplained(none.fitter, none.fit)
+    is_told_once = none.fit.deviance - selection.fit.deviance >= FAINT and gap.shown_from > 0.0
+    if is_told_once and not matters(none.fitter.problem, none.fit, left):
+        return selection, rest
+    return none, left
+
+
 def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
     """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
     fit = selection.fit
@@ -111,5 +128,4 @@ def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
     p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
     if np.isnan(gap.interval[0]):
         return p <= WEAK and gap.after < gap.before
-    # Whatever its p, it has to hold elsewhere; what explains much may be told by one stretch alone: a leap, by one turn
-    return gap.interval[0] > 0.0 or (explained >= FAINT and gap.shown_from > 0.0)
+    return gap.interval[0] > 0.0  # else, whatever its p, it does not hold elsewhere

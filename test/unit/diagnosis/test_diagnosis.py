@@ -41,7 +41,7 @@ from dvl_calib_ros.diagnosis.registered import first_guess, guess_beside
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm, started
 from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
-from dvl_calib_ros.diagnosis.standing import is_borne_out
+from dvl_calib_ros.diagnosis.standing import borne_out
 from dvl_calib_ros.diagnosis.told_apart import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.twice import happening_again, is_taken_back
 from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
@@ -1198,19 +1198,21 @@ def test_what_the_very_stretch_that_is_held_out_tells_is_no_unknown_cause():
     assert diagnosis.verdict is DiagnosisVerdict.KNOWN
 
 
-def test_what_explains_much_may_be_told_by_one_stretch_alone():
+def test_what_explains_much_may_be_told_by_one_stretch_alone(monkeypatch):
     """A leap of 0.6 s before a straight leg: without its only turn it came out at 1.2 s, and no gap was left to say."""
     gap = Gap(0.0417, 0.0419, 0.0350, -0.02, (-0.08, 1.0), 0.0230, left_open=0.0142, shown_from=0.05)
     assert gap.shown == pytest.approx(0.37, abs=0.02)
-    for explained, shown_from, is_wanted in ((984.0, 0.05, True), (984.0, -0.05, False), (150.0, 0.05, False)):
+    for explained, shown_from, is_there, stands in (
+        (984.0, 0.05, False, True), (984.0, 0.05, True, False), (984.0, -0.05, False, False), (150.0, 0.05, False, False)
+    ):  # fmt: skip
         fit, base = (Mock(spec=Fit, deviance=each) for each in (1000.0, 1000.0 + explained))
-        fit.columns, fit.residual, fit.seen = np.zeros((9, 3, 7)), np.zeros((9, 3)), [None]
-        fit.hypothesis = no_effect().with_effects([EFFECTS["dvl_time_offset"]], 1, {})
-        selection: Any = SimpleNamespace(fit=fit, base=base, fitter=Mock(), selected=[SimpleNamespace(log_p=-480.0)])
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(standing, "told_elsewhere", lambda *_: 1e9)
-            patch.setattr(standing, "FittedBeside", Mock())
-            assert is_borne_out(selection, replace(gap, shown_from=shown_from), 30) is is_wanted
+        none = SimpleNamespace(fit=base, fitter=Mock())
+        selection: Any = SimpleNamespace(fit=fit, selected=[None], withdrawn=lambda none=none: none)
+        monkeypatch.setattr(standing, "is_borne_out", lambda *_: False)
+        monkeypatch.setattr(standing, "unexplained", lambda *_: "an unknown cause")
+        monkeypatch.setattr(standing, "matters", lambda *_, is_there=is_there: is_there)
+        found = borne_out(selection, "nothing", replace(gap, shown_from=shown_from), 30)
+        assert found == ((selection, "nothing") if stands else (none, "an unknown cause"))
 
 
 def test_a_stretch_is_left_open_by_no_more_than_what_it_has_beyond_the_noise():
