@@ -1203,7 +1203,7 @@ def test_what_explains_much_may_be_told_by_one_stretch_alone(monkeypatch):
     gap = Gap(0.0417, 0.0419, 0.0350, -0.02, (-0.08, 1.0), 0.0230, left_open=0.0142, shown_from=0.05)
     assert gap.shown == pytest.approx(0.37, abs=0.02)
     for explained, shown_from, is_there, stands in (
-        (984.0, 0.05, False, True), (984.0, 0.05, True, False), (984.0, -0.05, False, False), (150.0, 0.05, False, False)
+        (984.0, 0.05, False, True), (984.0, 0.05, True, False), (984.0, -0.1, False, False), (150.0, 0.05, False, False)
     ):  # fmt: skip
         fit, base = (Mock(spec=Fit, deviance=each) for each in (1000.0, 1000.0 + explained))
         none = SimpleNamespace(fit=base, fitter=Mock())
