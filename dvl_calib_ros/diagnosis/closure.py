@@ -129,14 +129,11 @@ def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, record
     """Fit to one recording with the vehicle as others tell it and the day as it tells itself."""
     problem, noise = selection.fitter.problem, selection.fit.noise
     alone = only(problem, recording)
-    of_it = problem.recording_of == recording
-    part = replace(noise, segments=alone.segments, level=noise.level[of_it])
-    if noise.rotation is not None:
-        part = replace(part, rotation=noise.rotation[of_it])
+    of_it = problem.rows_of[recording]
     outliers = selection.fitter.outliers
     fitter = Fitter(alone, outliers[of_it] if isinstance(outliers, np.ndarray) else outliers)
     values = {name: (per[recording],) for name, per in hypothesis.values.items()}
-    return fitter.fit(replace(hypothesis, values=values), part, only_of_the_day=True)
+    return fitter.fit(replace(hypothesis, values=values), noise.part(of_it), only_of_the_day=True)
 
 
 def only(problem: Problem, recording: int) -> Problem:

@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from itertools import pairwise
 from typing import Any, NamedTuple, overload
 
 import numpy as np
@@ -209,8 +210,8 @@ class Seen:
 
 class _Moved(NamedTuple):
     """What a DVL says of the motion at F times. motion, at_dvl, angles, body_from_measured, dvl_stamps: as of `Seen`.
-    raw, smooth: (F, 3) m/s, what it measured, its frame. added: (F, 3) m/s that a lever arm that is known, and effects
-    before the reference, add to the motion, body frame. attitude_stamps: (F,) s.
+    raw, smooth: (F, 3) m/s, what it measured, its frame. added: (F, 3) or (3,) m/s that a lever arm that is known, and
+    effects before the reference, add to the motion, body frame. attitude_stamps: (F,) s.
     """
 
     motion: EffectInput
@@ -366,6 +367,12 @@ class Problem:
         return np.repeat(np.arange(len(self.grids)), [len(grid.bin_time) for grid in self.grids])
 
     @cached_property
+    def rows_of(self) -> tuple[slice, ...]:
+        """Which of the M bins belong to each recording."""
+        ends = np.cumsum([0, *(len(grid.bin_time) for grid in self.grids)]).tolist()
+        return tuple(slice(*each) for each in pairwise(ends))
+
+    @cached_property
     def segments(self) -> tuple[slice, ...]:
         """Stretches of the M bins without a gap."""
         return segments_of([grid.bin_time for grid in self.grids])
@@ -466,7 +473,8 @@ class Problem:
             closely=partial(self._close, hypothesis, recording, time),
             as_it_is=partial(self._close_as_it_is, hypothesis, recording, time),
         )
-        error -= found.on_reference(injections)  # in place: what it is seen as close by is kept
+        if any(each.effect.acts_on is ActsOn.REFERENCE for each in injections):
+            error -= found.on_reference(injections)  # in place: what it is seen as close by is kept
         for lag, values in hypothesis.lags(recording):
             error -= lag.of_before(found.motion, error, values)
         return found
@@ -567,17 +575,50 @@ class Problem:
         for recording, (grid, each) in enumerate(zip(self.grids, seen, strict=True)):
             # of one mounting they are linear in the velocity, and so in its mean over each bin
             lags = hypothesis.lags(recording)
-            is_linear = each.body_from_measured.ndim == 2 and all(self.measured) and not lags
+            if each.body_from_measured.ndim == 2 and all(self.measured) and not lags:
+                parts.append(self._by_calibration(hypothesis, each, grid.averaged(each.measured)))
+                continue
             close, own = each.close if lags else (each, slice(None))
-            measured = grid.averaged(each.measured) if is_linear else close.measured
-            columns = np.empty((len(measured), 3, 6))
-            by_turn = _by_turn(hypothesis, close, measured)
-            columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
-            unscaled = measured / (1.0 + hypothesis.scale)
-            np.multiply(-unscaled[:, None, :], close.body_from_measured, out=columns[:, :, 3:])
-            lagging = columns if is_linear else _begun(lags, each, _lagging(lags, close, columns)[own])
-            parts.append(lagging if is_linear else self._in_bins(grid, lagging, each))
+            body = self._by_calibration(hypothesis, close, close.measured)
+            parts.append(self._in_bins(grid, _lagging(lags, each, close, own, body), each))
         return np.concatenate(parts)
+
+    def _by_calibration(self, hypothesis: Hypothesis, seen: Seen, measured: Array) -> Array:
+        """(F, 3, 6) d e / d (φ, δk), body frame, of velocities (F, 3) m/s in the DVL's."""
+        columns = np.empty((len(measured), 3, 6))
+        by_turn = _by_turn(hypothesis, seen, measured)
+        columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
+        unscaled = measured / (1.0 + hypothesis.scale)
+        np.multiply(-unscaled[:, None, :], seen.body_from_measured, out=columns[:, :, 3:])
+        return columns
+
+    def all_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
+        """(M, A, 6 + p) d e / d (φ, δk) and all parameters of a hypothesis, in its order."""
+        effects = hypothesis.effects
+        if not hypothesis.lags(0):
+            of_each = [self.columns(hypothesis, seen, each, hypothesis.values[each.name]) for each in effects]
+            return np.concatenate([self.calibration_columns(hypothesis, seen), *of_each], axis=2)
+        # what a lag filters, of all effects at once: to filter many columns takes little longer than to filter one
+        lagging = [effect for effect in effects if effect.acts_on is not ActsOn.REFERENCE]
+        bodies = []
+        for recording, each in enumerate(seen):
+            close, own = each.close
+            of_each = [
+                self._derivatives(hypothesis, close, effect, hypothesis.values[effect.name][recording])
+                for effect in lagging
+            ]
+            body = np.concatenate([self._by_calibration(hypothesis, close, close.measured), *of_each], axis=2)
+            bodies.append(_lagging(hypothesis.lags(recording), each, close, own, body))
+        joined = self.binned(bodies, seen)
+        parts, at = {}, 6
+        for effect in lagging:
+            p = len(amplitudes(effect))
+            parts[effect.name] = self._of_the_day(effect, joined[:, :, at : at + p])
+            at += p
+        for effect in effects:
+            if effect not in lagging:
+                parts[effect.name] = self.columns(hypothesis, seen, effect, hypothesis.values[effect.name])
+        return np.concatenate([joined[:, :, :6], *(parts[effect.name] for effect in effects)], axis=2)
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """(M, A, p) d e / d parameters of an effect about values, per recording; of the day: by recording."""
@@ -588,16 +629,30 @@ class Problem:
             close, own = each.close if of_motion else (each, slice(None))
             if isinstance(effect, EffectWithMemory):
                 as_it_is, own = each.close_as_it_is
-                body = _of_trace(effect, as_it_is, values[recording])
+                body = _of_trace(effect, as_it_is, values[recording])[own]
+                per_recording.append(_begun(lags, each, body))
             else:
                 body = self._derivatives(hypothesis, close, effect, values[recording])
-            per_recording.append(_begun(lags, each, _lagging(of_motion, close, body)[own]))
-        joined = self.binned(per_recording, seen)
-        if not effect.of_the_day or len(seen) == 1:
-            return joined
-        whose = whose_parameters(effect, len(seen))
-        blocks = [np.where((self.recording_of == r)[:, None, None], joined, 0.0) for r in whose]
-        return np.concatenate(blocks, axis=2)
+                lagging = _lagging(lags, each, close, own, body) if of_motion else _begun(lags, each, body)
+                per_recording.append(lagging)
+        return self._of_the_day(effect, self.binned(per_recording, seen))
+
+    def _of_the_day(self, effect: Effect, columns: Array) -> Array:
+        """(M, A, p) of an effect -> (M, A, p), or (M, A, r p) where it is another in each recording: each one's own and
+        zero in the others."""
+        whose, p = whose_parameters(effect, len(self.grids)), columns.shape[2]
+        if whose == [None]:
+            return columns
+        found = np.zeros((*columns.shape[:2], len(whose) * p))
+        for number, recording in enumerate(whose):
+            own = self.recording_of == recording
+            found[own, :, number * p : (number + 1) * p] = columns[own]
+        return found
+
+    def lacks_columns(self, hypothesis: Hypothesis) -> bool:
+        """Whether there is anything that `unshown_columns` gives of a hypothesis."""
+        named = {*hypothesis.values, *OF_EVERY}
+        return any(effect.name in named for effect in self.unshown) or not np.allclose(self.shown_turns, np.eye(3))
 
     def unshown_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> tuple[Array, Array]:
         """(M, A, u) d e / d what is not shown and not fitted: turns of the mounting, parts of effects; and their usual
@@ -633,11 +688,7 @@ class Problem:
         recording: by its cosine a turn of 4° makes all velocities of a day slower by a quarter of a per cent."""
         turned = self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen))
         slower = self.binned([-each.motion.velocity_body for each in seen], seen)[:, :, None]
-        whose = whose_parameters(effect, len(seen))
-        if whose == [None]:
-            return [turned, slower]
-        of_each = [np.where((self.recording_of == one)[:, None, None], slower, 0.0) for one in whose]
-        return [turned, np.concatenate(of_each, axis=2)]
+        return [turned, self._of_the_day(effect, slower)]
 
     def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """(M, A) m/s that an effect adds to the residual of a hypothesis that has not got it."""
@@ -699,15 +750,15 @@ def _change(curve: Curve, at: Array) -> Array:
 def _undone(
     injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn, turned: Array | None
 ) -> tuple[EffectInput, Array]:
-    """The motion before the effects of one stage have acted on it, and what they have added (F, 3).
+    """The motion before the effects of one stage have acted on it, and what they have added (F, 3), or (3,) nothing.
 
     Where an effect is not small against the motion, as of a spike of 7 m/s, a pass may lead further off than the one
     before; it is not taken there.
     """
     here = [each for each in injections if each.effect.acts_on is acts_on]
-    after, added = motion.velocity_body, np.zeros_like(motion.velocity_body)
     if not here:
-        return motion, added
+        return motion, np.zeros(3)
+    after, added = motion.velocity_body, np.zeros_like(motion.velocity_body)
     moved_before = np.full(len(after), np.inf)
     for _ in range(_PASSES):
         before, added = added, traces(here, motion, acts_on)
@@ -723,11 +774,21 @@ def _undone(
     return motion, added
 
 
-def _lagging(lags: Sequence[tuple[EffectWithMemory, Values]], seen: Seen, columns: Array) -> Array:
-    """Derivatives (F, 3, p) of the reference point's velocity, m/s, of references that follow with a lag."""
+def _lagging(
+    lags: Sequence[tuple[EffectWithMemory, Values]],
+    seen: Seen,
+    close: Seen,
+    own: NDArray[np.intp] | slice,
+    columns: Array,
+) -> Array:
+    """Derivatives (C, 3, p) of the reference point's velocity, m/s, at close times, of which some are a recording's
+    own -> (F, 3, p) of references that follow with a lag, as `_begun`."""
+    if close is seen and len(lags) == 1:
+        ((lag, values),) = lags
+        return lag.follows(seen.motion, columns, values)
     for lag, values in lags:
-        columns = columns - lag.filtered(seen.motion, columns, values)
-    return columns
+        columns = columns - lag.filtered(close.motion, columns, values)
+    return _begun(lags, seen, columns[own])
 
 
 def _begun(lags: Sequence[tuple[EffectWithMemory, Values]], seen: Seen, columns: Array) -> Array:

@@ -89,11 +89,10 @@ def log_p_in_place(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> float
 
 def _told_by_unshown(problem: Problem, fit: Fit) -> float:
     """Deviance that what is not shown, and not fitted, would explain beside a fit, as straight lines tell it."""
-    beside, own = FittedBeside.of_fit(problem, fit), fit.columns.shape[2]
-    if len(beside.std) == own:
+    if not problem.lacks_columns(fit.hypothesis):
         return 0.0
-    both = beside.step(fit.noise, fit.residual)
-    alone = both.part(np.arange(own))
+    both = FittedBeside.of_fit(problem, fit).step(fit.noise, fit.residual)
+    alone = both.part(np.arange(fit.columns.shape[2]))
     return alone.misfit(alone.solution()) - both.misfit(both.solution())
 
 

@@ -5,8 +5,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,8 @@ OF_A_TIME, NO_TIME_BEYOND = -2.0 * float(np.log(1.0 - np.sqrt(0.95))), 40.0
 # Standard deviations from the middle to the ends of an interval of 95 per cent
 OF_INTERVAL = 1.96
 Mask = NDArray[np.bool_]
+# A hypothesis through the model, and its residual (M, A)
+Evaluated = tuple[tuple[Seen, ...], Array]
 
 
 def around(value: float, std: float) -> tuple[float, float, float]:
@@ -60,8 +63,8 @@ def prior_std(hypothesis: Hypothesis) -> Array:
 
 @dataclass(frozen=True)
 class Fit:
-    """A hypothesis fitted. seen: per recording. residual: (M, A) m/s that is left, outliers drawn in. columns:
-    (M, A, 6 + p) its derivatives. system: the last step's. own_noise: whitened, what made-up noise of the velocities
+    """A hypothesis fitted. seen: per recording. residual: (M, A) m/s that is left, outliers drawn in. made: gives its
+    derivatives, `columns`. system: the last step's. own_noise: whitened, what made-up noise of the velocities
     makes in it. deviance: whitened squares and prior, less those of that: a delay interpolates at another phase, a
     low-pass takes noise off, which must not count for or against them. of_tails: by how much the squares of own_noise
     are larger where that has heavier tails than what is made up.
@@ -71,11 +74,16 @@ class Fit:
     seen: Sequence[Seen]
     residual: Array
     noise: Noise
-    columns: Array
+    made: Callable[[], Array] = field(repr=False)
     system: WhitenedLeastSquares
     deviance: float
     own_noise: Array
     of_tails: float = 0.0
+
+    @cached_property
+    def columns(self) -> Array:
+        """(M, A, 6 + p) derivatives of the residual, of which of most fits nobody asks."""
+        return self.made()
 
     def gain_over(self, rest: Fit) -> float:
         """Deviance that this explains beyond another, for sure.
@@ -163,10 +171,7 @@ class Fitter:
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
         """(M, A, 6 + p) derivatives of the residual."""
-        problem = self.problem
-        parts = [problem.calibration_columns(hypothesis, seen)]
-        parts += [problem.columns(hypothesis, seen, e, hypothesis.values[e.name]) for e in hypothesis.effects]
-        return np.concatenate(parts, axis=2)
+        return self.problem.all_columns(hypothesis, seen)
 
     def _looked(
         self, hypothesis: Hypothesis, noise: Noise, seen: tuple[Seen, ...] | None = None, residual: Array | None = None
@@ -196,17 +201,21 @@ class Fitter:
         fixed: frozenset[str] = frozenset(),
         careful: bool = False,
         looked: _Looked | None = None,
+        evaluated: Evaluated | None = None,
     ) -> Fit:
         """Fit a hypothesis from where it is, under a noise; of the day: all that belongs to the vehicle is kept.
 
         fixed: names of effects whose values are kept. careful: the last step, with what noise makes in the columns
         taken off, is not one that was just seen to make it worse, as at the kink of a slow attitude. Where a fit is
-        stuck far from the best, that step is what takes it out. looked: at the start, where that is done already.
+        stuck far from the best, that step is what takes it out. looked, evaluated: the start, where that is done
+        already.
         """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
         kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
         hypothesis = start
-        seen, residual = self.evaluated(hypothesis) if looked is None else (looked.seen, looked.residual)
+        if looked is not None:
+            evaluated = looked.seen, looked.residual
+        seen, residual = evaluated or self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)
         length, before, moved = 1.0, np.zeros(len(kept)), True
         for _ in range(max_steps):
@@ -233,6 +242,7 @@ class Fitter:
                 break
         looked = looked or self._looked(hypothesis, noise, seen, residual)
         columns, plain = looked.columns, looked.system
+        made: Callable[[], Array] = partial(np.asarray, columns)
         system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
         free = np.flatnonzero(~kept)
         if len(free):
@@ -245,12 +255,12 @@ class Fitter:
             last_misfit = self._misfit(noise, last_residual, last)
             if last_misfit < ASTRAY * misfit:
                 hypothesis, seen, residual, misfit = last, last_seen, last_residual, last_misfit
-                columns = self.columns(hypothesis, seen)
+                made = partial(self.problem.all_columns, hypothesis, seen)
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
         of_each = own_noise.reshape(len(self.problem.shaken), -1)
         of_tails = float((np.array(self.problem.tails) - 1.0) @ (of_each**2).sum(axis=1))
-        return Fit(hypothesis, seen, residual, noise, columns, system, deviance, own_noise, of_tails)
+        return Fit(hypothesis, seen, residual, noise, made, system, deviance, own_noise, of_tails)
 
     def _without_own_noise(
         self, system: WhitenedLeastSquares, hypothesis: Hypothesis, noise: Noise, columns: Array, residual: Array
@@ -305,11 +315,15 @@ class Fitter:
         what = tuple(of), windows
         key = (id(noise), *what)
         if key not in self._fits:
-            starts = [start, *self.problem.fitted.get(what, [])]
-            if len(starts) > 1:  # under other noise it ended nearby
-                starts.sort(key=lambda each: self._misfit(noise, self.evaluated(each)[1], each))
-            found = self.fit(starts[0], noise)
-            self._fits[key] = replace(found, seen=SeenAgain(self.problem, found.hypothesis))
+            nearest, evaluated = start, self.evaluated(start)
+            for each in self.problem.fitted.get(what, []):  # under other noise it ended nearby
+                at_end = self.evaluated(each)
+                if self._misfit(noise, at_end[1], each) < self._misfit(noise, evaluated[1], nearest):
+                    nearest, evaluated = each, at_end
+            found = self.fit(nearest, noise, evaluated=evaluated)
+            seen = SeenAgain(self.problem, found.hypothesis)
+            made = partial(self.problem.all_columns, found.hypothesis, seen)
+            self._fits[key] = replace(found, seen=seen, made=made)
             self.problem.fitted[what] = [self._fits[key].hypothesis]
         return self._fits[key]
 

@@ -36,8 +36,9 @@ class WhitenedLeastSquares:
     @staticmethod
     def of(columns: Array, target: Array, std: Array, centre: Array) -> WhitenedLeastSquares:
         """From whitened columns (m, n) and target (m,)."""
-        joined = np.column_stack([columns, target])
-        return WhitenedLeastSquares(joined.T @ joined, std, centre)
+        along = columns.T @ target
+        gram = np.block([[columns.T @ columns, along[:, None]], [along, target @ target]])
+        return WhitenedLeastSquares(gram, std, centre)
 
     def part(self, at: NDArray[np.intp]) -> WhitenedLeastSquares:
         """With these columns only; the others are zero."""

@@ -13,6 +13,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import fft
 
 from ..calibration.frames import Array
 from ..calibration.robust import robust_std
@@ -49,7 +50,8 @@ class Arma:
         if not len(self.ar) and not self.ma:
             return series / self.std
         known = self._after(series, starts, -self.ar[0] if len(self.ar) else 0.0)
-        white: Array = self._recursion(known, starts, -self.ma) / self.std
+        white = self._recursion(known, starts, -self.ma)
+        white /= self.std
         white[starts] /= self.ratio  # nothing is known before the first, so it is as uncertain as the noise itself
         return white
 
@@ -95,11 +97,17 @@ class Noise:
 
     def whiten(self, values: Array) -> Array:
         """Values (M, A, ...) as white noise of unit variance would be, flattened to (M A, ...)."""
-        scaled = self._scaled(values)
-        white = np.empty_like(scaled)
+        white = self._scaled(values)
         for axis, arma in enumerate(self.axes):
-            white[:, axis] = arma.innovations(scaled[:, axis], self._starts)
+            white[:, axis] = arma.innovations(white[:, axis], self._starts)
         return white.reshape(-1, *values.shape[2:])
+
+    def part(self, rows: slice) -> Noise:
+        """That of some samples, which no stretch goes on from or into."""
+        within = [each for each in self.segments if rows.start <= each.start and each.stop <= rows.stop]
+        segments = tuple(slice(each.start - rows.start, each.stop - rows.start) for each in within)
+        rotation = None if self.rotation is None else self.rotation[rows]
+        return replace(self, segments=segments, rotation=rotation, level=self.level[rows])
 
     def unwhiten(self, white: Array) -> Array:
         """Inverse of `whiten` for one series: (M A,) -> (M, A)."""
@@ -151,9 +159,11 @@ class Noise:
         m = len(columns)
         # Of columns made orthonormal it is the sum of their power. Two of them in one complex series have the mean of
         # its powers at a frequency and at minus that
-        basis = root_of_inverse(white.T @ white + np.diag(std**-2.0)) @ white.T
-        each = np.concatenate([basis, np.zeros((len(basis) % 2, len(white)))]).reshape(-1, 2, m, len(self.axes))
-        power = (np.abs(np.fft.fft(each[:, 0] + 1j * each[:, 1], axis=1)) ** 2).sum(axis=0).T / m
+        root = root_of_inverse(white.T @ white + np.diag(std**-2.0))
+        root = np.concatenate([root, np.zeros((len(root) % 2, len(root)))])
+        waves = fft((white @ root.T).view(complex).reshape(m, len(self.axes), -1), axis=0, overwrite_x=True)
+        parts = waves.view(float)
+        power = np.einsum("map,map->am", parts, parts) / m
         half = np.arange(m // 2 + 1)
         return np.clip(0.5 * (power[:, half] + power[:, -half]), 0.0, MOST_TAKEN)
 

@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from ..calibration.frames import Array
 from ..effects.base import Effect
 from .clock_or_arm import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
-from .composed import Hypothesis, Values, amplitudes, is_time_of_run, no_effect
+from .composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run, no_effect
 from .criteria import price, step_of_times, windows
 from .fitting import PRIOR_IN_TYPICAL, Fit, Fitter, prior_std
 from .leaps import LEAP
 from .least_squares import WhitenedLeastSquares
+from .noise import Noise
 from .settings import SETTINGS
 
 # Effects from which combinations of three are made; proposals fitted in one round, and how much worse than the best
@@ -169,8 +170,23 @@ def straight_lines(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> S
     columns = np.concatenate([fit.columns[:, :, :6], *(variant.columns for variant in variants)], axis=2)
     n = len(problem.recordings)
     std = np.concatenate([prior_std(no_effect()), *(_std(variant.effect, variant.p, n) for variant in variants)])
-    system = WhitenedLeastSquares.of(noise.whiten(columns), noise.whiten(target), std, np.zeros_like(std))
+    system = WhitenedLeastSquares(_gram(problem, noise, columns, target), std, np.zeros_like(std))
     return StraightLines(variants, blocks, system)
+
+
+def _gram(problem: Problem, noise: Noise, columns: Array, target: Array) -> Array:
+    """(n + 1, n + 1) of whitened columns (M, A, n) and target (M, A): the sum of those of each recording, in which what
+    is the day's of all others is zero."""
+    total = np.zeros((columns.shape[2] + 1,) * 2)
+    for rows in problem.rows_of:
+        own, of_it = columns[rows], noise.part(rows)
+        has = np.asarray(own.any(axis=(0, 1)))
+        if not has.any():
+            has[:] = True
+        white = of_it.whiten(own if has.all() else own[:, :, has])
+        here, none = np.flatnonzero(np.append(has, True)), np.zeros(white.shape[1])
+        total[np.ix_(here, here)] += WhitenedLeastSquares.of(white, of_it.whiten(target[rows]), none, none).gram
+    return total
 
 
 def _std(effect: Effect, p: int, n_recordings: int) -> Array:

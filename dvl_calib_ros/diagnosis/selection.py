@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -209,7 +210,7 @@ def _shaken(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator
     """The same columns (M, A, p), and the residual (M, A), with made-up noise in one velocity and then in the other."""
     for problem in fitter.problem.shaken:
         other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
-        again = replace(fit, seen=seen, columns=other.columns(fit.hypothesis, seen))
+        again = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
         yield _always_there(other, again, effects), problem.residual(seen)
 
 

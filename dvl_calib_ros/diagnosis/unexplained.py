@@ -136,7 +136,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     clearest = noise.whiten(best[2])
     held_against = (basis[: left.size, :0], clearest, left)
     if not isinstance(best[1], float):
-        held_against = (basis, _with_rows_of_prior(clearest, white), white)
+        held_against = (basis, clearest, white)
     clear_energy = explained(*held_against, 1.0)[1]
     clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
     energy = max(energy, clear_energy - best[2].shape[2])  # a period is of no group
@@ -195,7 +195,7 @@ def _looked(
     sound = ~_upset(fitter, noise)[:, None]
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions * sound, problem.axes)
-        told = _Told.by(q, _with_rows_of_prior(noise.whiten(raw[name]), white), white)
+        told = _Told.by(q, noise.whiten(raw[name]), white)
         for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
             looks.append(FollowTest(name, at, number == 0, *told.energy(at)))
     return looks, white, raw, q
@@ -207,13 +207,8 @@ def _beside_prior(known: FittedBeside, columns: Array, white: Array) -> tuple[Ar
 
     Without it the scale of a sway that is hardly there, which is noise, would explain that noise.
     """
-    basis = _orthonormal(np.concatenate([columns, np.diag(1.0 / known.std)]))
+    basis = orthonormal(np.concatenate([columns, np.diag(1.0 / known.std)]))
     return basis, np.concatenate([white, known.centre / known.std])
-
-
-def _with_rows_of_prior(columns: Array, white: Array) -> Array:
-    """Whitened columns (M A, c) of which a prior says nothing, with as many rows as a series has with its prior."""
-    return np.concatenate([columns, np.zeros((len(white) - len(columns), columns.shape[1]))])
 
 
 def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
@@ -381,7 +376,7 @@ def _coloured_anew(noise: Noise, known: FittedBeside, raw: Array, residual: Arra
         series = np.concatenate([colour.whiten(residual), known.centre / known.std])
         left = residual - joined @ np.linalg.lstsq(rows, series, rcond=INDEPENDENT)[0]
         colour = noise.like(left)
-    return _Coloured(colour.deviance(left), _orthonormal(white).shape[1], colour)
+    return _Coloured(colour.deviance(left), orthonormal(white).shape[1], colour)
 
 
 def _along_axes(functions: Array, axes: int) -> Array:
@@ -400,7 +395,8 @@ def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
     return [*looks, *(index[:, at : at + together].ravel() for at in range(0, c, together))]
 
 
-def _orthonormal(white: Array) -> Array:
+def orthonormal(white: Array) -> Array:
+    """(m, r) basis of whitened columns (m, n), of which some may be zero or alike."""
     lengths = np.linalg.norm(white, axis=0)
     white = white[:, lengths > 0.0] / lengths[lengths > 0.0]
     u, s, _ = np.linalg.svd(white, full_matrices=False)
@@ -416,7 +412,8 @@ def explained(q: Array, white_columns: Array, white: Array, variance: float) -> 
 
 @dataclass(frozen=True)
 class _Told:
-    """What columns tell of a whitened series beside those of an orthonormal basis.
+    """What columns tell of a whitened series beside those of an orthonormal basis. Both may have further rows, of a
+    prior, which says nothing of these columns.
 
     gram: (c, c) of unit columns less what the basis tells of them. along: (c,) their products with the series. has:
     (c,) whether there is more left of a column than its rounding.
@@ -428,11 +425,14 @@ class _Told:
 
     @staticmethod
     def by(q: Array, white_columns: Array, white: Array) -> _Told:
-        left = white_columns - q @ (q.T @ white_columns)
-        before, after = (np.sqrt(np.einsum("mc,mc->c", each, each)) for each in (white_columns, left))
+        rows = len(white_columns)
+        known, square = q[:rows].T @ white_columns, white_columns.T @ white_columns
+        left = square - known.T @ known
+        before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, left))
         has = after > 0.02 * np.maximum(before, 1e-300)
-        left = left / np.where(has, after, 1.0)
-        return _Told(left.T @ left, left.T @ white, has)
+        size = np.where(has, after, 1.0)
+        along = white_columns.T @ white[:rows] - known.T @ (q.T @ white)
+        return _Told(left / np.outer(size, size), along / size, has)
 
     def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
         """Square of the series that columns `at` explain together, and of how many dimensions."""

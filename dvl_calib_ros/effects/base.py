@@ -240,6 +240,12 @@ class EffectWithMemory(Effect):
         """That part of a velocity (N, 3) m/s, body frame, or of several (N, 3, p), that what the filter has kept of the
         time before the motion explains, by least squares."""
 
+    def follows(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
+        """A velocity (N, 3) m/s, body frame, or several (N, 3, p), less what is `filtered` of it, less what is
+        `of_before` in that."""
+        left: Array = velocity - self.filtered(motion, velocity, values)
+        return left - self.of_before(motion, left, values)
+
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """What the filter adds to the motion's own velocity."""
         return self.filtered(motion, motion.velocity_body, values)

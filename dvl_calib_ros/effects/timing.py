@@ -169,9 +169,23 @@ class ReferenceLag(EffectWithMemory):
         constant = values["time_constant_s"]
         if constant <= 0.0:
             return np.zeros_like(velocity)
-        left = np.exp((motion.time[0] - motion.time) / constant)
-        at_first = np.tensordot(left, _in_reference_frame(motion, velocity), axes=1) / (left @ left)
-        return _in_body(motion, np.multiply.outer(left, at_first))
+        return _in_body(motion, _dying_away(motion.time, _in_reference_frame(motion, velocity), constant))
+
+    def follows(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
+        """The same, turned to and fro once."""
+        reference, constant = _in_reference_frame(motion, velocity), values["time_constant_s"]
+        if constant <= 0.0:
+            return velocity
+        error = lag_error(motion.time, reference.reshape(len(reference), -1), constant)
+        error += reference.reshape(error.shape)
+        error -= _dying_away(motion.time, error, constant)
+        return _in_body(motion, error.reshape(reference.shape))
+
+
+def _dying_away(time: Array, values: Array, time_constant: float) -> Array:
+    """That part of values (N, ...) at times (N,) s that dies away from the first on with a time constant, s."""
+    left = np.exp((time[0] - time) / time_constant)
+    return np.multiply.outer(left, np.tensordot(left, values, axes=1) / (left @ left))
 
 
 def delayed(time: Array, values: Array, delay: float | Array) -> Array:
