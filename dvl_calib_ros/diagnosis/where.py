@@ -16,7 +16,7 @@ from .fitting import Fit, Fitter
 from .holm import holm
 from .least_squares import WhitenedLeastSquares
 from .noise import Noise
-from .unexplained import explained
+from .unexplained import explained, orthonormal
 
 LEVEL = 0.01
 TURNING_RADPS = np.deg2rad(2.0)
@@ -72,7 +72,7 @@ def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[GapPlace
     if total <= 0.0:
         return []
     white = noise.whiten(base.residual)
-    q = np.linalg.qr(noise.whiten(base.columns))[0]
+    q = orthonormal(noise.whiten(base.columns))
     white = white - q @ (q.T @ white)
     functions = _simplest(problem, fit.seen)
     seconds = max(recording.seconds for recording in problem.recordings)

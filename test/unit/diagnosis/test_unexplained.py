@@ -27,6 +27,7 @@ from dvl_calib_ros.diagnosis.unexplained import (
     told_elsewhere,
     unexplained,
 )
+from dvl_calib_ros.diagnosis.where import places
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.scenario import simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -234,3 +235,19 @@ def test_an_unknown_cause_that_explains_much_less_than_effects_do_is_not_in_thei
     selected = (Selected(drift, -50.0, ()),)
     left, _ = settled(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS), len(EFFECTS))
     assert bool(left.selected) == kept
+
+
+def test_how_sure_the_places_of_a_gap_are_does_not_go_by_how_columns_of_nothing_are_rounded():
+    """Of the mounting of a boat that does not tilt only yaw is shown: two columns were rounding, and each took a part
+    of the gap with it that nobody could have told before."""
+    fitter, _ = without_effects(recording_of(simulate(scenario(effects=[LEVER], seconds=300.0, gnss_std=0.02))))
+    fitter = Fitter(replace(fitter.problem, shown_turns=np.diag([0.0, 0.0, 1.0]), of_axes=(True, True, False)))
+    problem = fitter.problem
+    residual = fitter.evaluated(no_effect())[1]
+    base = fitter.fit(no_effect(), white_noise(residual, problem.segments, None, problem.interval))
+    arm = problem.columns(base.hypothesis, base.seen, EFFECTS["lever_arm"], [EFFECTS["lever_arm"].defaults])
+    mixed = base.columns @ np.linalg.qr(np.random.default_rng(0).standard_normal((6, 6)))[0]
+    assert np.linalg.matrix_rank(mixed.reshape(-1, 6)) == 4
+    once, again = (places(fitter, replace(base, made=made), base, arm) for made in (base.made, lambda: mixed))
+    assert len(once) > 3
+    np.testing.assert_allclose([np.log(each.p) for each in again], [np.log(each.p) for each in once], rtol=1e-6)
