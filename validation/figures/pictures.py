@@ -26,6 +26,8 @@ COLOURS = 64
 WIDTH = 1000  # pixels
 BARS = ("#bd1f01", "#ffa90e", "#b9ac70", "#3f90da")
 
+MEASURED = ": measured and as the effect says"  # in the heading of what each effect makes
+
 COMMIT = "commit"  # key of the text in a picture's metadata
 
 
@@ -159,10 +161,17 @@ def real_data(folder: Path) -> None:
     page = folder / "real_data.html"
     dvl_calib("import", snapir_ins(), "-o", folder / "sea", *IMPORT)
     dvl_calib("diagnose", folder / "sea" / "T01", "--report", page)
-    before, found, rest = page.read_text().partition("<h3>lever_arm: measured")
-    head, body, _ = before.partition("<main>")
-    page.write_text(head + body + found + rest.partition("</section>")[0].partition("<h2>")[0])
-    screenshot(page, "real_data", 840)
+    page.write_text(only_sections(page.read_text(), MEASURED))
+    screenshot(page, "real_data", 990)
+
+
+def only_sections(page: str, title: str) -> str:
+    """A report with those of its sections alone in whose heading a title stands. Raises InputError without any."""
+    head, begin, body = page.partition("<main>")
+    sections = [each for each in re.split("(?=<h2>)", body) if title in each.partition("</h2>")[0]]
+    if not sections:
+        raise InputError(f"the report has no section {title!r} any more: what is the picture to show?")
+    return head + begin + "".join(sections)
 
 
 def simulators(folder: Path) -> None:
