@@ -3,8 +3,8 @@
 Everything is judged on stretches of the vehicle's recordings that were held out: misalignment and scale (which take in
 a part of every effect) and the effects that are added are fitted to the rest. Two figures: the rms of what recorded and
 simulated DVL velocity differ by, and an energy distance between windows of both, each less what an ideal DVL would have
-measured, the simulated one with noise. If both were drawn alike, each pair of windows of the same time could be
-exchanged, which gives the distance's distribution.
+measured by the clocks and the lag that the vehicle has, the simulated one with noise. If both were drawn alike, each
+pair of windows of the same time could be exchanged, which gives the distance's distribution.
 """
 
 from __future__ import annotations
@@ -22,15 +22,17 @@ from ..diagnosis.folds import fitted_without, stretch_of
 from ..diagnosis.selection import EffectSelection
 from ..diagnosis.settings import SETTINGS
 from ..diagnosis.twin import simulated, with_quiet_reference
-from ..effects.base import Effect
+from ..effects.base import ActsOn, ClockEffect, Effect, EffectWithMemory
 from .logs import Log
 from .results import ComparisonStatus, Rung
 from .sizes import Size
 
 # Windows of the two-sample test: long enough that neighbours are nearly independent
 WINDOW_S, PERMUTATIONS = 10.0, 500
-# Noise is drawn from stretches of so many residuals, so that its colour is in it
+# Noise of a simulator is drawn from stretches of so many residuals, so that its colour is in it
 STRETCH = 8
+# The colour of a vehicle's noise is that of so many made-up references, the mean over so many bands of frequency
+MADE_UP, BANDS = 8, 40
 # Errors count no more than so many standard deviations: an outlier is noise, of which there is a figure
 FAR = 5.0
 AS_IT_IS, ALL, NOISE = "as it is", "all effects", "all effects, and the vehicle's noise"
@@ -73,6 +75,12 @@ def is_of_every_run(effect: Effect) -> bool:
     return not effect.relative_to_first and not any(is_time_of_run(spec) for spec in effect.parameters)
 
 
+def _is_of_time(effect: Effect) -> bool:
+    """Whether an effect says when a velocity was, or that it lags."""
+    of_clock = isinstance(effect, ClockEffect) and effect.acts_on is not ActsOn.ATTITUDE_CLOCK
+    return of_clock or isinstance(effect, EffectWithMemory)
+
+
 def _values(size: Size) -> Values:
     mean = size.mean[0].tolist()
     return size.effect.defaults | {s.name: v for s, v in zip(amplitudes(size.effect), mean, strict=True)}
@@ -102,12 +110,16 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
     time = np.concatenate([each.dvl.time for each in problem.recordings])
     recording_of = np.repeat(np.arange(len(truth), dtype=np.intp), [len(each) for each in truth])
     windows = np.floor(time / WINDOW_S).astype(int) + recording_of * 1_000_000
-    ideal = _held_out(selection, SimulatedModel("", (), {}))
     everything = _held_out(selection, ladder[-1])
-    own = [turned_over(a - b, rng) for a, b in zip(truth, everything, strict=True)]
+    # at other times, or without a lag, the reference has other noise, which were in both, and in one of them twice
+    ideal = _held_out(selection, SimulatedModel("", tuple(each for each in ladder[-1].added if _is_of_time(each)), {}))
     # the vehicle's residual holds its reference's noise; that of a simulator, whose reference is the truth, does not
-    of_reference = _reference_noise(with_quiet_reference(problem), selection.base.hypothesis, rng)
-    drawn = [_drawn(simulator.residuals, a, rng) + b for a, b in zip(truth, of_reference, strict=True)]
+    of_reference = _reference_noise(problem, selection.fit.hypothesis, rng)
+    drawn = [_drawn(simulator.residuals, a, rng) + b[0] for a, b in zip(truth, of_reference, strict=True)]
+    own = [
+        turned_over(a - b, noise_spectrum(of_it, one.dvl.noise), rng)
+        for a, b, of_it, one in zip(truth, everything, of_reference, problem.recordings, strict=True)
+    ]
     recorded = np.concatenate([a - b for a, b in zip(truth, ideal, strict=True)])
     rungs, errors = [], {}
     for model in ladder:
@@ -175,25 +187,50 @@ def _fold_of(problem: Problem, index: int) -> Array:
 
 
 def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Generator) -> list[Array]:
-    """(N, 3) m/s per recording: what made-up noise of the reference makes in the DVL's frame."""
-    noisy = replace(
-        problem,
-        recordings=tuple(replace(one, reference=one.reference.shaken(rng)) for one in problem.recordings),
-    )
+    """(MADE_UP, N, 3) m/s per recording: what made-up noise of the reference makes in the DVL's frame, where it is not
+    taken off: slow, where the motion is.
+    """
+    quiet = with_quiet_reference(problem)
+    noisy = [
+        with_quiet_reference(
+            replace(
+                problem,
+                recordings=tuple(replace(one, reference=one.reference.shaken(rng)) for one in problem.recordings),
+            )
+        )
+        for _ in range(MADE_UP)
+    ]
     return [
-        simulated(noisy, hypothesis, index) - simulated(problem, hypothesis, index)
+        np.stack([simulated(each, hypothesis, index) for each in noisy]) - simulated(quiet, hypothesis, index)
         for index in range(len(problem.recordings))
     ]
 
 
-def turned_over(residual: Array, rng: np.random.Generator) -> Array:
-    """(N, 3) m/s: a residual with stretches of it turned over by chance, so as loud in every turn as it is there.
+def noise_spectrum(of_reference: Array, white: Array) -> Array:
+    """(N // 2 + 1, 3) power of noise by frequency, in (m/s)²: of references (R, N, 3) in bands, beside white noise of
+    standard deviations (3,).
+    """
+    power = (np.abs(np.fft.rfft(of_reference, axis=1)) ** 2).mean(axis=0) / of_reference.shape[1]
+    edges = np.unique(np.concatenate([[0], np.geomspace(1.0, len(power), BANDS)]).astype(int))
+    counts = np.diff(edges)
+    mean = np.add.reduceat(power, edges[:-1], axis=0) / counts[:, None]
+    return np.asarray(np.repeat(mean, counts, axis=0) + np.maximum(white, 1e-9) ** 2)
+
+
+def turned_over(residual: Array, spectrum: Array, rng: np.random.Generator) -> Array:
+    """(N, 3) m/s: a residual, made white, turned over by chance and made as coloured again as its noise is: so it is as
+    loud at every turn as it is there, and what lasts longer than noise of this spectrum is lost.
 
     Drawn from elsewhere, it would be too loud where the vehicle goes straight on, and windows were told apart by that.
     """
     n = len(residual)
-    signs = np.repeat(rng.choice([-1.0, 1.0], -(-n // STRETCH)), STRETCH)[:n]
-    return np.asarray(np.nan_to_num(residual - np.nanmedian(residual, axis=0)) * signs[:, None])
+    values = np.nan_to_num(residual - np.nanmedian(residual, axis=0))
+    signs = rng.choice([-1.0, 1.0], n)[:, None]
+    near = _drawn_in(values)  # outliers are not coloured
+    gain = np.sqrt(spectrum)
+    white = np.fft.irfft(np.fft.rfft(near, axis=0) / gain, n, axis=0)
+    made = np.fft.irfft(np.fft.rfft(white * signs, axis=0) * gain, n, axis=0)
+    return np.asarray(made + (values - near) * signs)
 
 
 def _drawn(pool: Sequence[Array], like: Array, rng: np.random.Generator) -> Array:
