@@ -64,7 +64,7 @@ def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> bool:
     The two leave the motion where it is, but for its corners, and take noise off the DVL. That of a slow one is known
     by its claims, which may be anything up to its roughness.
     """
-    if effect.name != LAG or lag_not_taken_back(fit) >= TAKEN_BACK:
+    if effect.name != LAG or lag_not_taken_back(fit, rest) >= TAKEN_BACK:
         return False
     smoothed = [float(each.own_noise @ each.own_noise) for each in (rest, fit)]
     more = (smoothed[0] - smoothed[1]) * (fitter.problem.rougher_than_claimed**2 - 1.0)

@@ -35,6 +35,8 @@ WORTH_FITTING, NO_DELAY = 40.0, 0.13
 # The largest gaps in the stamps, from so many seconds on, are times at which a clock may have leapt ahead, if by as
 # much (but for that many seconds)
 GAPS, GAP_FROM_S, AS_LARGE_S = 6, 0.15, 0.3
+# Of those that a lost sample does not leave, so many are tried as leaps
+LEAPS = 3
 # Lost samples leave a gap of whole steps, a clock's leap such as differs by this share of a step
 OF_A_STEP = 0.15
 
@@ -105,6 +107,48 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     return found
 
 
+def told_by_stamps(
+    fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]
+) -> list[Hypothesis]:
+    """Hypotheses of a fit of one recording that leaps where the stamps say so to a sample, once or twice, by what the
+    motion in each part says; but for those times of which a leap of the fit is one already.
+
+    once, every: effects, with a leap that happens once, and twice. In a part that says little of a leap it is small
+    beside the noise, and what then is left without it is taken for slow noise: it is found only where it is looked for.
+    """
+    if len(fit.seen) > 1 or LEAP not in once:
+        return []
+    rest = [effect for effect in fit.effects if effect.name not in STANDS_IN]
+    stamped = replace(fit, hypothesis=fit.hypothesis.with_effects(rest, 1, {}))
+    usual = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
+    shown = [each for each in gaps(fitter, stamped) if _is_shifted(each[1], usual)][:LEAPS]
+    leapt = sum(
+        np.isfinite(each.get(at_s, np.inf)) for each in fit.values.get(LEAP, ()) for at_s in ("at_s", "again_at_s")
+    )
+    if leapt >= min(len(shown), 2):
+        return []
+    squares, ends = _squares(fitter, fit, rest, every[DVL_CLOCK])
+    found = []
+    for leapt in (each for n in (1, 2) for each in itertools.combinations(sorted(shown), n)):
+        edges = [0, *np.searchsorted(fitter.problem.time[np.maximum(ends - 1, 0)], [at for at, _ in leapt]), len(ends)]
+        if min(np.diff(edges)) < FEWEST_PARTS:
+            continue
+        late = [float(DELAYS[squares[:, a:b].sum(axis=1).argmin()]) for a, b in itertools.pairwise(edges)]
+        steps = np.diff(late).tolist()
+        if not all(_is_as_large(by, gap) for by, (_, gap) in zip(steps, leapt, strict=True)):
+            continue
+        values = {"seconds": steps[0], "at_s": leapt[0][0] - late[0]}
+        if len(leapt) > 1:
+            values |= {"again_seconds": steps[1], "again_at_s": leapt[1][0] - late[1]}
+        found += _hypotheses(fit, rest, once, every[LEAP] if len(leapt) > 1 else once[LEAP], values, late[0])
+    return found
+
+
+def _is_shifted(gap: float, usual: float) -> bool:
+    """Whether stamps that go back, or a gap of no whole number of steps, are a clock's that leaps: not lost samples."""
+    return gap < 0.0 or OF_A_STEP < (gap / usual) % 1.0 < 1.0 - OF_A_STEP
+
+
 def _is_as_large(by: float, gap: float) -> bool:
     """Whether a leap, s, is one that leaves a gap, s; below zero: of a clock that is set back by no more."""
     return gap - AS_LARGE_S < by < (0.0 if gap < 0.0 else gap + AS_LARGE_S)
@@ -144,8 +188,7 @@ def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, f
     usual = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
     value, by = fit.values[LEAP][0][at_s], fit.values[LEAP][0][at_s.replace("at_s", "seconds")]
     for at, gap in gaps(fitter, fit):
-        is_shifted = gap < 0.0 or OF_A_STEP < (gap / usual) % 1.0 < 1.0 - OF_A_STEP
-        if is_shifted and _is_as_large(by, gap) and abs(value - at) < max(usual, AS_LARGE_S):
+        if _is_shifted(gap, usual) and _is_as_large(by, gap) and abs(value - at) < max(usual, AS_LARGE_S):
             return value, min(value, at) - usual, max(value, at) + usual
     return None
 

@@ -28,7 +28,7 @@ from .composed import Hypothesis, Problem, Values, is_time_of_run, make_problem,
 from .contradicted import without_contradicted
 from .criteria import best_of, criterion, finer_steps, price_of_a_time
 from .fitting import Fit, Fitter
-from .leaps import LEAP, MOVING_CLOCK, in_gaps, leaping
+from .leaps import LEAP, MOVING_CLOCK, in_gaps, leaping, told_by_stamps
 from .least_squares import WhitenedLeastSquares
 from .levels import estimated
 from .noise import Noise, white_noise
@@ -135,8 +135,8 @@ def select(
         best = fitter.refined_as_white(fitter.refined(best_of(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
         best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))
         best = only_called_for(fitter, best, len(effects))
-        names = frozenset(effect.name for effect in best.effects)
-        fitter, fit = _about(fitter, best, every)
+        fitter, fit = _leapt_where_stamps_say_so(*_about(fitter, best, every), every, effects)
+        names = frozenset(effect.name for effect in fit.effects)
         if names in seen_before:
             break
         seen_before.add(names)
@@ -230,6 +230,22 @@ def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Arra
     system = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge))
     of_noise = sum((joined.T @ joined for joined in map(noise.whiten, own)), np.zeros_like(system.gram))
     return np.asarray(columns @ system.solution_without(of_noise)), ridge
+
+
+def _leapt_where_stamps_say_so(
+    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
+) -> tuple[Fitter, Fit]:
+    """A fit, or the same with the leaps that the stamps show, each with the noise about it, by their likelihoods.
+
+    Under the noise about a fit without it, what a leap leaves is noise.
+    """
+    fits = [fitter.fit(hypothesis, fit.noise) for hypothesis in told_by_stamps(fitter, fit, effects, every)]
+    if not fits:
+        return fitter, fit
+    leapt = _about(fitter, best_of(fits, effects), every)
+    likely, other = (each.noise.deviance(each.residual) for each in (leapt[1], fit))
+    prices = [criterion(each, len(effects)) - each.deviance for each in (leapt[1], fit)]
+    return leapt if likely + prices[0] < other + prices[1] else (fitter, fit)
 
 
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:

@@ -14,8 +14,9 @@ TWO_STEPS, FEWEST = 1.25, 4
 # In order of stamps its samples go to and fro between two times, by so many times what they do elsewhere; where they
 # do not, the mixture is as good as either
 TO_AND_FRO = 2.0
-# A step shorter than this share of the usual one tells of a clock where all but so many are within this of it
-SHORT, RARE, REGULAR = 0.8, 3, 0.1
+# A step that differs from the usual one by a share of it tells of a clock, where so many do at most: by so many times
+# how steps scatter, within these
+RARE, REGULAR, FAR = 3, (0.03, 0.1), 8.0
 # Of two samples nearer than this share of the usual step, measured a while apart, a curve through both would ring
 TOO_SHORT = 0.5
 # By as much at most, s, is a clock set back of which the stamps do not tell by how much; and of which they do
@@ -52,8 +53,9 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
         if behind - first >= FEWEST and inside < LONGEST_S and is_mixed:
             once[first : behind + 2] = False
             found.append(SetBack(float(time[first]), float(time[behind + 1]), inside))
-    odd = np.flatnonzero(np.abs(steps - usual) > REGULAR * usual)
-    short = odd[steps[odd] < SHORT * usual]
+    apart = np.abs(steps - usual) / usual
+    odd = np.flatnonzero(apart > np.clip(FAR * np.median(apart), *REGULAR))
+    short = odd[steps[odd] < usual]
     if not found and len(short) > 0 and len(odd) <= RARE:
         found = [SetBack(float(time[at]), float(time[at + 1]), UP_TO_S) for at in short.tolist()]
         once[short[steps[short] < TOO_SHORT * usual] + 1] = False

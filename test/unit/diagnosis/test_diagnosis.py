@@ -31,7 +31,7 @@ from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
 from dvl_calib_ros.diagnosis.holm import holm
-from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays, gaps, in_gaps, time_by_stamps
+from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays, gaps, in_gaps, time_by_stamps, told_by_stamps
 from dvl_calib_ros.diagnosis.leaps import _found as _delays
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
@@ -39,7 +39,13 @@ from dvl_calib_ros.diagnosis.proposing import coming_and_going, told_by_other_cl
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
 from dvl_calib_ros.diagnosis.registered import first_guess, guess_beside
 from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
-from dvl_calib_ros.diagnosis.selection import _about, _by_fewer_clocks, _with_all_of_the_arm, started
+from dvl_calib_ros.diagnosis.selection import (
+    _about,
+    _by_fewer_clocks,
+    _leapt_where_stamps_say_so,
+    _with_all_of_the_arm,
+    started,
+)
 from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
 from dvl_calib_ros.diagnosis.standing import borne_out
 from dvl_calib_ros.diagnosis.told_apart import _clock_or_arm, _selected
@@ -401,6 +407,43 @@ def as_sent(run: Run) -> Run:
     return replace(run, dvl=[each for each, before in zip(run.dvl, newest, strict=False) if each.stamp_ns > before])
 
 
+def about(given: Scenario, run: Run, offsets: Offsets, effects: list, values: dict) -> tuple[Fitter, Fit]:
+    """A fit of effects, with the noise that is about it."""
+    problem = make_problem([recording_of(run, given.gnss_frame)], np.eye(3), np.zeros(3), [offsets])
+    start, fitter = no_effect().with_effects(effects, 1, values), Fitter(problem)
+    noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
+    return _about(fitter, fitter.fit(start, noise), EFFECTS)
+
+
+@pytest.mark.parametrize(("leap", "of_leap"), [(-1.3, "seconds=-1.3,at_s=201.3"), (0.7, "seconds=0.7,at_s=201.3")])
+def test_a_leap_of_which_the_stamps_tell_is_not_taken_for_noise(leap, of_leap):
+    """Two leaps where the vehicle went straight on were slow noise (ratio 1.5) beside a lag, and never looked for."""
+    once = {name: effect.once for name, effect in EFFECTS.items()}
+    given = scenario(effects=["dvl_time_offset:seconds=0.5", "time_offset_jump:" + of_leap], gnss_std=0.02)
+    late = {"dvl_time_offset": ({"seconds": 0.5},)}
+    fitter, fit = about(given, as_sent(simulate(given)), Offsets(0.5, 0.0), [once["dvl_time_offset"]], late)
+    (hypothesis, *_) = told_by_stamps(fitter, fit, once, EFFECTS)
+    assert hypothesis.values["time_offset_jump"][0] == {
+        "seconds": pytest.approx(leap, abs=0.4),
+        "at_s": pytest.approx(201.3 - 0.5, abs=0.5),
+    }
+    _, found = _leapt_where_stamps_say_so(fitter, fit, EFFECTS, once)
+    assert found.values["time_offset_jump"][0]["seconds"] == pytest.approx(leap, abs=0.1)
+    assert found.noise.deviance(found.residual) < fit.noise.deviance(fit.residual) - 50.0
+    assert told_by_stamps(fitter, found, once, EFFECTS) == []
+
+
+def test_a_driver_that_begins_anew_has_not_leapt_though_its_stamps_show_it():
+    once = {name: effect.once for name, effect in EFFECTS.items()}
+    given = scenario(effects=["dvl_time_offset:seconds=0.5"], gnss_std=0.02, dvl_rate=10.0)
+    run = simulate(given)  # every fourth ping, and from 200 s on those half a step later, after a gap of 1.4 s
+    run = replace(run, dvl=[*run.dvl[:2000:4], *run.dvl[2010::4]])
+    fitter, fit = about(
+        given, run, Offsets(0.5, 0.0), [once["dvl_time_offset"]], {"dvl_time_offset": ({"seconds": 0.5},)}
+    )
+    assert _leapt_where_stamps_say_so(fitter, fit, EFFECTS, once) == (fitter, fit)
+
+
 LAGGING = "reference_lag:time_constant_s=1.3"
 SET_BACK_TWICE = "time_offset_jump:seconds=-1.68,at_s=155,again_seconds=-1.99,again_at_s=277"
 
@@ -481,22 +524,28 @@ def test_a_clock_that_is_late_throughout_does_not_choose_a_time_from_which_on_it
 
 
 @pytest.mark.parametrize(
-    ("lag", "clock", "late", "drop", "rougher", "is_wanted"),
+    ("lag", "clock", "before", "late", "drop", "rougher", "is_wanted"),
     [
-        (0.60, "reference_time_offset", -0.59, 363.0, 2.05, True),
-        (0.47, "dvl_time_offset", 0.44, 122.0, 1.0, True),
-        (0.60, "reference_time_offset", -0.59, 363.0, 1.0, False),
-        (1.22, "dvl_time_offset", 1.43, 9000.0, 2.0, False),
-        (0.60, "dvl_time_offset", -0.59, 122.0, 2.05, False),
+        (0.60, "reference_time_offset", 0.0, -0.59, 363.0, 2.05, True),
+        (0.47, "dvl_time_offset", 0.0, 0.44, 122.0, 1.0, True),
+        (0.60, "reference_time_offset", 0.0, -0.59, 363.0, 1.0, False),
+        (1.22, "dvl_time_offset", 0.0, 1.43, 9000.0, 2.0, False),
+        (0.60, "dvl_time_offset", 0.0, -0.59, 122.0, 2.05, False),
+        (0.70, "reference_time_offset", -1.50, -2.21, 122.0, 2.05, True),
+        (1.22, "dvl_time_offset", 1.35, 1.43, 122.0, 2.05, False),
     ],
 )
-def test_a_lag_that_a_clock_takes_back_only_smooths_unless_it_explains_more(lag, clock, late, drop, rougher, is_wanted):
-    """The three false alarms of 726: messages claimed a half or less of the noise of a DVL at 2 Hz."""
+def test_a_lag_that_a_clock_takes_back_only_smooths_unless_it_explains_more(
+    lag, clock, before, late, drop, rougher, is_wanted
+):
+    """The three false alarms of 726: messages claimed a half or less of the noise of a DVL at 2 Hz. A clock that is
+    late itself takes a lag back by how much later it becomes: 1.5 s were 2.2 beside a lag of 0.7."""
     effect = EFFECTS["reference_lag"]
+    of_rest = {clock: ({"seconds": before},)} if before else {}
     values = {effect.name: ({"time_constant_s": lag},), clock: ({"seconds": late},)}
     rest, fit = (
-        Mock(spec=Fit, values=values, seen=[None], deviance=deviance, own_noise=np.array([np.sqrt(own)]))
-        for deviance, own in ((1000.0 + drop, 231.0), (1000.0, 150.0))
+        Mock(spec=Fit, values=own_values, seen=[None], deviance=deviance, own_noise=np.array([np.sqrt(own)]))
+        for own_values, deviance, own in ((of_rest, 1000.0 + drop, 231.0), (values, 1000.0, 150.0))
     )
     fitter: Any = SimpleNamespace(problem=SimpleNamespace(rougher_than_claimed=rougher))
     assert _only_smooths(fitter, fit, rest, effect) is is_wanted

@@ -31,9 +31,13 @@ def test_what_was_stamped_twice_is_found_and_left_out():
     assert not ((recording.dvl.time >= before) & (recording.dvl.time <= after)).any()
 
 
-def test_a_short_step_is_where_a_driver_threw_away_what_came_twice():
-    kept = np.maximum.accumulate(np.append(-1.0, STAMPS[:-1])) < STAMPS
-    events, once = set_back(STAMPS[kept], sailed(TRUE)[kept])
+@pytest.mark.parametrize("by", [1.27, 1.23, 1.213])
+def test_a_short_step_is_where_a_driver_threw_away_what_came_twice(by):
+    """One that was shorter by a sixth was none: bins of a second had velocities of another second, and the leap was
+    found six seconds late."""
+    stamps = TRUE - by * (TRUE >= 60.0)
+    kept = np.maximum.accumulate(np.append(-1.0, stamps[:-1])) < stamps
+    events, once = set_back(stamps[kept], sailed(TRUE)[kept])
     assert [(each.before, each.by) for each in events] == [(pytest.approx(59.8), UP_TO_S)] and once.all()
 
 
