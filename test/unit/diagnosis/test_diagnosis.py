@@ -234,11 +234,16 @@ def test_the_times_of_a_water_lock_are_found_where_noise_with_a_memory_hides_all
     assert found["from_s"] == pytest.approx(65.0, abs=0.5) and found["to_s"] == pytest.approx(260.0, abs=0.5)
 
 
-def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best():
-    """Its deviance was -3e12; what came after had noise of 43 m/s, and no effect was named."""
+@pytest.mark.parametrize(("seed", "by_chance"), [(3, {"scale_drift"}), (4, set()), (7, set())])
+def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best(seed, by_chance):
+    """Its deviance was -3e12; what came after had noise of 43 m/s, and no effect was named.
+
+    by_chance: of noise alone, a drift of scale explains 14.6 in the first, as one of thirty effects does once in 250.
+    """
     told = ["attitude_time_offset:seconds=-0.26", "water_lock:east_mps=0.14,north_mps=0.26,from_s=61,to_s=140"]
-    diagnosis = diagnosed(effects=told, seed=3, gnss_std=0.02)
-    assert {"attitude_time_offset", "water_lock"} <= set(found(diagnosis))  # and what explains next to nothing more
+    diagnosis = diagnosed(effects=told, seed=seed, gnss_std=0.02)
+    assert set(found(diagnosis)) == {"attitude_time_offset", "water_lock"} | by_chance
+    assert diagnosis.verdict == (DiagnosisVerdict.AMBIGUOUS if by_chance else DiagnosisVerdict.KNOWN)
     assert diagnosis.gap.not_explained < 0.3 * diagnosis.gap.noise_floor
     assert_within(diagnosis, "attitude_time_offset", seconds=-0.26)
 
