@@ -24,7 +24,7 @@ from .clock_or_arm import (
     with_clocks,
 )
 from .composed import Hypothesis
-from .criteria import blocks_of, fit_without, log_p_in_place, log_p_value, robust_p
+from .criteria import blocks_of, fit_without, log_p_in_place, log_p_value, robust_p, times_tried
 from .fitting import Fit, Fitter, n_amplitudes
 from .proposing import combined, straight_lines
 from .registered import FirstGuess
@@ -92,7 +92,8 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     """Test an effect given all others, and every other effect in its place.
 
     One with more parameters that fits as well could be the cause, however much less likely its numbers make it; one
-    that fits worse could be if it needs fewer.
+    that fits worse could be if it needs fewer, or chooses no time: a leap at the best of nine times was known, where
+    the clock drifted.
     """
     rest = fit_without(fitter, fit, effect)
     log_p = log_p_in_place(fitter, fit, rest, effect)
@@ -112,7 +113,8 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
         rival = fitter.fit_kept(combined(fitter, rest, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance
         fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
-        if behind < SETTINGS.indistinguishable + max(0.0, 2.0 * fewer):
+        chosen = float(np.log(times_tried(effect) / times_tried(effects[name])))
+        if behind < SETTINGS.indistinguishable + max(0.0, 2.0 * (fewer + chosen)):
             found.append((behind, name, rival.hypothesis))
     found.sort(key=lambda each: each[:2])
     return Selected(effect, log_p, tuple(name for _, name, _ in found), tuple(each for *_, each in found))

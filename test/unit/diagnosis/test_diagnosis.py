@@ -222,6 +222,18 @@ def test_a_clock_that_only_stands_beside_an_arm_is_not_named_unless_it_is_shown(
     assert [each.effect.name for each in kept] == ["reference_time_offset"]
 
 
+@pytest.mark.parametrize(("behind", "could_be"), [(8.0, True), (13.0, False)])
+def test_what_chooses_no_time_could_be_the_cause_though_a_leap_at_the_best_of_times_fits_better(behind, could_be):
+    """A drift of 6.8 s/h was a leap of 0.68 s, `known`: of nine times and either clock the best was 6.2 better."""
+    once = {name: effect.once for name, effect in EFFECTS.items()}
+    drift, leap, lasting = once["clock_drift"], once["time_offset_jump"], {"seconds": -0.6, "at_s": 200.0}
+    given = scenario(effects=["clock_drift:seconds_per_hour=-6.8"], gnss_std=0.2)
+    fitter, drifting, _ = fitted(given, {drift.name: {"seconds_per_hour": -6.8}})
+    fit = fitter.fit(drifting.hypothesis.with_effects([leap], 1, {leap.name: (lasting,)}), drifting.noise)
+    fit = replace(fit, deviance=drifting.deviance - behind)
+    assert (drift.name in _selected(fitter, fit, leap, once).equivalent) is could_be
+
+
 def test_the_times_of_a_water_lock_are_found_where_noise_with_a_memory_hides_all_but_the_exact_ones():
     lock = {"east_mps": 0.14, "north_mps": 0.26, "from_s": 65.0, "to_s": 260.0}
     told = "water_lock:" + ",".join(f"{name}={value}" for name, value in lock.items())
