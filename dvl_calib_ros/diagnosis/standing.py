@@ -14,7 +14,15 @@ from .criteria import blocks_of, price, robust_p
 from .fitting import Fit
 from .selection import EffectSelection
 from .settings import SETTINGS
-from .unexplained import Unexplained, matters, moved_by, surprise_elsewhere, told_elsewhere, unexplained
+from .unexplained import (
+    Unexplained,
+    is_of_group,
+    matters,
+    moved_by,
+    surprise_elsewhere,
+    told_elsewhere,
+    unexplained,
+)
 
 # p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
 WEAK = 1e-3
@@ -34,7 +42,8 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
 
     Of effects that nobody would see without a test: a step in a bias looks like a drift, but for what that leaves.
     Better is what explains more for its price, or predicts stretches of the run that neither was fitted to: several
-    effects together have shapes enough for a stall in turns, where they are fitted.
+    effects together have shapes enough for a stall in turns, where they are fitted. A group of functions of which the
+    effects are some is their cause and more: it is better by what more explains alone.
     """
     fitter, fit = selection.fitter, selection.fit
     rest = unexplained(fitter, fit)
@@ -50,7 +59,7 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
         if not other.found:
             continue
         gain = (other.clear_energy - other.price) - lost - wanted
-        if other.clear_energy > AS_MUCH * drop:
+        if other.clear_energy > AS_MUCH * drop and not is_of_group(fitter.problem, fit, out, other.about):
             better = _better_elsewhere(fitter.problem, fit, reduced.fit, other)
             gain = max(gain, better - SETTINGS.indistinguishable - OF_INEXACT * drop)
         if gain < 0.0 or not matters(fitter.problem, reduced.fit, other):

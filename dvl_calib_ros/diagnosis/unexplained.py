@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..calibration.distributions import chi2_isf, chi2_logsf
 from ..calibration.frames import Array
+from ..effects.base import Effect
 from ..verdict.reasons import Reason, finding
 from .beside import FittedBeside
 from .composed import Problem, Seen
@@ -37,6 +38,8 @@ MADE_UP, PRIOR_DOF = 12, 4.0
 # Of what explains the rest as well, but for a factor of 400 in p, the simplest is named: a step in time beside fifteen
 # functions of the turn rate, which turned otherwise after it
 AS_LIKELY = 6.0
+# A column of which others leave less than this share of its squares is one of their functions
+OF_GROUP = 0.02
 # Directions of the dictionary that hold less of their length than this beside the others are left out
 INDEPENDENT = 1e-3
 
@@ -305,6 +308,24 @@ def told_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Arr
         base = trained.part(of_known)
         gain += held.part(of_known).squares(base.solution()) - held.squares(trained.solution())
     return gain
+
+
+def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: str | float) -> bool:
+    """Whether what effects of a fit are to first order, beside its calibration, are functions of one group.
+
+    about: name of the group, or a period, which is none.
+    """
+    if isinstance(about, float):
+        return False
+    noise, parameters = fit.noise, fit.hypothesis.parameters()
+    own = [6 + at for at, each in enumerate(parameters) if each.effect in effects]
+    functions = _along_axes(dictionary(problem, fit.seen)[about], problem.axes)
+    calibration = orthonormal(noise.whiten(fit.columns[:, :, :6]))
+    asked = noise.whiten(fit.columns[:, :, own])
+    asked = asked - calibration @ (calibration.T @ asked)
+    group = orthonormal(np.concatenate([calibration, noise.whiten(functions)], axis=1))
+    left = asked - group @ (group.T @ asked)
+    return bool(((left**2).sum(axis=0) < OF_GROUP * (asked**2).sum(axis=0)).all())
 
 
 def surprise_elsewhere(problem: Problem, noise: Noise, fitted: FittedBeside, residual: Array) -> float:
