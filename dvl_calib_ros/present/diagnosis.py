@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..calibration.frames import Array
+from ..diagnosis.clock_or_arm import LAG
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.results import Diagnosis, FoundEffect
 from ..diagnosis.series import BODY_AXES, DiagnosisSeries, HeldOutTwin
@@ -211,7 +212,8 @@ def _numbers(d: Diagnosis) -> list[Number]:
         told = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=told))
     claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
-    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"as high frequencies show it{claimed}"))
+    slow = ", and what the lag has made slow" if any(each.name == LAG for each in d.effects) else ""
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"as high frequencies show it{slow}{claimed}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="left beyond the noise")]
 
 

@@ -15,7 +15,7 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.diagnosis.followed import Followed
-from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict
+from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict, FoundEffect
 from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.diagnosis import rms
 from dvl_calib_ros.present.reports import write_report
@@ -60,6 +60,15 @@ def test_held_out_gap_before_and_after_and_the_closure_stand_large(page):
     start = page.text[: page.text.index("Where the gap lies")]
     for shown in ("42.1 mm/s", "35.3 mm/s", "98 %", "91 % to 100 %", "34.6 mm/s", "7.0 mm/s", "claim 30.0 mm/s"):
         assert shown in start
+
+
+def test_beside_a_lag_the_noise_is_not_only_what_high_frequencies_show(page, tmp_path):
+    assert "as high frequencies show it; the messages claim" in page.text
+    lag = FoundEffect("reference_lag", (), {"time_constant_s": (1.3, 1.2, 1.4)}, 0.85, 1e-20)
+    series = diagnosis().series
+    traced = replace(series, traces={lag.name: series.traces["lever_arm"]})
+    lagging = page_of(tmp_path, diagnosis(effects=(lag,), series=traced))
+    assert "as high frequencies show it, and what the lag has made slow; the messages claim" in lagging.text
 
 
 def test_effects_that_cannot_be_told_apart_are_named_together_and_none_is_preferred(page):
