@@ -122,24 +122,24 @@ def told_by_stamps(
     stamped = replace(fit, hypothesis=fit.hypothesis.with_effects(rest, 1, {}))
     usual = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
     shown = [each for each in gaps(fitter, stamped) if _is_shifted(each[1], usual)][:LEAPS]
-    leapt = sum(
-        np.isfinite(each.get(at_s, np.inf)) for each in fit.values.get(LEAP, ()) for at_s in ("at_s", "again_at_s")
-    )
-    if leapt >= min(len(shown), 2):
+    own = fit.values.get(LEAP, ())
+    n_own = sum(np.isfinite(each.get(at_s, np.inf)) for each in own for at_s in ("at_s", "again_at_s"))
+    if n_own >= min(len(shown), 2):
         return []
     squares, ends = _squares(fitter, fit, rest, every[DVL_CLOCK])
     found = []
     for leapt in (each for n in (1, 2) for each in itertools.combinations(sorted(shown), n)):
-        edges = [0, *np.searchsorted(fitter.problem.time[np.maximum(ends - 1, 0)], [at for at, _ in leapt]), len(ends)]
+        stamps, by = zip(*leapt, strict=True)
+        edges = [0, *np.searchsorted(fitter.problem.time[np.maximum(ends - 1, 0)], stamps), len(ends)]
         if min(np.diff(edges)) < FEWEST_PARTS:
             continue
         late = [float(DELAYS[squares[:, a:b].sum(axis=1).argmin()]) for a, b in itertools.pairwise(edges)]
         steps = np.diff(late).tolist()
-        if not all(_is_as_large(by, gap) for by, (_, gap) in zip(steps, leapt, strict=True)):
+        if not all(map(_is_as_large, steps, by)):
             continue
-        values = {"seconds": steps[0], "at_s": leapt[0][0] - late[0]}
+        values = {"seconds": steps[0], "at_s": stamps[0] - late[0]}
         if len(leapt) > 1:
-            values |= {"again_seconds": steps[1], "again_at_s": leapt[1][0] - late[1]}
+            values |= {"again_seconds": steps[1], "again_at_s": stamps[1] - late[1]}
         found += _hypotheses(fit, rest, once, every[LEAP] if len(leapt) > 1 else once[LEAP], values, late[0])
     return found
 
