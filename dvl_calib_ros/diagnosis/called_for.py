@@ -8,7 +8,7 @@ from functools import cache, partial
 import numpy as np
 
 from ..effects.base import Effect
-from .clock_or_arm import DVL_CLOCK, LAG, lag_not_taken_back
+from .clock_or_arm import DVL_CLOCK, LAG, TWO_CLOCKS, lag_not_taken_back
 from .criteria import blocks_of, finer_steps, fit_without, log_p_in_place, robust_p
 from .fitting import Fit, Fitter
 from .leaps import LEAP
@@ -35,7 +35,7 @@ def only_called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             if log_p_in_place(fitter, fit, rest, effect) > threshold
             or is_taken_back(fitter, fit, effect.name, drops[effect.name], rest)
             or _makes_leaps_cancel(fit, effect, drops)
-            or _only_smooths(fitter, fit, rest, effect)
+            or _only_smooths(fitter, fit, rest, effect, drops)
             or (
                 _is_ghost(effect, drops[effect.name], explained, fit.deviance)
                 and not _is_late_before_a_leap(fit, effect)
@@ -58,13 +58,17 @@ def _makes_leaps_cancel(fit: Fit, effect: Effect, drops: Mapping[str, float]) ->
     return drops[DVL_CLOCK] < LITTLE_OF_LEAPS * drops[LEAP]
 
 
-def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> bool:
+def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect, drops: Mapping[str, float]) -> bool:
     """Whether an effect is a lag that clocks take back, and explains no more than smoothing does. rest: without it.
 
     The two leave the motion where it is, but for its corners, and take noise off the DVL. That of a slow one is known
-    by its claims, which may be anything up to its roughness.
+    by its claims, which may be anything up to its roughness. Of a clock that is late without the lag as well, and
+    explains more than this, what it becomes earlier beside it is meant. drops: as for `_makes_leaps_cancel`.
     """
-    if effect.name != LAG or lag_not_taken_back(fit, rest) >= TAKEN_BACK:
+    if effect.name != LAG:
+        return False
+    is_late_itself = max((drops[name] for name in TWO_CLOCKS if name in drops), default=0.0) > drops[LAG]
+    if lag_not_taken_back(fit, rest if is_late_itself else None) >= TAKEN_BACK:
         return False
     smoothed = [float(each.own_noise @ each.own_noise) for each in (rest, fit)]
     more = (smoothed[0] - smoothed[1]) * (fitter.problem.rougher_than_claimed**2 - 1.0)

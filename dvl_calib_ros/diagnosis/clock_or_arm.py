@@ -74,17 +74,19 @@ def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, t
     ]
 
 
-def lag_not_taken_back(fit: Fit, rest: Fit) -> float:
-    """The share of a reference's lag, or of how much earlier its stamps are beside the DVL's than without the lag
-    (rest), that the other does not take back, of the larger; the most of all recordings."""
+def lag_not_taken_back(fit: Fit, rest: Fit | None = None) -> float:
+    """The share of a reference's lag, or of how early its stamps are beside the DVL's, that the other does not take
+    back, of the larger; the most of all recordings. rest: of how much earlier they are than in this."""
+    lag = np.array([each["time_constant_s"] for each in fit.values[LAG]])
+    late = _late_beside_dvl(fit) - (0.0 if rest is None else _late_beside_dvl(rest))
+    return float((np.abs(lag + late) / np.maximum(np.maximum(lag, np.abs(late)), 1e-9)).max())
+
+
+def _late_beside_dvl(fit: Fit) -> Array:
+    """How late the reference's stamps are beside the DVL's, s, by recording."""
     of_none = ({"seconds": 0.0},) * len(fit.seen)
-    dvl, reference = (
-        np.array([[each["seconds"] for each in of.values.get(name, of_none)] for of in (fit, rest)])
-        for name in TWO_CLOCKS
-    )
-    lag, late = np.array([each["time_constant_s"] for each in fit.values[LAG]]), reference - dvl
-    later = late[0] - late[1]
-    return float((np.abs(lag + later) / np.maximum(np.maximum(lag, np.abs(later)), 1e-9)).max())
+    dvl, reference = ([each["seconds"] for each in fit.values.get(name, of_none)] for name in TWO_CLOCKS)
+    return np.subtract(reference, dvl)
 
 
 def is_open(guesses: Sequence[FirstGuess]) -> bool:

@@ -541,22 +541,24 @@ def test_a_clock_that_is_late_throughout_does_not_choose_a_time_from_which_on_it
 
 
 @pytest.mark.parametrize(
-    ("lag", "clock", "before", "late", "drop", "rougher", "is_wanted"),
+    ("lag", "clock", "before", "late", "drop", "of_clock", "rougher", "is_wanted"),
     [
-        (0.60, "reference_time_offset", 0.0, -0.59, 363.0, 2.05, True),
-        (0.47, "dvl_time_offset", 0.0, 0.44, 122.0, 1.0, True),
-        (0.60, "reference_time_offset", 0.0, -0.59, 363.0, 1.0, False),
-        (1.22, "dvl_time_offset", 0.0, 1.43, 9000.0, 2.0, False),
-        (0.60, "dvl_time_offset", 0.0, -0.59, 122.0, 2.05, False),
-        (0.70, "reference_time_offset", -1.50, -2.21, 122.0, 2.05, True),
-        (1.22, "dvl_time_offset", 1.35, 1.43, 122.0, 2.05, False),
+        (0.60, "reference_time_offset", 0.0, -0.59, 363.0, 400.0, 2.05, True),
+        (0.47, "dvl_time_offset", 0.0, 0.44, 122.0, 100.0, 1.0, True),
+        (0.60, "reference_time_offset", 0.0, -0.59, 363.0, 400.0, 1.0, False),
+        (1.22, "dvl_time_offset", 0.0, 1.43, 9000.0, 9000.0, 2.0, False),
+        (0.60, "dvl_time_offset", 0.0, -0.59, 122.0, 100.0, 2.05, False),
+        (0.70, "reference_time_offset", -1.50, -2.21, 122.0, 9000.0, 2.05, True),
+        (1.88, "reference_time_offset", 1.07, -0.49, 257.0, 31.0, 2.05, False),
+        (1.22, "dvl_time_offset", 1.35, 1.43, 122.0, 9000.0, 2.05, False),
     ],
 )
 def test_a_lag_that_a_clock_takes_back_only_smooths_unless_it_explains_more(
-    lag, clock, before, late, drop, rougher, is_wanted
+    lag, clock, before, late, drop, of_clock, rougher, is_wanted
 ):
     """The three false alarms of 726: messages claimed a half or less of the noise of a DVL at 2 Hz. A clock that is
-    late itself takes a lag back by how much later it becomes: 1.5 s were 2.2 beside a lag of 0.7."""
+    late itself takes a lag back by how much earlier it becomes: 1.5 s were 2.2 beside a lag of 0.7. But not where it
+    explains less than the lag, which is late as a clock is."""
     effect = EFFECTS["reference_lag"]
     of_rest = {clock: ({"seconds": before},)} if before else {}
     values = {effect.name: ({"time_constant_s": lag},), clock: ({"seconds": late},)}
@@ -565,8 +567,9 @@ def test_a_lag_that_a_clock_takes_back_only_smooths_unless_it_explains_more(
         for own_values, deviance, own in ((of_rest, 1000.0 + drop, 231.0), (values, 1000.0, 150.0))
     )
     fitter: Any = SimpleNamespace(problem=SimpleNamespace(rougher_than_claimed=rougher))
-    assert _only_smooths(fitter, fit, rest, effect) is is_wanted
-    assert not _only_smooths(fitter, fit, rest, EFFECTS[clock])
+    drops = {effect.name: drop, clock: of_clock}
+    assert _only_smooths(fitter, fit, rest, effect, drops) is is_wanted
+    assert not _only_smooths(fitter, fit, rest, EFFECTS[clock], drops)
 
 
 def test_of_two_leaps_that_a_late_clock_before_them_makes_one_taken_back_the_clock_goes():
