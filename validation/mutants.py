@@ -100,7 +100,7 @@ MUTANTS = (
     ),
     Mutant(
         "checksum of salvage",
-        "dvl_calib_ros/bags/salvage/mcap_chunks.py",
+        "dvl_calib_ros/bags/salvage/mcap_records.py",
         "elif head.checksum and crc32(records) != head.checksum:",
         "elif head.checksum and False:",
         (UNIT + "bags/test_damaged_bags.py::test_corrupt_bytes_anywhere_never_give_a_message_that_was_not_recorded",),

@@ -1,17 +1,24 @@
-"""Channels of a recording, and how their messages are decoded: by the definition that each brings along."""
+"""Channels of a recording, and how their messages are decoded: by the definition that each brings along.
+
+Message definitions that a recording brings along, made harmless before rosbags turns them into Python code.
+
+rosbags generates a class and its decoder from a definition and runs the code. What a definition decides in that code is
+names, numbers and values of constants; here names must be plain, numbers bounded, and constants are left out.
+"""
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any, NamedTuple
 
-from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
-
-from .definitions import Definition, DefinitionError, is_empty, known_typestore, typestore
 
 FORMATS = {
     "ros2msg": MessageDefinitionFormat.MSG,
@@ -96,3 +103,97 @@ class Decoder:
             stores = [known_typestore(msgtype, text) for text in texts] or [typestore(definition, msgtype)]
             self._by_definition[key] = stores
         return self._by_definition[key]
+
+
+# Of the definitions that ROS ships the longest has 9 kB, with all that is nested in it, and the largest array 48.
+LONGEST_DEFINITION = 1 << 18
+LARGEST_ARRAYS = 1 << 16
+# Types made of definitions that are kept: making them takes longer than reading a minute, and recordings are alike.
+KEPT = 32
+_FIELD = re.compile(r"[A-Za-z]\w*", re.ASCII)
+_TYPE = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
+# rosbags evaluates the constants of IDL: a shift can take all memory, and nested brackets for ever to parse
+_EXPENSIVE_IDL = re.compile(r"<<|\(\s*\(\s*\(")
+_SEPARATOR = "=" * 80 + "\n"
+
+
+class Definition(NamedTuple):
+    """The text of a message definition."""
+
+    format: MessageDefinitionFormat
+    text: str
+
+
+class DefinitionError(Exception):
+    """A definition that cannot be used."""
+
+
+def is_empty(definition: Definition | None) -> bool:
+    """Whether a recording does not say how messages are laid out; those of before ROS 2 Iron do not."""
+    return definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip()
+
+
+@lru_cache(maxsize=KEPT)
+def known_typestore(msgtype: str, text: str) -> Typestore:
+    """Jazzy's types and one that a definition is known of, in MSG format."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(get_types_from_msg(text, msgtype))
+    return store
+
+
+@lru_cache(maxsize=KEPT)
+def typestore(definition: Definition | None, msgtype: str) -> Typestore:
+    """Types for a message: from its definition, or Jazzy's if that is empty. Raises DefinitionError."""
+    if definition is None or is_empty(definition):
+        return get_typestore(Stores.ROS2_JAZZY)
+    try:
+        return _typestore(definition, msgtype)
+    except DefinitionError:
+        raise
+    except Exception as error:
+        # The parser raises all sorts of things on what is damaged; one that parses nothing at all is not damage.
+        _typestore(_SOUND[definition.format], "a/msg/B")
+        raise DefinitionError(f"the definition of {msgtype} is damaged ({type(error).__name__})") from error
+
+
+def _typestore(definition: Definition, msgtype: str) -> Typestore:
+    store = get_typestore(Stores.EMPTY)
+    store.register(_harmless(_parsed(definition, msgtype)))
+    return store
+
+
+_SOUND = {
+    MessageDefinitionFormat.MSG: Definition(MessageDefinitionFormat.MSG, "int32 a\nfloat64[9] b\n"),
+    MessageDefinitionFormat.IDL: Definition(
+        MessageDefinitionFormat.IDL, "module a { module msg { struct B { long x; }; }; };"
+    ),
+}
+
+
+def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
+    if len(definition.text) > LONGEST_DEFINITION:
+        raise DefinitionError(f"the definition of {msgtype} has {len(definition.text)} characters")
+    if definition.format is MessageDefinitionFormat.MSG:
+        return dict(get_types_from_msg(definition.text, msgtype))
+    if _EXPENSIVE_IDL.search(definition.text):
+        raise DefinitionError(f"the definition of {msgtype} has constants that are computed")
+    types: dict[str, Any] = {}
+    for part in definition.text.split(_SEPARATOR):
+        idl = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
+        if idl.strip():
+            types.update(get_types_from_idl(idl))
+    return types
+
+
+def _harmless(types: dict[str, Any]) -> dict[str, Any]:
+    """The types without their constants. Raises DefinitionError for what no driver defines."""
+    arrays = 0
+    for name, (_, fields) in types.items():
+        for field, (kind, description) in fields:
+            if not _TYPE.fullmatch(name) or not _FIELD.fullmatch(field):
+                raise DefinitionError(f"{name!r} or its field {field!r} is no name")
+            if kind == Nodetype.ARRAY:  # decoders have a line of code for each element
+                arrays += description[1]
+    if arrays > LARGEST_ARRAYS:
+        raise DefinitionError(f"arrays of {arrays} elements")
+    return {name: ([], fields) for name, (_, fields) in types.items()}

@@ -14,11 +14,10 @@ from types import TracebackType
 from typing import Any
 
 from ..errors import InputError
-from .batches import Batch, batched, one_batch
+from .batches import BagMessage, Batch, batched, one_batch
 from .channels import Channel, Decoder, DecodingError
 from .files import ZSTD_MAGIC, files_of
 from .salvage.damage import LARGEST_RECORD
-from .sorting import BagMessage
 from .sources import DAMAGE, Source, open_source, said
 
 if sys.version_info >= (3, 14):

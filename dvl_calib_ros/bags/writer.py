@@ -1,4 +1,7 @@
-"""New rosbag2 recordings, written by rosbags."""
+"""New rosbag2 recordings, written by rosbags.
+
+Attachments of MCAP recordings, which rosbags does not write.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,9 @@ from typing import Any
 from urllib.parse import quote
 
 import yaml
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
@@ -21,9 +27,7 @@ from rosbags.typesys import Stores, get_typestore
 from ..disk.atomic import NO_SPACE
 from ..disk.yaml_files import load_yaml
 from ..errors import InputError
-from .attachments import attach
-from .channels import Channel
-from .definitions import Definition, DefinitionError, typestore
+from .channels import Channel, Definition, DefinitionError, typestore
 
 
 class Storage(Enum):
@@ -199,7 +203,7 @@ class BagWriter:
 class _Part:
     """One file of a bag."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: McapWriter) -> None:
         self.writer = writer
         self.connections: dict[Channel, Any] = {}
 
@@ -220,3 +224,30 @@ def _type_hash(definition: Definition | None, msgtype: str) -> str:
         return typestore(definition, msgtype).hash_rihs01(msgtype)
     except (DefinitionError, LookupError):  # a damaged definition, or one without the type; its messages are whole
         return UNKNOWN_HASH
+
+
+def attach(path: Path, name: str, media_type: str, data: bytes, compressed: bool) -> None:
+    """Add an attachment to an MCAP file, which is written anew beside itself and then replaced."""
+    new = path.with_name(f"{path.name}.tmp")
+    with path.open("rb") as source, new.open("xb") as target:
+        reader = make_reader(source)
+        header = reader.get_header()
+        writer = McapWriter(target, compression=CompressionType.ZSTD if compressed else CompressionType.NONE)
+        writer.start(header.profile, header.library)
+        channels: dict[int, int] = {}
+        start_ns = 0
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if schema is not None and channel.id not in channels:
+                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, schema_id, channel.metadata
+                )
+            start_ns = start_ns or message.log_time
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        writer.add_attachment(start_ns, start_ns, name, media_type, data)
+        writer.finish()  # type: ignore[no-untyped-call]
+    os.replace(new, path)

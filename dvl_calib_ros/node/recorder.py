@@ -12,8 +12,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.interfaces import MessageDefinitionFormat
 
-from ..bags.channels import Channel
-from ..bags.definitions import Definition
+from ..bags.channels import Channel, Definition
 from ..bags.writer import BagWriter
 from ..errors import InputError
 from ..recordings.columns import is_kept

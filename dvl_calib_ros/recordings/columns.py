@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bags.channels import Channel, Decoder, DecodingError
-from ..bags.columns import Part
-from ..bags.layout import MessageColumns
+from ..bags.columns import MessageColumns, Part
 from ..calibration.frames import Array
 from ..calibration.parameters import Parameters
 from ..calibration.samples import Codes, Covariances, Index, Stamps

@@ -21,7 +21,7 @@ from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from wholes import Names, names_seeds, run_names, run_settings, settings_seeds
 
-from dvl_calib_ros.bags.definitions import Definition, DefinitionError, typestore
+from dvl_calib_ros.bags.channels import Definition, DefinitionError, typestore
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.salvage.damage import DamagedError
 from dvl_calib_ros.bags.salvage.mcap_file import salvage_mcap_stream

@@ -21,7 +21,7 @@ from report_fixtures import drawn
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.serde import SerdeError
 
-from dvl_calib_ros.bags.definitions import Definition, DefinitionError, typestore
+from dvl_calib_ros.bags.channels import Definition, DefinitionError, typestore
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.disk.atomic import check_writable, save_text

@@ -28,15 +28,17 @@ from ..batches import Batch, one_batch, times
 from ..channels import Channel
 from ..raw_file import holes_in, open_raw
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
-from .mcap_chunks import RECORD_HEAD, is_chunk, open_chunk
 from .mcap_records import (
     CHANNEL,
     MESSAGE,
     PARSING,
+    RECORD_HEAD,
     SCHEMA,
     Found,
     Tables,
+    is_chunk,
     messages_of,
+    open_chunk,
     places_by_index,
     places_of,
     record_head,

@@ -21,9 +21,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from dvl_calib_ros.bags import channels, definitions, sources
-from dvl_calib_ros.bags.channels import Channel, DecodingError
-from dvl_calib_ros.bags.definitions import Definition, is_empty
+from dvl_calib_ros.bags import channels, sources
+from dvl_calib_ros.bags.channels import Channel, DecodingError, Definition, is_empty
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Storage
 from dvl_calib_ros.calibration.samples import DvlSample
@@ -308,7 +307,7 @@ def test_salvage_of_a_bag_without_definitions_writes_none(tmp_path):
     ("kind", "module", "name"),
     [
         ("mcap", sources, "read_summary"), ("mcap", sources, "indexed_messages"), ("mcap", sources, "salvage_mcap"),
-        ("sqlite3", sources, "Database"), ("mcap", definitions, "get_types_from_msg"),
+        ("sqlite3", sources, "Database"), ("mcap", channels, "get_types_from_msg"),
         ("mcap", channels, "typestore"),
     ],
 )  # fmt: skip
@@ -316,7 +315,7 @@ def test_what_does_not_fit_of_a_library_is_no_damage(bags, tmp_path, monkeypatch
     def unfit(*_, **__):
         raise error("no such thing in this version")
 
-    definitions.typestore.cache_clear()
+    channels.typestore.cache_clear()
     bag = bags[kind]
     if name == "salvage_mcap":
         file = tmp_path / "cut.mcap"

@@ -27,7 +27,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from yaml_text import parsed, written
 
-from dvl_calib_ros.bags import sorting, sources
+from dvl_calib_ros.bags import batches, sources
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.samples import DvlSample, VelocityFrame
@@ -128,10 +128,10 @@ def test_mcap_files_of_other_writers_give_the_same_messages(tmp_path, plain, com
     assert messages == raw(plain) and not notes
 
 
-@pytest.mark.parametrize(("at_once", "in_memory"), [(0, sorting.IN_MEMORY), (0, 20_000), (1 << 30, 20_000)])
+@pytest.mark.parametrize(("at_once", "in_memory"), [(0, batches.IN_MEMORY), (0, 20_000), (1 << 30, 20_000)])
 def test_chunks_of_one_topic_each_are_merged_in_memory_or_on_disk(tmp_path, plain, monkeypatch, at_once, in_memory):
     monkeypatch.setattr(sources, "MERGED_AT_ONCE", at_once)
-    monkeypatch.setattr(sorting, "IN_MEMORY", in_memory)
+    monkeypatch.setattr(batches, "IN_MEMORY", in_memory)
     by_topic = sorted(raw(plain), key=lambda message: message[0])
     (tmp_path / "by_topic.mcap").write_bytes(mcap_bytes(by_topic, chunk_size=30_000, compression=CompressionType.LZ4))
     found, notes = raw_and_notes(tmp_path / "by_topic.mcap")
@@ -140,14 +140,14 @@ def test_chunks_of_one_topic_each_are_merged_in_memory_or_on_disk(tmp_path, plai
     assert estimates(tmp_path / "by_topic.mcap") == estimates(plain)
 
 
-@pytest.mark.parametrize("in_memory", [sorting.IN_MEMORY, 20_000])
+@pytest.mark.parametrize("in_memory", [batches.IN_MEMORY, 20_000])
 @pytest.mark.parametrize("is_cut", [False, True])
 @pytest.mark.spread(2)
 def test_log_times_out_of_order_in_a_file_without_index_are_put_in_order(
     tmp_path, plain, monkeypatch, in_memory, is_cut
 ):
     """One topic after the other, as of a recorder that caches by topic; in memory, or for the greater part on disk."""
-    monkeypatch.setattr(sorting, "IN_MEMORY", in_memory)
+    monkeypatch.setattr(batches, "IN_MEMORY", in_memory)
     by_topic = sorted(raw(plain), key=lambda message: message[0])
     content = mcap_bytes(by_topic, use_chunking=False)
     (tmp_path / "by_topic.mcap").write_bytes(content[:-37] if is_cut else content)

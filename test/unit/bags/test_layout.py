@@ -13,8 +13,8 @@ from io_fixtures import JAZZY
 from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_typestore
 
-from dvl_calib_ros.bags.definitions import Definition, typestore
-from dvl_calib_ros.bags.layout import MessageColumns, NoLayoutError, layout_of
+from dvl_calib_ros.bags.channels import Definition, typestore
+from dvl_calib_ros.bags.columns import MessageColumns, NoLayoutError, layout_of
 
 NUMBERS = (
     "int8",
