@@ -23,7 +23,7 @@ from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.messages.decode import stamp_ns
-from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.messages.live_feed import MessageFeed
 
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 FRAMES = {VelocityFrame.BODY: "base_link", VelocityFrame.ENU: "map", VelocityFrame.NED: "ned"}

@@ -17,7 +17,7 @@ from ..calibration.register.readings import FITS
 from ..calibration.samples import VelocityFrame
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES
-from ..messages.fixes import SELDOM_S
+from ..messages.positions import SELDOM_S
 from ..recordings.look import Look
 from ..recordings.recorded import Recorded
 from ..recordings.recording import Recording, open_recording

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..calibration.frames import Array, over_ground
 from ..calibration.samples import ReferenceSample, VelocityFrame
-from ..messages.fixes import FixDifference
+from ..messages.positions import FixDifference
 from .nmea import KNOT, STANDING, xor
 
 GENERAL_NMEA = 0x2022

@@ -18,7 +18,7 @@ from ..calibration.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameter
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from ..verdict.reasons import Reason, finding
 from .drivers import NOT_MEASURED, VelocityType, velocity_type
-from .fixes import FixDifference, Place, PositionType, matrix_of
+from .positions import FixDifference, Place, PositionType, matrix_of
 
 # Under which messages are counted that no sensor can mean, and those in another frame
 INVALID, WRONG_FRAME = "invalid", "wrong_frame"

@@ -51,7 +51,7 @@ from ..files.result_file import (
     save_result,
 )
 from ..messages.decode import frame_name, heading_variance
-from ..messages.feed import MessageFeed
+from ..messages.live_feed import MessageFeed
 from ..streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..messages.drivers import VELOCITY_TYPES, may_be_recognised, velocity_type
-from ..messages.recognised import recognised
+from ..messages.type_recognition import recognised
 
 
 def velocity_class(parameter: str, name: str) -> Any:

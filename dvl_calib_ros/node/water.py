@@ -15,7 +15,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from ..calibration.water import Water
 from ..errors import InputError
-from ..messages.waters import WaterCollector, readers, water_of
+from ..messages.water_properties import WaterCollector, readers, water_of
 from .inbox import take
 from .message_types import message_class
 

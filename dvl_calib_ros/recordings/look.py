@@ -22,7 +22,7 @@ from ..calibration.robust import median
 from ..calibration.samples import Index, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.fixes import SELDOM_S, FixDifference, PositionType
+from ..messages.positions import SELDOM_S, FixDifference, PositionType
 from .columns import TopicColumns, stamped, turning
 
 # Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and

@@ -15,7 +15,7 @@ from ..calibration.samples import Codes, Stamps
 from ..calibration.screening import NOT_MEASURED_VARIANCE, screen_columns
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.fixes import SELDOM_S, FixDifference, PositionType
+from ..messages.positions import SELDOM_S, FixDifference, PositionType
 from .columns import Laid, TopicColumns, stamped
 from .look import FASTEST
 

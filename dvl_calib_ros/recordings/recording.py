@@ -25,8 +25,8 @@ from ..calibration.samples import Stamps, Stream, Streams, no_samples
 from ..calibration.water import Water
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.opening import open_bags
-from ..messages.waters import OfWater, WaterCollector, readers, water_of
+from ..messages.type_recognition import open_bags
+from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from .columns import Collector, TopicColumns, is_kept
 from .look import Survey, look_of
 from .recorded import Recorded, recorded

@@ -40,7 +40,7 @@ from dvl_calib_ros.files.trajectories import read_columns
 from dvl_calib_ros.files.urdf import read_urdf
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
-from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.recordings.recording import open_recording
 
 ROOT = Path(__file__).resolve().parents[2]

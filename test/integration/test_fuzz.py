@@ -21,7 +21,7 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
-from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.messages.live_feed import MessageFeed
 
 sys.path.insert(0, str(ROOT / "test" / "fuzz"))
 from targets import TARGETS

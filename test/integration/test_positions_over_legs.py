@@ -21,8 +21,8 @@ from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.examination.examine import examine
 from dvl_calib_ros.files.trajectories import ImportOptions, import_recording
-from dvl_calib_ros.messages.feed import MessageFeed
-from dvl_calib_ros.messages.opening import open_bags
+from dvl_calib_ros.messages.live_feed import MessageFeed
+from dvl_calib_ros.messages.type_recognition import open_bags
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.replay.replay import replay

@@ -27,7 +27,7 @@ from dvl_calib_ros.calibration.samples import DvlSample
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.drivers import POSE_TYPE, VELOCITY_TYPES
-from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.node import calibration_node
 from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose

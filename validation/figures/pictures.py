@@ -117,7 +117,7 @@ def watch(folder: Path) -> None:
     from dvl_calib_ros.calibration.calibrator import Calibrator
     from dvl_calib_ros.calibration.parameters import Parameters
     from dvl_calib_ros.cli.live_view import rendered
-    from dvl_calib_ros.messages.feed import MessageFeed
+    from dvl_calib_ros.messages.live_feed import MessageFeed
     from dvl_calib_ros.node.card import Card
     from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
     from dvl_calib_ros.node.status import Status

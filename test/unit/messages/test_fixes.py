@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import ReferenceSample, VelocityFrame
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
-from dvl_calib_ros.messages.fixes import FixDifference
+from dvl_calib_ros.messages.positions import FixDifference
 
 A, B = 6_378_137.0, 6_356_752.314245  # WGS 84
 START = 1_760_000_000_000_000_000

@@ -11,7 +11,7 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.messages.decode import LinearCovariance, stamp_ns
-from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.messages.live_feed import MessageFeed
 
 SECOND = 10**9
 

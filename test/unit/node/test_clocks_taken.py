@@ -15,8 +15,8 @@ from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.judging import Judge
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
-from dvl_calib_ros.messages import kept
-from dvl_calib_ros.messages.feed import MessageFeed
+from dvl_calib_ros.messages import live_feed
+from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.node.late_clocks import LateClocks
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.replay.replay import replay
@@ -141,8 +141,8 @@ def test_what_came_before_a_clock_was_taken_off_is_fed_again_so_that_live_is_wha
 
 
 def test_what_is_more_than_is_kept_is_not_fed_again(monkeypatch):
-    monkeypatch.setattr(kept, "MOST", 3)
-    messages = kept.KeptMessages()
+    monkeypatch.setattr(live_feed, "MOST", 3)
+    messages = live_feed.KeptMessages()
     for i in range(3):
         messages.add(Stream.DVL, DvlSample(i, (1.0, 0.0, 0.0)))
     assert messages.streams is not None and len(messages.streams.dvl) == 3
@@ -152,11 +152,11 @@ def test_what_is_more_than_is_kept_is_not_fed_again(monkeypatch):
 
 def test_the_room_for_what_is_kept_is_taken_before_it_comes():
     """It grew by 10 MB in the first hour."""
-    messages = kept.KeptMessages()
+    messages = live_feed.KeptMessages()
     room = messages.values
     for i in range(20_000):
         messages.add(Stream.IMU, ImuSample(i, None, (0.0, 0.0, 0.1)))
-    assert messages.values is room and len(room) == kept.MOST
+    assert messages.values is room and len(room) == live_feed.MOST
     messages.forget()
     assert not len(messages.values)
 
@@ -167,7 +167,7 @@ def test_what_is_kept_is_what_came():
         Stream.REFERENCE: [ReferenceSample(5, (1.0, 0.0, 0.0), 2.0 * np.eye(3), VelocityFrame.NED)],
         Stream.IMU: [ImuSample(6, None, (0.1, 0.2, 0.3)), "no_stamp", ImuSample(7, (0.0, 0.0, 0.6, 0.8), None)],
     }
-    messages = kept.KeptMessages()
+    messages = live_feed.KeptMessages()
     for stream, samples in came.items():
         for sample in samples:
             messages.add(stream, sample)

@@ -2,13 +2,17 @@
 
 Forks and ports of a driver send its messages under packages of their own: waterlinked_a50_ros_driver and dvl_a50_msgs
 are dvl_msgs in all but the name, stonefish_msgs and dave_interfaces are as uuv_sensor_ros_plugins_msgs.
+
+Recordings opened with all that is known of message types.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from pathlib import Path
 
-from .drivers import VELOCITY_TYPES, VelocityType, add_type
+from ..bags.reader import BagReader
+from .drivers import KNOWN_DEFINITIONS, VELOCITY_TYPES, VelocityType, add_type
 
 # fields that tell a DVL's message, the most telling first -> the type that is read alike
 _ALIKE: tuple[tuple[frozenset[str], str], ...] = (
@@ -44,3 +48,12 @@ def recognised(name: str, fields: Collection[str]) -> VelocityType | None:
         return known
     like = next((like for needed, like in _ALIKE if needed <= set(fields)), None)
     return None if like is None else add_type(name, like)
+
+
+def open_bags(paths: Sequence[Path]) -> BagReader:
+    """A reader of recordings whose types are recognised. Raises InputError for what is no bag."""
+    bag = BagReader(paths, KNOWN_DEFINITIONS)
+    for topic, name in bag.topics.items():
+        if name not in VELOCITY_TYPES:
+            recognised(name, bag.fields_of(topic))
+    return bag
