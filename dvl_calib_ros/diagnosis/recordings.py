@@ -26,11 +26,10 @@ from ..effects.base import EffectNeeds
 from ..errors import InputError
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.check import check_topics, missing_imu
-from ..recordings.recorded import Recorded
 from ..recordings.recording import Recording as Opened
 from ..recordings.recording import open_recording
-from ..recordings.same import hold_the_same
+from ..recordings.requirements import check_topics, hold_the_same, missing_imu
+from ..recordings.topic_messages import Recorded
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason
 from .curve import Curve

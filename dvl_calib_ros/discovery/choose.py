@@ -13,7 +13,7 @@ from ..recordings.topics import spelled
 from ..verdict.reasons import Reason, finding
 
 if TYPE_CHECKING:
-    from ..recordings.look import Look, Survey
+    from ..recordings.topic_preview import Look, Survey
 
 NONE = "none"
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")

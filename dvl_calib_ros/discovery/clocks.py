@@ -20,8 +20,8 @@ from ..calibration.register.motion import MotionStreams, motion_of
 from ..calibration.register.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
 from ..calibration.samples import SampleBlock, Stream, Streams
 from ..messages.decode import MessageDecoder
-from ..recordings.look import Look, Survey
 from ..recordings.recording import Recording
+from ..recordings.topic_preview import Look, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason
 

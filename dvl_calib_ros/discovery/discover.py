@@ -36,8 +36,8 @@ from ..calibration.screening import unit_quaternions
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.look import Look, Survey
 from ..recordings.recording import Recording, open_recording
+from ..recordings.topic_preview import Look, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from . import choose

@@ -24,9 +24,9 @@ from ..calibration.results import Estimate
 from ..calibration.samples import AlignedBlock
 from ..errors import InputError
 from ..parallel import Workers, run_all
-from ..recordings.recorded import Recorded
 from ..recordings.recording import open_recording
-from ..recordings.same import hold_the_same
+from ..recordings.requirements import hold_the_same
+from ..recordings.topic_messages import Recorded
 from ..recordings.topics import Topics
 from ..replay.replay import replay
 from ..verdict.answering import Answering

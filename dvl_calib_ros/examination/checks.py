@@ -11,7 +11,7 @@ from ..calibration.parameters import SCHEMA, Parameters
 from ..calibration.register.arrival import apart
 from ..calibration.samples import Stream
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.recorded import Recorded
+from ..recordings.topic_messages import Recorded
 from ..verdict.reasons import Reason, finding
 
 SECOND_NS = 1_000_000_000

@@ -18,9 +18,9 @@ from ..calibration.samples import VelocityFrame
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S
-from ..recordings.look import Look
-from ..recordings.recorded import Recorded
 from ..recordings.recording import Recording, open_recording
+from ..recordings.topic_messages import Recorded
+from ..recordings.topic_preview import Look
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding

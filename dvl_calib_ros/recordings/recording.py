@@ -28,9 +28,9 @@ from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.type_recognition import open_bags
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from .columns import Collector, TopicColumns, is_kept
-from .look import Survey, look_of
-from .recorded import Recorded, recorded
-from .streams import Stretch, stretches
+from .sample_columns import Stretch, stretches
+from .topic_messages import Recorded, recorded
+from .topic_preview import Survey, look_of
 from .topics import Topics
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"

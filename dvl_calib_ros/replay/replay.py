@@ -31,8 +31,8 @@ from ..errors import InputError
 from ..files.result_file import load_initial_calibration
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import TWIST_TYPE
-from ..recordings.check import check_topics, missing_imu
 from ..recordings.recording import Recording, open_recording
+from ..recordings.requirements import check_topics, missing_imu
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding

@@ -9,7 +9,7 @@ import pytest
 
 from dvl_calib_ros.discovery.choose import choose_dvl, choose_imu, choose_reference, may_be_dvl
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
-from dvl_calib_ros.recordings.look import Look, Survey
+from dvl_calib_ros.recordings.topic_preview import Look, Survey
 
 
 def survey(*topics: str, msgtype: str = TWIST_TYPE) -> Survey:

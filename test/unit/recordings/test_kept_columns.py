@@ -18,8 +18,8 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import Stream
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS
-from dvl_calib_ros.recordings import growing
-from dvl_calib_ros.recordings import streams as kept_streams
+from dvl_calib_ros.recordings import columns
+from dvl_calib_ros.recordings import sample_columns as kept_streams
 from dvl_calib_ros.recordings.recording import open_recording
 
 TOPICS = {"dvl/twist": Stream.DVL, "gnss/twist": Stream.REFERENCE, "imu/data": Stream.IMU}
@@ -145,7 +145,7 @@ def recordings(draw: st.DrawFn):
 @searched(120)
 @given(
     recordings(), st.sampled_from([1, 7, 4096]), st.sampled_from(["", "dvl_link", "base_link"]), st.booleans(),
-    st.sampled_from([100, growing.IN_MEMORY]),
+    st.sampled_from([100, columns.IN_MEMORY]),
 )  # fmt: skip
 def test_whatever_is_recorded_gives_the_same_in_columns(
     tmp_path_factory, messages, window, dvl_frame, is_turned, in_memory
@@ -157,7 +157,7 @@ def test_whatever_is_recorded_gives_the_same_in_columns(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bag_columns, "WINDOW_MESSAGES", window)
         patch.setattr(kept_streams, "STRETCH_MESSAGES", window)
-        patch.setattr(growing, "IN_MEMORY", in_memory)
+        patch.setattr(columns, "IN_MEMORY", in_memory)
         assert_same([path], parameters)
 
 

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from io_fixtures import run, write_bag
 
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.recordings import look as looking
-from dvl_calib_ros.recordings.look import BURST_EVERY_NS, BURST_NS, BURSTS, in_bursts
+from dvl_calib_ros.recordings import topic_preview as looking
 from dvl_calib_ros.recordings.recording import open_recording
-from dvl_calib_ros.recordings.same import hold_the_same
+from dvl_calib_ros.recordings.requirements import hold_the_same
+from dvl_calib_ros.recordings.topic_preview import BURST_EVERY_NS, BURST_NS, BURSTS, in_bursts
 from dvl_calib_ros.recordings.topics import Topics
 
 

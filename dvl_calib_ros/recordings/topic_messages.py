@@ -17,7 +17,7 @@ from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.positions import SELDOM_S, FixDifference, PositionType
 from .columns import Laid, TopicColumns, stamped
-from .look import FASTEST
+from .topic_preview import FASTEST
 
 # Of an IMU
 NOTHING = np.zeros((0, 3)), np.zeros(0, dtype=np.uint8)

@@ -1,14 +1,21 @@
-"""Whether a recording has what a command needs of it."""
+"""Whether a recording has what a command needs of it.
+
+Whether two recordings are one by two names, or one a part of the other.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Set
 
-from ..calibration.samples import VelocityFrame
+import numpy as np
+
+from ..calibration.frames import Array
+from ..calibration.samples import Stamps, VelocityFrame
 from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES
 from ..verdict.reasons import Reason, finding
 from .recording import Recording
+from .topic_messages import Recorded
 from .topics import Topics
 
 
@@ -67,3 +74,22 @@ def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
     fitting = sorted(name for name, kind in present.items() if kind in DVL_TYPES and name != topics.gnss)
     only_dvl = [name for name in fitting if present[name] not in REFERENCE_TYPES]
     return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting
+
+
+def hold_the_same(one: Recorded, other: Recorded) -> bool:
+    """Whether half of the DVL's velocities of one recording are in the other too, at the same stamps."""
+    (stamps, values), (its_stamps, its_values) = _velocities(one), _velocities(other)
+    if not len(stamps) or not len(its_stamps):
+        return False
+    at = np.minimum(np.searchsorted(its_stamps, stamps), len(its_stamps) - 1)
+    same = (its_stamps[at] == stamps) & (its_values[at] == values).all(axis=1)
+    return bool(2 * np.count_nonzero(same) > min(len(stamps), len(its_stamps)))
+
+
+def _velocities(topic: Recorded) -> tuple[Stamps, Array]:
+    """(N,) stamps in order and (N, 3) velocities, of each stamp the first."""
+    kept = np.flatnonzero(np.isfinite(topic.values).all(axis=1))
+    stamps = np.where(topic.stamps_ns == 0, topic.log_ns, topic.stamps_ns)[kept]
+    order = np.argsort(stamps, kind="stable")
+    first = np.concatenate([[True], np.diff(stamps[order]) > 0])[: len(order)]
+    return stamps[order][first], topic.values[kept[order][first]]
