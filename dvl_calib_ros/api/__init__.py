@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from ..evaluation.bags import CrossCheck
     from ..evaluation.results import Evaluation
     from ..export.simulator import Export
-    from ..files.applying import Applied
-    from ..files.instruments import InstrumentSettings
-    from ..files.trajectories import Imported
+    from ..files.apply import Applied
     from ..fleet.fleet import Fleet
+    from ..instruments.settings import InstrumentSettings
+    from ..logs.trajectories import Imported
     from ..unpaired.results import UnpairedComparison
     from ..unpaired.rounds import ClosedGap
 
@@ -162,7 +162,7 @@ def compare(
     from ..bags.files import is_bag
     from ..calibration.comparison import check_distinct
     from ..calibration.comparison import compare as run
-    from ..files.extrinsics import load_extrinsics
+    from ..files.mounting import load_extrinsics
     from ..replay.compared import calibrated
     from ..replay.replay import extrinsics_of_replay
 
@@ -513,8 +513,8 @@ def import_files(
     InputError
         Naming file and row; then nothing is written.
     """
-    from ..files.trajectories import ImportOptions
-    from ..files.trajectories import import_files as run
+    from ..logs.trajectories import ImportOptions
+    from ..logs.trajectories import import_files as run
 
     options = ImportOptions(frame, gnss_frame, dvl_std, gnss_std, start, *_form(storage, compression))
     return run(Path(dvl), _path(gnss), _path(attitude), Path(output), options)
@@ -566,7 +566,7 @@ def apply(
     InputError
         For what is no result file, must not be applied, or cannot be written.
     """
-    from ..files.applying import Targets, write_calibration
+    from ..files.apply import Targets, write_calibration
     from ..files.mounting import load_calibrated_mounting
 
     targets = Targets(_path(urdf), _path(output), joint, keep_position, _path(params), _path(launch), _path(fusion))
@@ -600,8 +600,8 @@ def instrument_settings(
     InputError
         For another instrument or setting, what it cannot be set to, or what must not be applied.
     """
-    from ..files.instruments import instrument_settings as settings_of
     from ..files.mounting import load_calibrated_mounting
+    from ..instruments.settings import instrument_settings as settings_of
 
     return settings_of(load_calibrated_mounting(Path(result)), instrument, now, force)
 

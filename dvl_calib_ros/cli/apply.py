@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from . import common
 
 if TYPE_CHECKING:
-    from ..files.instruments import InstrumentSettings
     from ..files.mounting import CalibratedMounting
+    from ..instruments.settings import InstrumentSettings
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -59,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Check everything, then write everything; or roll back."""
     from ..errors import InputError
-    from ..files.applying import Targets, roll_back, write_calibration
+    from ..files.apply import Targets, roll_back, write_calibration
 
     names = ("urdf", "output", "joint", "keep_position", "params", "launch", "fusion")
     targets = Targets(**{name: getattr(arguments, name) for name in names})
@@ -102,8 +102,8 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
     """Show an instrument's settings; write, and send them, where that is wanted."""
     from ..disk.atomic import save_bytes
     from ..errors import InputError
-    from ..files.instruments import AS_RECORDED, instrument_settings
-    from ..files.water_linked import configure
+    from ..instruments.settings import AS_RECORDED, instrument_settings
+    from ..instruments.water_linked import configure
 
     now = _told_settings(arguments.now)
     chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)

@@ -139,7 +139,7 @@ def check_outputs(
     """
     from ..disk.atomic import check_folder_writable, check_writable
     from ..errors import InputError
-    from ..files.outputs import check_outputs as check_apart
+    from ..files.output_paths import check_outputs as check_apart
 
     given = {name: value for name, value in vars(arguments).items() if isinstance(value, Path)}
     for name in files:

@@ -72,7 +72,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
 def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
     """Of a result file; a bag is calibrated for it."""
     from ..bags.files import is_bag
-    from ..files.extrinsics import load_extrinsics
+    from ..files.mounting import load_extrinsics
 
     if not is_bag(path):
         return load_extrinsics(path, name)

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Import one recording, or a folder of them."""
     from ..bags.writer import Compression, Storage
-    from ..files.trajectories import ImportOptions, import_files
+    from ..logs.trajectories import ImportOptions, import_files
 
     options = ImportOptions(
         frame=arguments.frame,

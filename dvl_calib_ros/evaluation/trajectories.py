@@ -22,8 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_frd
 from ..errors import InputError
-from ..files.attitudes import angular_velocities
-from ..files.trajectories import read_columns
+from ..logs.dvl_log import angular_velocities
+from ..logs.trajectories import read_columns
 from ..simulation.trajectories import make_motion
 from .protocol import SETS, TRAJECTORIES, WINDOWS_S
 

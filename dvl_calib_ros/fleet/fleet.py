@@ -12,7 +12,7 @@ from .. import __version__
 from ..calibration.parameters import Parameters
 from ..discovery.discover import Given
 from ..errors import InputError
-from ..files.outputs import check_outputs
+from ..files.output_paths import check_outputs
 from ..parallel import Lost, Workers, outcomes_as_done
 from ..verdict.answering import Answering
 from .catalogue import PAGE, SCHEMA, Catalogue, CataloguePart

@@ -40,7 +40,7 @@ from ..discovery.heading_claim import believed_heading
 from ..discovery.placement import Frames, not_default, placement
 from ..disk.atomic import check_writable
 from ..errors import InputError
-from ..files.outputs import check_outputs
+from ..files.output_paths import check_outputs
 from ..files.parameter_files import NODE_NAME
 from ..files.result_file import (
     NothingUsedError,

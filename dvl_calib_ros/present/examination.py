@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..examination.examine import NO_IMU, Content, Examination
 from ..examination.expected import Shown
-from ..files.parameter_edit import as_yaml
+from ..files.parameter_files import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from .document import Answer, Columns, Commands, Document, FindingLine, Section, Sentence, bar, table_by

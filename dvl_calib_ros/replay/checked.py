@@ -26,7 +26,7 @@ from ..calibration.parameters import Parameters
 from ..calibration.results import Result
 from ..calibration.verification import shown_misalignment
 from ..errors import InputError
-from ..files.extrinsics import load_extrinsics
+from ..files.mounting import load_extrinsics
 from ..recordings.recording import Recording, open_recording, together
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding

@@ -32,12 +32,12 @@ from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.calibration.samples import Stream
 from dvl_calib_ros.disk.yaml_files import parse_scalar
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.dvl_logs import read_dvl_log
-from dvl_calib_ros.files.nmea import read_rmc
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration
-from dvl_calib_ros.files.trajectories import read_columns
 from dvl_calib_ros.files.urdf import read_urdf
+from dvl_calib_ros.logs.dvl_logs import read_dvl_log
+from dvl_calib_ros.logs.nmea import read_rmc
+from dvl_calib_ros.logs.trajectories import read_columns
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.messages.live_feed import MessageFeed

@@ -17,7 +17,7 @@ from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from dvl_calib_ros.disk.atomic import backup_of, check_writable, save_bytes
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.outputs import check_outputs
+from dvl_calib_ros.files.output_paths import check_outputs
 from dvl_calib_ros.files.result_file import result_document
 
 _STEPS_NS = (0, 1, 50_000_000, 200_000_000, 199_000_000, -50_000_000, 10**9, 3 * 10**9, -(10**9), 60 * 10**9, 10**17)

@@ -18,8 +18,8 @@ from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy, rpy_from_rotation
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.instruments import instrument_settings
 from dvl_calib_ros.files.mounting import load_calibrated_mounting
+from dvl_calib_ros.instruments.settings import instrument_settings
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 

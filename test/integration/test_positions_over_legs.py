@@ -20,7 +20,7 @@ from dvl_calib_ros.calibration.models import WITH_POSITIONS
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.examination.examine import examine
-from dvl_calib_ros.files.trajectories import ImportOptions, import_recording
+from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording
 from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.messages.type_recognition import open_bags
 from dvl_calib_ros.recordings.recording import open_recording

@@ -13,7 +13,7 @@ from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rpy_from_rotation
 from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.evaluation.protocol import COMBINATIONS, GNSS_STD, TRAJECTORIES
-from dvl_calib_ros.files.trajectories import ImportOptions, import_recording, read_columns
+from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording, read_columns
 from dvl_calib_ros.replay.checked import checked_replay
 from dvl_calib_ros.replay.replay import extrinsics_of_replay, replay
 from dvl_calib_ros.simulation.sensors import measure_dvl, measure_gnss

@@ -33,8 +33,8 @@ from dvl_calib_ros.evaluation.procedure import (
 )
 from dvl_calib_ros.evaluation.results import UNCALIBRATED
 from dvl_calib_ros.evaluation.trajectories import Trajectory, load_folder, own_trajectories
-from dvl_calib_ros.files.attitudes import angular_velocities
-from dvl_calib_ros.files.trajectories import ImportOptions, import_recording
+from dvl_calib_ros.logs.dvl_log import angular_velocities
+from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording
 from dvl_calib_ros.parallel import Workers, run_all
 from dvl_calib_ros.replay.replay import replay
 

@@ -15,7 +15,7 @@ from log_fixtures import nortek
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.files.dvl_logs import is_dvl_log, read_dvl_log
+from dvl_calib_ros.logs.dvl_logs import is_dvl_log, read_dvl_log
 
 START_US = 1_638_191_471_563_017
 VELOCITIES = [(1.5, 0.1, -0.02), (1.4, -0.2, 0.01), (1.6, 0.0, 0.03)]

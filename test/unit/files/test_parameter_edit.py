@@ -6,8 +6,7 @@ import pytest
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.parameter_edit import new_file, with_parameters
-from dvl_calib_ros.files.parameter_files import load_parameters
+from dvl_calib_ros.files.parameter_files import load_parameters, new_file, with_parameters
 
 VALUES = {"mounting_rpy": [0.1, -0.2, 3.0], "dvl_time_offset": -1.25, "lever_arm": [1.0, 0.0, 1e-05]}
 BLOCK = """# our vehicle é\r

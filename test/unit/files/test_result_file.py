@@ -26,7 +26,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.extrinsics import load_extrinsics
+from dvl_calib_ros.files.mounting import load_extrinsics
 from dvl_calib_ros.files.result_file import (
     NothingUsedError,
     load_initial_calibration,

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.trajectories import (
+from dvl_calib_ros.logs.trajectories import (
     ImportOptions,
     import_folder,
     import_recording,

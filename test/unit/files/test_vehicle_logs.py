@@ -15,8 +15,8 @@ from log_fixtures import START_S, dataflash, general_nmea, nortek, pd0, rmc, sen
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.frames import rotation_from_quaternion
-from dvl_calib_ros.files.dvl_logs import is_dvl_log, read_dvl_log
-from dvl_calib_ros.files.nmea import read_rmc
+from dvl_calib_ros.logs.dvl_logs import is_dvl_log, read_dvl_log
+from dvl_calib_ros.logs.nmea import read_rmc
 
 KNOT = 1852.0 / 3600.0
 

@@ -19,7 +19,7 @@ from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.trajectories import read_columns
+from dvl_calib_ros.logs.trajectories import read_columns
 from validation.trial import generator, main
 from validation.trial.cases import draw
 from validation.trial.generator import Noise, record

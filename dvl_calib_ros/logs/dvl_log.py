@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from ..calibration.frames import Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
-from ..calibration.samples import ImuSample
+from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from ..messages.encode import WaterReading
 
 
 def imu_samples(stamps_ns: Sequence[int], rpy: Array) -> list[ImuSample]:
@@ -33,3 +36,17 @@ def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
         return np.zeros((len(time), 3))
     rates: Array = RotationSpline(time, Rotation.from_matrix(rotation_enu_from_body))(time, 1)
     return rates
+
+
+class DvlLog(NamedTuple):
+    """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason.
+
+    references, attitudes, waters: what else the log holds. notes: in sentences, what to know of it.
+    """
+
+    samples: list[DvlSample]
+    left_out: Counter[str]
+    references: Sequence[ReferenceSample] = ()
+    attitudes: Sequence[ImuSample] = ()
+    notes: tuple[str, ...] = ()
+    waters: Sequence[WaterReading] = ()

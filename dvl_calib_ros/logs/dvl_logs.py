@@ -16,18 +16,18 @@ import json
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, Array
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from ..calibration.samples import DvlSample
 from ..errors import InputError
 from ..messages.encode import WaterReading
-from .attitudes import imu_samples
+from .dvl_log import DvlLog, imu_samples
 from .nortek_logs import is_nortek_log, read_nortek_log
 from .pd0_nmea import GENERAL_NMEA, Nmea
 
@@ -45,20 +45,6 @@ _TEMPERATURE_SENSOR, _CONDUCTIVITY_SENSOR = 1, 2
 _BAD_VELOCITY = -32768
 # forward-left-up from RDI's starboard, forward, up
 _FLU_FROM_RDI: Array = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-
-
-class DvlLog(NamedTuple):
-    """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason.
-
-    references, attitudes, waters: what else the log holds. notes: in sentences, what to know of it.
-    """
-
-    samples: list[DvlSample]
-    left_out: Counter[str]
-    references: Sequence[ReferenceSample] = ()
-    attitudes: Sequence[ImuSample] = ()
-    notes: tuple[str, ...] = ()
-    waters: Sequence[WaterReading] = ()
 
 
 def is_dvl_log(path: Path) -> bool:

@@ -16,8 +16,8 @@ import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
 from ..errors import InputError, printable
-from .mounting import POSITION_UNKNOWN, CalibratedMounting
-from .urdf import numbers
+from ..files.mounting import POSITION_UNKNOWN, CalibratedMounting
+from ..files.urdf import numbers
 
 # An angle that stays is worth a word from here on, rad.
 SAID_FROM = math.radians(0.05)

@@ -22,8 +22,7 @@ import numpy as np
 from ..calibration.frames import FLU_FROM_FRD, Array, over_ground
 from ..calibration.samples import DvlSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
-from .attitudes import imu_samples
-from .dvl_logs import DvlLog
+from .dvl_log import DvlLog, imu_samples
 
 # A 3-D fix.
 _FIX = 3

@@ -17,9 +17,9 @@ from ..calibration.frames import Array, over_ground
 from ..calibration.samples import ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from ..messages.encode import SatelliteFix
-from .attitudes import imu_samples
+from .csv_columns import cells, numbers_of, stamps_ns
+from .dvl_log import imu_samples
 from .nmea import KNOT
-from .trajectories import cells, numbers_of, stamps_ns
 
 # Units that a column's name may hold, with what takes them to SI
 _UNITS = {"deg": math.pi / 180.0, "rad": 1.0, "mps": 1.0, "m/s": 1.0, "knots": KNOT, "kn": KNOT, "km/h": 1.0 / 3.6}
