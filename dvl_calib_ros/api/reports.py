@@ -8,7 +8,7 @@ from typing import Any
 
 from ..calibration.comparison import Comparison
 from ..diagnosis.results import Diagnosis
-from ..disk.json_files import write_json
+from ..disk.text_files import write_json
 from ..errors import InputError
 from ..examination.examine import Examination
 from .calibrated import Calibration

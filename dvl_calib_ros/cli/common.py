@@ -218,7 +218,7 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
 
 def write_json(path: Path, document: Any) -> None:
     """Write JSON, whole or not at all."""
-    from ..disk.json_files import write_json as write
+    from ..disk.text_files import write_json as write
 
     write(path, document)
 

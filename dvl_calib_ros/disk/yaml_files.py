@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from ..errors import InputError
-from .reading import read_file
+from .text_files import read_file
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]

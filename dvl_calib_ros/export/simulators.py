@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .. import __version__
 from ..disk.atomic import own_stream, save_all
-from ..disk.json_files import as_json
+from ..disk.text_files import as_json
 from ..errors import InputError
 from . import dave, dvl_simulator, gazebo, holoocean, stonefish, uuv_simulator
 from .description import load_description

@@ -11,7 +11,7 @@ from xml.parsers import expat
 import numpy as np
 
 from ..calibration.frames import Array, rotation_from_rpy, rpy_from_rotation
-from ..disk.reading import read_file
+from ..disk.text_files import read_file
 from ..errors import InputError
 
 # Those with meshes written out in them have some MB

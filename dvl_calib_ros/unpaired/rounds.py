@@ -18,7 +18,7 @@ from ..bags.writer import Compression, Storage
 from ..calibration.parameters import Parameters
 from ..diagnosis.composed import amplitudes
 from ..diagnosis.results import Diagnosis, diagnosis_document
-from ..disk.json_files import write_json
+from ..disk.text_files import write_json
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..errors import InputError

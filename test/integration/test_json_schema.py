@@ -15,7 +15,7 @@ from report_fixtures import comparison, cross_checked, diagnosis, evaluation
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.comparison_words import comparison_document
 from dvl_calib_ros.diagnosis.results import diagnosis_document
-from dvl_calib_ros.disk.json_files import write_json
+from dvl_calib_ros.disk.text_files import write_json
 from dvl_calib_ros.evaluation.bags import cross_check_document
 from dvl_calib_ros.evaluation.documents import evaluation_document
 

@@ -13,7 +13,7 @@ from io_fixtures import run, write_bag
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.disk.reading import LARGEST_FILE, read_file
+from dvl_calib_ros.disk.text_files import LARGEST_FILE, read_file
 from dvl_calib_ros.errors import InputError
 
 # Every option and argument that takes a file which is read whole

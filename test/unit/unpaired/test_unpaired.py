@@ -18,7 +18,7 @@ from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import Stream, VelocityFrame, sample_block
 from dvl_calib_ros.diagnosis.recordings import make_recording, zeros_while_moving
 from dvl_calib_ros.diagnosis.results import diagnosis_document
-from dvl_calib_ros.disk.json_files import write_json
+from dvl_calib_ros.disk.text_files import write_json
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.export.description import load_description
