@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ..evaluation.results import Evaluation
     from ..export.simulator import Export
     from ..files.apply import Applied
-    from ..fleet.fleet import Fleet
+    from ..fleet_catalogue.update import Fleet
     from ..instruments.settings import InstrumentSettings
     from ..logs.trajectories import Imported
     from ..unpaired.results import UnpairedComparison
@@ -231,7 +231,7 @@ def fleet(
         For a place that is none or holds no recording, for a catalogue that cannot be written, and without pyarrow.
         What is wrong with a recording is its row.
     """
-    from ..fleet.fleet import run_fleet
+    from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers
     from ..present.reports import write_report
 

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Calibrate what is to be done, write the page, print."""
     from ..errors import InputError
-    from ..fleet.fleet import run_fleet
+    from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers
     from ..present.fleet import fleet as present
     from ..present.reports import write_report

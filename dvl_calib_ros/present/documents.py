@@ -10,7 +10,7 @@ from ..diagnosis.results import Diagnosis
 from ..evaluation.bags import CrossCheck
 from ..evaluation.results import Evaluation
 from ..examination.examine import Examination
-from ..fleet.fleet import Fleet
+from ..fleet_catalogue.update import Fleet
 from ..unpaired.results import UnpairedComparison
 from ..unpaired.rounds import ClosedGap
 from .comparison import comparison

@@ -12,8 +12,8 @@ import numpy as np
 from ..calibration.comparison import ANSWERS, fused
 from ..calibration.comparison_words import date, moved, reasons, suspicious
 from ..calibration.extrinsics import SCALE, Extrinsics
-from ..fleet.fleet import WORDS, Fleet
-from ..fleet.history import CompassDeviation, NeedsPerson, VehicleHistory
+from ..fleet_catalogue.update import WORDS, Fleet
+from ..fleet_catalogue.vehicle_history import CompassDeviation, NeedsPerson, VehicleHistory
 from ..verdict.kinds import Severity
 from ..verdict.reasons import full
 from .comparison import QUANTITIES, values_of

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..fleet.history import CompassDeviation
+from ..fleet_catalogue.vehicle_history import CompassDeviation
 from .fleet import deviation
 from .style import legend_above, new_figure
 

@@ -120,7 +120,7 @@ def test_a_wide_table_can_be_read_on_a_phone_by_scrolling_it(browser, reports):
 
 def test_on_a_phone_no_table_of_a_fleet_is_scrolled_and_every_value_has_its_heading(browser, tmp_path):
     pytest.importorskip("pyarrow", reason="pip install '.[fleet]'")
-    from dvl_calib_ros.fleet.fleet import run_fleet
+    from dvl_calib_ros.fleet_catalogue.update import run_fleet
 
     for day in range(2):
         write_dive(tmp_path / "dives" / "auv1" / f"dive{day}", day, seed=day)

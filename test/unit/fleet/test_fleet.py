@@ -23,9 +23,9 @@ from water_fixtures import SALINITY, TEMPERATURE, USED, with_water
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.water import speed_of_sound
-from dvl_calib_ros.fleet import fleet as running
-from dvl_calib_ros.fleet.catalogue import Catalogue
-from dvl_calib_ros.fleet.history import Catalogued
+from dvl_calib_ros.fleet_catalogue import update as running
+from dvl_calib_ros.fleet_catalogue.parquet_parts import Catalogue
+from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
 
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -149,7 +149,7 @@ def test_what_failed_by_the_machine_is_tried_again(dives, tmp_path, monkeypatch)
     def full(task):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dvl_calib_ros.fleet.one.open_recording", lambda *_: full(None))
+    monkeypatch.setattr("dvl_calib_ros.fleet_catalogue.recording_entry.open_recording", lambda *_: full(None))
     result = dc.fleet(dives / "auv2" / "late", tmp_path / "out", jobs=1)
     assert [each.why for each in result.persons] == ["OSError: [Errno 28] No space left on device"]
     monkeypatch.undo()

@@ -19,7 +19,7 @@ from ..calibration.extrinsics import Extrinsics
 from ..calibration.frames import Array
 from ..calibration.models import MODELS
 from ..errors import InputError
-from .one import HEADING_ERRORS, Row
+from .recording_entry import HEADING_ERRORS, Row
 
 DAY_NS = 86_400_000_000_000
 

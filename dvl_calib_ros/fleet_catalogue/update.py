@@ -15,10 +15,10 @@ from ..errors import InputError
 from ..files.output_paths import check_outputs
 from ..parallel import Lost, Workers, outcomes_as_done
 from ..verdict.answering import Answering
-from .catalogue import PAGE, SCHEMA, Catalogue, CataloguePart
-from .history import Catalogued, NeedsPerson, VehicleHistory, distinct, histories, need_person
-from .one import Task, entry_of, failed
-from .places import StoredRecording, as_text, recordings_in, vehicle_pattern
+from .parquet_parts import PAGE, SCHEMA, Catalogue, CataloguePart
+from .recording_entry import Task, entry_of, failed
+from .recording_search import StoredRecording, as_text, recordings_in, vehicle_pattern
+from .vehicle_history import Catalogued, NeedsPerson, VehicleHistory, distinct, histories, need_person
 
 # Answers of a comparison, the worst first
 WORDS = ("moved", "suspicious", "same")

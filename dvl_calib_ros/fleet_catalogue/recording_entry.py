@@ -23,7 +23,7 @@ from ..errors import InputError
 from ..recordings.recording import open_recording
 from ..replay.checked import checked_replay
 from ..replay.replay import Replayed, extrinsics_of_replay
-from .places import StoredRecording, as_text
+from .recording_search import StoredRecording, as_text
 
 _UNITS = {"°": "deg"}
 # `Estimate.heading_deviation`, in degrees; the last by the hour

@@ -16,7 +16,7 @@ from typing import Any
 
 from ..disk.atomic import check_folder_writable, save_bytes
 from ..errors import InputError
-from .one import Entry, Row
+from .recording_entry import Entry, Row
 
 ROWS, PAGE = "rows", "index.html"
 # Version of the schema: part of what says whether a recording is done
