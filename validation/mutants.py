@@ -93,7 +93,7 @@ MUTANTS = (
     ),
     Mutant(
         "tie of discovery",
-        "dvl_calib_ros/discovery/choose.py",
+        "dvl_calib_ros/discovery/topic_choice.py",
         "ranked.sort(key=lambda each: (each[0], each[1].topic))",
         "ranked.sort(key=lambda each: each[0])",
         (UNIT + "discovery/test_choose.py",),

@@ -40,10 +40,9 @@ from ..recordings.recording import Recording, open_recording
 from ..recordings.topic_preview import Look, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from . import choose
-from .clocks import FoundClocks, find_clocks, in_time
-from .gravity import Gravity
-from .heading_claim import believed_heading
+from . import topic_choice
+from .clock_offsets import FoundClocks, find_clocks, in_time
+from .gravity import Gravity, believed_heading
 from .transforms import FrameTree, Placed
 
 # A rotation found in the data below this is a misalignment, to be calibrated; above, the mounting is another one.
@@ -222,27 +221,33 @@ class _Search:
 
     def _topics(self) -> Topics:
         given, default = self._given, Topics()
-        dvl = self._named("dvl", given.dvl_topic) or choose.choose_dvl(self._seen, default.dvl, self._where)
-        self._notes += choose.other_dvls(self._seen, dvl, _difference)
+        dvl = self._named("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._seen, default.dvl, self._where)
+        self._notes += topic_choice.other_dvls(self._seen, dvl, _difference)
         gnss, imu = default.gnss, default.imu
         if given.gnss_topic is None:
-            chosen, said = choose.choose_reference(self._seen, default.gnss, dvl, _difference)
+            chosen, said = topic_choice.choose_reference(self._seen, default.gnss, dvl, _difference)
             gnss = chosen or default.gnss
             self._notes += said
-        elif given.gnss_topic != choose.NONE:
+        elif given.gnss_topic != topic_choice.NONE:
             gnss = self._named("gnss", given.gnss_topic) or gnss
         else:
-            gnss = choose.NONE
+            gnss = topic_choice.NONE
         if given.imu_topic is None:
-            imu = choose.choose_imu(self._seen, default.imu) or default.imu
+            imu = topic_choice.choose_imu(self._seen, default.imu) or default.imu
         else:
-            imu = choose.NONE if given.imu_topic == choose.NONE else self._named("imu", given.imu_topic) or imu
+            imu = (
+                topic_choice.NONE
+                if given.imu_topic == topic_choice.NONE
+                else self._named("imu", given.imu_topic) or imu
+            )
         return Topics(dvl, gnss, imu)
 
     def _named(self, role: str, name: str | None) -> str | None:
         if name is None:
             return None
-        return choose.checked_topic(f"--{role}-topic", name, choose.wanted_types(role), self._seen, self._where)
+        return topic_choice.checked_topic(
+            f"--{role}-topic", name, topic_choice.wanted_types(role), self._seen, self._where
+        )
 
     def _topics_said(self, topics: Topics) -> str:
         parts = []
@@ -356,7 +361,7 @@ class _Search:
             self._contradictions.append(finding("DVL_FRAME_NOT_OWN", topic=dvl.topic, frame=dvl.frame_id))
         placed = self._tree.placed(frame, base_frame)
         if placed is None and not self._is_body_or_earth(frame):
-            like = self._tree.likely(choose.DVL_WORDS)
+            like = self._tree.likely(topic_choice.DVL_WORDS)
             placed = None if like is None else self._tree.placed(like, base_frame)
             if placed is not None:
                 self._notes.append(finding("FRAME_NOT_IN_TREE", frame=frame, other=placed.frame))
@@ -615,7 +620,7 @@ class _Search:
         if not len(velocity):
             return
         mean = velocity.mean(axis=0)
-        if np.linalg.norm(mean) < STRAIGHT_SHARE * dvl.speed or dvl.speed < choose.MOVES_FROM:
+        if np.linalg.norm(mean) < STRAIGHT_SHARE * dvl.speed or dvl.speed < topic_choice.MOVES_FROM:
             return
         ahead = np.tile([np.linalg.norm(mean), 0.0, 0.0], (2, 1))
         rotation_dvl_from_body = best_rotation(np.tile(mean, (2, 1)), ahead, np.eye(3))

@@ -24,8 +24,8 @@ from ..recordings.topic_preview import Look
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
-from . import checks
-from .expected import Shown, expected
+from . import topic_checks
+from .expected_result import Shown, expected
 
 # A reference below this rate (Hz) leaves turns to a straight line; 1 Hz receivers are a little slow at times
 SLOW_REFERENCE = 0.8
@@ -183,20 +183,24 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     over_legs = reference is not None and _is_compared_over_legs(reference)
     found: list[Reason] = []
     for topic in streams.values():
-        found += checks.stamp_findings(topic) + checks.gap_findings(topic)
+        found += topic_checks.stamp_findings(topic) + topic_checks.gap_findings(topic)
     # where velocities and turns show how the clocks stand, it does not matter when messages arrived
     if not _has_error(found) and not _are_clocks_known(discovery):
-        found += checks.clock_findings(streams, discovery.parameters)
-    found += checks.velocity_findings(dvl, True)
+        found += topic_checks.clock_findings(streams, discovery.parameters)
+    found += topic_checks.velocity_findings(dvl, True)
     if reference is not None:
         if not _has_error(found):  # which would be why
-            found += checks.apart_findings(dvl, reference)
-        found += [] if over_legs else checks.velocity_findings(reference, False)
-        if not over_legs and len(reference) > checks.ENOUGH and checks.interval_s(reference) > 1.0 / SLOW_REFERENCE:
-            rate_hz = 1.0 / checks.interval_s(reference)
+            found += topic_checks.apart_findings(dvl, reference)
+        found += [] if over_legs else topic_checks.velocity_findings(reference, False)
+        if (
+            not over_legs
+            and len(reference) > topic_checks.ENOUGH
+            and topic_checks.interval_s(reference) > 1.0 / SLOW_REFERENCE
+        ):
+            rate_hz = 1.0 / topic_checks.interval_s(reference)
             found.append(finding("DOCTOR_SLOW_REFERENCE", topic=reference.topic, rate_hz=rate_hz))
     if imu is not None and discovery.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
-        found += checks.orientation_findings(imu)
+        found += topic_checks.orientation_findings(imu)
     if imu is None:
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
         what = "no lever arm is taken out or found" if reference is not None else "nothing tells the heading"
@@ -216,15 +220,15 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     elif not len(speed) or (speed > parameters.min_speed).mean() < MOVES_SHARE:
         found.append(finding("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
     elif reference is not None and not over_legs:
-        found += _disagreement(discovery, checks.shown_noise(reference.values) / float(np.median(speed)))
+        found += _disagreement(discovery, topic_checks.shown_noise(reference.values) / float(np.median(speed)))
     return sorted(found, key=lambda each: (not each.code.startswith(NO_IMU), each.severity is not Severity.ERROR))
 
 
 def _is_compared_over_legs(reference: Recorded) -> bool:
     """Whether a reference is positions that are too noisy, or too seldom, for velocities to be of use."""
     is_position = VELOCITY_TYPES[reference.msgtype].position is not None
-    is_noisy = len(reference) > 0 and checks.shown_noise(reference.values) > NOISY_MPS
-    return is_position and (is_noisy or checks.interval_s(reference) > SELDOM_S)
+    is_noisy = len(reference) > 0 and topic_checks.shown_noise(reference.values) > NOISY_MPS
+    return is_position and (is_noisy or topic_checks.interval_s(reference) > SELDOM_S)
 
 
 def _are_clocks_known(discovery: Discovery) -> bool:

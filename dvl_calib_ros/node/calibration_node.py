@@ -36,8 +36,8 @@ from ..calibration.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.positions import check_model
 from ..calibration.samples import DvlSample, VelocityFrame
 from ..calibration.water import Water
-from ..discovery.heading_claim import believed_heading
-from ..discovery.placement import Frames, not_default, placement
+from ..discovery.gravity import believed_heading
+from ..discovery.transforms import Frames, not_default, placement
 from ..disk.atomic import check_writable
 from ..errors import InputError
 from ..files.output_paths import check_outputs

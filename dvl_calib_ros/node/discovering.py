@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from rclpy.node import Node
 
 from ..calibration.parameters import Parameters
-from ..discovery.choose import may_be_dvl
+from ..discovery.topic_choice import may_be_dvl
 from ..errors import InputError
 
 if TYPE_CHECKING:

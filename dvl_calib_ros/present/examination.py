@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ..examination.examine import NO_IMU, Content, Examination
-from ..examination.expected import Shown
+from ..examination.expected_result import Shown
 from ..files.parameter_files import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity

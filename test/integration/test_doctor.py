@@ -24,7 +24,7 @@ from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, examine
-from dvl_calib_ros.examination.expected import EXPECTED_FROM_S
+from dvl_calib_ros.examination.expected_result import EXPECTED_FROM_S
 from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate

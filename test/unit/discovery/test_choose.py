@@ -7,7 +7,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.discovery.choose import choose_dvl, choose_imu, choose_reference, may_be_dvl
+from dvl_calib_ros.discovery.topic_choice import choose_dvl, choose_imu, choose_reference, may_be_dvl
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.recordings.topic_preview import Look, Survey
 
