@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from dvl_calib_ros.bag_replay.replay import BLOCK_SIZE
 from dvl_calib_ros.calibration import kalman
 from dvl_calib_ros.calibration.assembly import Assembler
 from dvl_calib_ros.calibration.bank import Group, groups_of
@@ -16,7 +17,6 @@ from dvl_calib_ros.calibration.observations import Observations
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.estimation import heave_joined
-from dvl_calib_ros.replay.replay import BLOCK_SIZE
 
 from . import Measurement, check_same
 

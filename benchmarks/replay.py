@@ -25,7 +25,7 @@ ROUNDS = 3
 _OURS = """
 from pathlib import Path
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.replay.replay import replay
+from dvl_calib_ros.bag_replay.replay import replay
 def work(bag):
     counts = replay([Path(bag)], Parameters()).result.counts
     return sum(counts[stream]["received"] for stream in ("dvl", "reference", "imu"))

@@ -12,6 +12,7 @@ from matplotlib.category import StrCategoryLocator
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
+from dvl_calib_ros.bag_replay.replay import Replayed, replay
 from dvl_calib_ros.calibration.comparison import Comparison, compare
 from dvl_calib_ros.calibration.extrinsics import Extrinsics, rotation_of
 from dvl_calib_ros.calibration.models import MODELS
@@ -37,7 +38,6 @@ from dvl_calib_ros.evaluation.results import (
     Trace,
 )
 from dvl_calib_ros.present.reports import write_replay_report
-from dvl_calib_ros.replay.replay import Replayed, replay
 from dvl_calib_ros.verdict.reasons import finding
 
 # One of each kind: most of a report's time goes into pictures of the models' estimates

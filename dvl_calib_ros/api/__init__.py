@@ -113,7 +113,7 @@ def replay(
     ----------
     The models M1 to M7 are those of Yampolsky and Klein, Information-Aided DVL Calibration; see the page Models.
     """
-    from ..replay.checked import checked_replay
+    from ..bag_replay.checked_replay import checked_replay
 
     paths = _paths(bags)
     recording, discovery = _discovered(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
@@ -159,12 +159,12 @@ def compare(
     InputError
         For what is no result file, holds no sample, is one of the others, or has nothing in common with them.
     """
+    from ..bag_replay.checked_replay import calibrated
+    from ..bag_replay.replay import extrinsics_of_replay
     from ..bags.files import is_bag
     from ..calibration.comparison import check_distinct
     from ..calibration.comparison import compare as run
     from ..files.mounting import load_extrinsics
-    from ..replay.compared import calibrated
-    from ..replay.replay import extrinsics_of_replay
 
     found = []
     for given in results:

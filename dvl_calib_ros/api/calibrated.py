@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..bag_replay.replay import Replayed
 from ..calibration.frames import Array
 from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.quantities import Quantity, quantities
 from ..discovery.discover import Discovery
 from ..errors import InputError
-from ..replay.replay import Replayed
 from ..verdict.reasons import Reason
 
 if TYPE_CHECKING:
@@ -313,7 +313,7 @@ class Calibration:
         dict
             As docs/json_schema.json describes.
         """
-        from ..replay.document import replay_document
+        from ..bag_replay.replay import replay_document
 
         return replay_document(self.replayed, models) | {"discovery": self.discovery.document()}
 

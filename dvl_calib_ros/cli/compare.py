@@ -76,7 +76,7 @@ def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
 
     if not is_bag(path):
         return load_extrinsics(path, name)
-    from ..replay.compared import calibrated
+    from ..bag_replay.checked_replay import calibrated
 
     parameters = common.load(arguments)
     recording = common.opened([path], parameters)

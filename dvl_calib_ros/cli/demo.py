@@ -20,8 +20,8 @@ from .reporting import add_report_option, report_writer
 from .watch import node_command
 
 if TYPE_CHECKING:
+    from ..bag_replay.replay import Replayed
     from ..calibration.results import Result
-    from ..replay.replay import Replayed
 
 BAG = "harbour_box"
 # What the bag was simulated with, see bags/README.md
@@ -112,8 +112,8 @@ def _truth() -> dict[str, float]:
 
 
 def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
+    from ..bag_replay.replay import replay
     from ..files.parameter_files import load_parameters
-    from ..replay.replay import replay
 
     return replay([bag], load_parameters(None, [latency]), with_history=with_history)
 

@@ -15,8 +15,8 @@ from . import common
 from .reporting import add_report_option, report_writer
 
 if TYPE_CHECKING:
+    from ..bag_replay.replay import Replayed
     from ..discovery.discover import Discovery
-    from ..replay.replay import Replayed
     from ..verdict.reasons import Reason
 
 
@@ -35,11 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Look into the bags, replay them, save, print."""
+    from ..bag_replay.checked_replay import checked_replay
+    from ..bag_replay.replay import replay_document
     from ..calibration.models import MODELS
     from ..errors import InputError
     from ..files.result_file import result_document, save_result
-    from ..replay.checked import checked_replay
-    from ..replay.document import replay_document
 
     asked = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
     models = list(MODELS) if arguments.verbose or not asked else asked

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..bag_replay.replay import replay
 from ..calibration.calibrator import Calibrator
 from ..calibration.delay.hold_out import Terms, ThinnedRecording
 from ..calibration.error_model import correction_matrix
@@ -28,7 +29,6 @@ from ..recordings.recording import open_recording
 from ..recordings.requirements import hold_the_same
 from ..recordings.topic_messages import Recorded
 from ..recordings.topics import Topics
-from ..replay.replay import replay
 from ..verdict.answering import Answering
 from .metrics import RunMoments, vrmse
 from .results import Failure

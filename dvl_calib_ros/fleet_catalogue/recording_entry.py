@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from ..bag_replay.checked_replay import checked_replay
+from ..bag_replay.replay import Replayed, extrinsics_of_replay
 from ..calibration.extrinsics import Extrinsics
 from ..calibration.parameters import Parameters
 from ..calibration.quantities import quantities
@@ -21,8 +23,6 @@ from ..calibration.water import Water
 from ..discovery.discover import Given, discover
 from ..errors import InputError
 from ..recordings.recording import open_recording
-from ..replay.checked import checked_replay
-from ..replay.replay import Replayed, extrinsics_of_replay
 from .recording_search import StoredRecording, as_text
 
 _UNITS = {"°": "deg"}

@@ -8,12 +8,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..bag_replay.replay import Replayed
 from ..calibration.error_model import corrected_mounting
 from ..calibration.frames import Array, rpy_from_rotation
 from ..calibration.mounting_pose import rpy_std
 from ..calibration.parameters import Parameters
 from ..calibration.quantities import quantities
-from ..replay.replay import Replayed
 
 _COLOURS = ("#1f6fb2", "#2a7f62", "#c0392b")
 # Share of the run at its beginning that does not set the limits: the prior's width would

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..bag_replay.replay import Replayed
 from ..calibration.frames import FLU_FROM_FRD, rpy_from_rotation
 from ..calibration.models import MODELS
 from ..calibration.navigation import in_words, metres
@@ -23,7 +24,6 @@ from ..calibration.samples import VelocityFrame
 from ..calibration.verification import Verification
 from ..files.result_file import result_document
 from ..files.urdf import origin_tag
-from ..replay.replay import Replayed
 from ..verdict.kinds import Severity
 from .document import (
     CELL_KINDS,

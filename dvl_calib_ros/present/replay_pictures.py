@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from ..bag_replay.replay import Replayed
+from ..bag_replay.run_history import ModelHistory, RunHistory
 from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
-from ..replay.recorder import ModelHistory, RunHistory
-from ..replay.replay import Replayed
 from . import replay_figures as figures
 from .style import Picture, picture
 from .terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of

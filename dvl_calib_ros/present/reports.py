@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..bag_replay.replay import Replayed
 from ..calibration.comparison import Comparison
 from ..disk.atomic import save_bytes
-from ..replay.replay import Replayed
 from .comparison_figures import trend_png
 from .documents import DOCUMENTS
 from .page import write_document

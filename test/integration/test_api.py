@@ -250,7 +250,7 @@ def test_the_interface_is_what_the_package_says_it_is():
         assert callable(getattr(dc, name)) and getattr(dc, name).__doc__
     assert set(PUBLIC) <= set(dir(dc))
     # in whatever order subpackages are imported
-    script = "import dvl_calib_ros.replay.replay, dvl_calib_ros as dc; assert callable(dc.replay)"
+    script = "import dvl_calib_ros.bag_replay.replay, dvl_calib_ros as dc; assert callable(dc.replay)"
     assert subprocess.run([sys.executable, "-c", script], cwd=ROOT).returncode == 0
 
 

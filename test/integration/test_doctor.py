@@ -16,6 +16,7 @@ from conftest import ROOT
 from io_fixtures import TOPICS, mcap_bytes, write_bag
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.calibration.observability import MEASURES_VERTICAL
@@ -25,7 +26,6 @@ from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, examine
 from dvl_calib_ros.examination.expected_result import EXPECTED_FROM_S
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

@@ -9,13 +9,13 @@ import pytest
 from io_fixtures import rewrite
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.discovery.discover import Given, discover
 from dvl_calib_ros.files.parameter_files import load_parameters
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from io_fixtures import live
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.files.mounting import load_calibrated_mounting
 from dvl_calib_ros.files.result_file import result_document, save_result
 from dvl_calib_ros.recordings.recording import open_recording
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors

@@ -15,6 +15,7 @@ from conftest import ROOT
 from position_fixtures import USBL, write_positions
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import WITH_POSITIONS
 from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
@@ -25,7 +26,6 @@ from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.messages.type_recognition import open_bags
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
-from dvl_calib_ros.replay.replay import replay
 from validation.positions import Noise, Truth, driven
 
 TRUTH = Truth((0.0, 0.01, 0.03), 0.006, (0.5, 0.0, -0.3), 0.5)

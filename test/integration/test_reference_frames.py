@@ -10,6 +10,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 from stacks import DVL_STD, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import ReferenceSample, VelocityFrame
@@ -17,7 +18,6 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.discovery.discover import Given, discover
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal, frame_named
 from dvl_calib_ros.messages.drivers import VELOCITY_TYPES
-from dvl_calib_ros.replay.replay import replay
 
 
 def odometry_down(told: Told, frame: str, child: str, rates: bool) -> None:

@@ -13,12 +13,12 @@ from conftest import few, made_once
 from scipy.spatial.transform import Rotation
 from stacks import A50, LEVER_ARM, STACKS, TWIST, YAW_45, Stack, Told, true_mounting
 
+from dvl_calib_ros.bag_replay.replay import Replayed, replay
 from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy
 from dvl_calib_ros.calibration.observability import body_angle_std
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.discovery.discover import Discovery, Given, discover
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.replay.replay import Replayed, replay
 
 ANSWERED = [name for name, stack in STACKS.items() if not stack.missing]
 WAITED_FOR = ("bluerov_with_mavros", "water_linked_driver_at_45_degrees", "imu_on_its_side", "simulator_with_truth")

@@ -13,12 +13,12 @@ from io_fixtures import live, write_bag
 from scipy.spatial.transform import Rotation
 from yaml_text import written
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.files.result_file import result_document, result_text
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.verdict.kinds import Severity

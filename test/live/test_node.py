@@ -29,6 +29,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros import NODE, World, refused_at_start, until
 from std_srvs.srv import Trigger
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
@@ -37,7 +38,6 @@ from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.files.result_file import result_document, save_result
 from dvl_calib_ros.node.calibration_node import CalibrationNode
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 

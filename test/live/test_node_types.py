@@ -20,6 +20,7 @@ from rclpy.parameter import Parameter
 from ros import refused_at_start, until
 from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here, play, received
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import WITH_POSITIONS
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -32,7 +33,6 @@ from dvl_calib_ros.node import calibration_node
 from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
 from dvl_calib_ros.node.message_types import message_class
-from dvl_calib_ros.replay.replay import replay
 from validation.positions import Truth, driven
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros import parallel
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, rpy_from_rotation
 from dvl_calib_ros.calibration.models import MODELS
@@ -36,7 +37,6 @@ from dvl_calib_ros.evaluation.trajectories import Trajectory, load_folder, own_t
 from dvl_calib_ros.logs.dvl_log import angular_velocities
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording
 from dvl_calib_ros.parallel import Workers, run_all
-from dvl_calib_ros.replay.replay import replay
 
 pytestmark = pytest.mark.slow
 

@@ -29,6 +29,7 @@ from hypothesis import strategies as st
 from io_fixtures import estimates, mcap_bytes, raw, replayed, run, steady_run, write_bag
 from rosbags.rosbag2 import StoragePlugin
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.frames import rotation_from_quaternion, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -44,7 +45,6 @@ from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.messages.type_recognition import recognised
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.recordings.topics import Topics
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.recorded import MotionSource, recorded_motion
 
 SECOND = 10**9

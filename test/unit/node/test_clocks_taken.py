@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from runs import ONE_HERTZ, MatchedRun, make_samples
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
@@ -19,7 +20,6 @@ from dvl_calib_ros.messages import live_feed
 from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.node.late_clocks import LateClocks
 from dvl_calib_ros.recordings.topics import Topics
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors

@@ -16,6 +16,8 @@ from command_line import fail, in_fresh_process, succeed
 from io_fixtures import run, steady_run, write_bag
 from report_fixtures import FEW, Page, assert_described, drawn, evaluation, recorded, replay_page
 
+from dvl_calib_ros.bag_replay.replay import replay
+from dvl_calib_ros.bag_replay.run_history import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
@@ -26,8 +28,6 @@ from dvl_calib_ros.present.replay_figures import ModelLine, estimate_over_time, 
 from dvl_calib_ros.present.reports import write_replay_report, write_report
 from dvl_calib_ros.present.style import MODEL_STYLES, new_figure
 from dvl_calib_ros.present.time_axis import TimeAxis
-from dvl_calib_ros.replay.recorder import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.verdict.kinds import Severity
 
 SECOND = 1_000_000_000

@@ -12,6 +12,7 @@ from conftest import ROOT
 from io_fixtures import raw, storage_file, write_bag
 from mcap.reader import make_reader
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.error_model import distort
 from dvl_calib_ros.calibration.frames import ENU_FROM_NED, rotation_from_quaternion, rotation_from_rpy
@@ -21,7 +22,6 @@ from dvl_calib_ros.effects.base import ActsOn, ClockEffect, Effect, EffectInput
 from dvl_calib_ros.effects.composition import Injection
 from dvl_calib_ros.effects.registry import EFFECTS, OWN
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.replay.replay import replay
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.recorded import MotionSource, recorded_motion
 from dvl_calib_ros.simulation.scenario import Scenario, simulate

@@ -1,34 +1,40 @@
 """The calibration over recorded bags: the same estimator as the node's, fed from files.
 
 (Long, because what is asked of a bag before it is replayed, and said of it after, belongs to the same door.)
+
+A replay as plain data: what `replay --json` writes, but for what discovery says.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .. import __version__
 from ..calibration.advice import data_advice, gate_advice, message_advice, reference_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
+from ..calibration.comparison_words import comparison_document
 from ..calibration.doubts import doubts
 from ..calibration.extrinsics import Extrinsics, dvl_in_words, extrinsics_of
 from ..calibration.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.models import MODELS
-from ..calibration.navigation import Navigation, objections
+from ..calibration.navigation import Navigation, navigation_document, objections
 from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Day, Result
 from ..calibration.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.screening import are_valid_velocities, unit_quaternions
-from ..calibration.water import CauseOfScale, Water, cause_of_scale
+from ..calibration.verification import verification_document
+from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_document
 from ..calibration.worth import drift_left_open
 from ..errors import InputError
-from ..files.result_file import load_initial_calibration
+from ..files.result_file import days_document, estimate_document, load_initial_calibration
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import TWIST_TYPE
 from ..recordings.recording import Recording, open_recording
@@ -36,7 +42,7 @@ from ..recordings.requirements import check_topics, missing_imu
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
-from .recorder import Recorder, RunHistory
+from .run_history import Recorder, RunHistory
 
 # Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
 BLOCK_SIZE = 2048
@@ -293,3 +299,34 @@ def _remedy(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:
 
 def _counted(counts: Any) -> str:
     return ", ".join(f"{value} {name}" for name, value in counts.items() if value) or "none received"
+
+
+def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]:
+    """Plain data of a replay, of the models asked for. Segments are in s since the first DVL sample."""
+    result = replayed.result
+    told = [name for name in models if name in result.estimates]
+    segments = []
+    with suppress(TypeError):  # no sample at all: first_ns is None and there are no segments
+        ends = [segment.from_ns for segment in result.segments[1:]] + [result.last_ns]
+        segments = [
+            {
+                "from_s": (segment.from_ns - result.first_ns) * 1e-9,  # type: ignore[operator]
+                "to_s": (end - result.first_ns) * 1e-9,  # type: ignore[operator]
+                "model": segment.model,
+            }
+            for segment, end in zip(result.segments, ends, strict=True)
+        ]
+    return {
+        "models": {name: estimate_document(result.estimates[name]) for name in told},
+        "verification": {name: verification_document(result.verifications[name]) for name in told},
+        "selected": segments,
+        **days_document(result),
+        "counts": {name: dict(counts) for name, counts in result.counts.items()},
+        "parameters": dict(result.parameters),
+        "version": __version__,
+        "dvl": {"type": replayed.dvl_type, "turned_from_frd": replayed.turned},
+        "findings": [found.as_dict() for found in replayed.findings],
+        "recordings": None if replayed.recordings is None else comparison_document(replayed.recordings),
+        "navigation": navigation_document(replayed.navigation),
+        **({} if replayed.water is None else {"water": water_document(replayed.water)}),
+    }
