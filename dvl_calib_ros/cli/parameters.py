@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> None:
 
         raise InputError("--joint goes with --urdf; name that, too")
     if arguments.effects:
-        from ..effects.table import effect_table
+        from ..effects.registry import effect_table
 
         print(effect_table(), end="")
         return

@@ -26,7 +26,6 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration.frames import Array, cross, skew
 from ..calibration.samples import VelocityFrame
-from ..effects.along_time import slopes
 from ..effects.base import (
     ActsOn,
     ClockEffect,
@@ -38,6 +37,7 @@ from ..effects.base import (
     MountingEffect,
 )
 from ..effects.composition import Injection, late, traces, turns
+from ..effects.recursion import slopes
 from .curve import FAST_ENOUGH_S, Curve
 from .noise import segments_of
 from .recordings import RecordedStreams

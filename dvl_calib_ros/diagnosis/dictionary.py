@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..calibration.frames import Array
-from ..effects.along_time import recursion
+from ..effects.recursion import recursion
 from .composed import Grid, Problem, Seen
 
 TIME_KNOTS = 7

@@ -17,7 +17,7 @@ from scipy.fft import fft
 
 from ..calibration.frames import Array
 from ..calibration.robust import robust_std
-from ..effects.along_time import recursion
+from ..effects.recursion import recursion
 from .least_squares import root_of_inverse
 
 # Innovations beyond so many standard deviations pull no harder than at it (Huber)

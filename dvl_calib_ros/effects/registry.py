@@ -4,13 +4,16 @@ A package brings an effect by an entry point of the group `dvl_calib_ros.effects
 
     [project.entry-points."dvl_calib_ros.effects"]
     cable_drag = "my_vehicle.effects:CableDrag"
+
+The table of effects in the documentation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property, lru_cache
 from importlib.metadata import EntryPoint, entry_points
+from itertools import chain, groupby
 from typing import Generic, TypeVar
 
 from ..errors import InputError
@@ -135,3 +138,24 @@ def _named(point: EntryPoint) -> str:
 
 EFFECTS: Registry[Effect] = Registry(Effect)  # type: ignore[type-abstract]
 NOISE_EFFECTS: Registry[NoiseEffect] = Registry(NoiseEffect)  # type: ignore[type-abstract]
+
+
+def effect_table() -> str:
+    """Every effect with its parameters, in Markdown."""
+    lines = ["| effect | is | parameters | needs | looks like |", "|---|---|---|---|---|"]
+    lines += [_row(effect) for effect in chain(EFFECTS.values(), NOISE_EFFECTS.values())]
+    return "\n".join(lines) + "\n"
+
+
+def _row(effect: AnyEffect) -> str:
+    by_unit = [
+        f"{_codes(parameter.name for parameter in group)} {unit}"
+        for unit, group in groupby(effect.parameters, lambda parameter: parameter.unit)
+    ]
+    summary = effect.summary.replace("|", "\\|")  # a bar would end the cell
+    needs = ", ".join(sorted(need.value for need in effect.needs))
+    return f"| `{effect.name}` | {summary} | {', '.join(by_unit)} | {needs} | {_codes(effect.confounded_with)} |"
+
+
+def _codes(names: Iterable[str]) -> str:
+    return " ".join(f"`{name}`" for name in names)

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..calibration.frames import Array
 from ..calibration.register.coarse import LONGEST_S
 from ..calibration.samples import VelocityFrame
-from .along_time import recursion, slopes
 from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory
+from .recursion import recursion, slopes
 
 # As far as clocks are registered
 LONGEST_OFFSET_S = LONGEST_S

@@ -18,8 +18,7 @@ from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.effects import registry
 from dvl_calib_ros.effects.base import ActsOn, Effect, EffectInput, EffectNeeds
-from dvl_calib_ros.effects.registry import EFFECTS, NOISE_EFFECTS, OWN
-from dvl_calib_ros.effects.table import effect_table
+from dvl_calib_ros.effects.registry import EFFECTS, NOISE_EFFECTS, OWN, effect_table
 from dvl_calib_ros.effects.timing import lag_error
 from dvl_calib_ros.errors import InputError
 
