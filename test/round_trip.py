@@ -24,15 +24,15 @@ from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.cli.common import write_json
 from dvl_calib_ros.diagnosis.results import diagnosis_document
-from dvl_calib_ros.export.description import load_description
-from dvl_calib_ros.export.simulator import export
-from dvl_calib_ros.export.simulators import SIMULATORS
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.simulation.waves import Waves
+from dvl_calib_ros.simulator_export.dvl_description import load_description
+from dvl_calib_ros.simulator_export.registry import SIMULATORS
+from dvl_calib_ros.simulator_export.writer import export
 from dvl_calib_ros.unpaired.compare import compare_logs
 from dvl_calib_ros.unpaired.logs import Log, RecordedSide, read_log
 

@@ -36,11 +36,11 @@ if TYPE_CHECKING:
     from ..calibration.comparison import Comparison
     from ..evaluation.bags import CrossCheck
     from ..evaluation.results import Evaluation
-    from ..export.simulator import Export
     from ..files.apply import Applied
     from ..fleet_catalogue.update import Fleet
     from ..instruments.settings import InstrumentSettings
     from ..logs.trajectories import Imported
+    from ..simulator_export.writer import Export
     from ..unpaired.results import UnpairedComparison
     from ..unpaired.rounds import ClosedGap
 
@@ -628,7 +628,7 @@ def export(simulator: str, source: StrPath, output: StrPath) -> Export:
     InputError
         For another simulator, a source that is none of these, or a file that cannot be written.
     """
-    from ..export.simulators import write_settings
+    from ..simulator_export.registry import write_settings
 
     return write_settings(simulator, Path(source), Path(output))
 

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 from . import common
 
 if TYPE_CHECKING:
-    from ..export.simulator import Export
+    from ..simulator_export.writer import Export
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    from ..export.simulators import SIMULATORS
+    from ..simulator_export.registry import SIMULATORS
 
     parser.add_argument("simulator", choices=tuple(SIMULATORS), metavar="SIMULATOR", help=", ".join(SIMULATORS))
     parser.add_argument(
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Read, write both files, print."""
-    from ..export.simulators import missing_beside, write_settings
+    from ..simulator_export.registry import missing_beside, write_settings
 
     missing = missing_beside(arguments.output)
     beside = {} if missing is None else {"--output, for what is missing,": missing}

@@ -160,8 +160,8 @@ def _defaults() -> argparse.Namespace:
 
 def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace, scenario: Scenario) -> Scenario:
     from ..errors import InputError
-    from ..export.description import load_description
     from ..simulation.diagnosed import with_dvl
+    from ..simulator_export.dvl_description import load_description
 
     for name in OF_THE_DVL:
         if getattr(arguments, name) != getattr(defaults, name):

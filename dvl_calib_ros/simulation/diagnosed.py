@@ -9,7 +9,7 @@ from ..effects.base import AnyEffect
 from ..effects.composition import Injection
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
-from ..export.description import NOT_EXPLAINED, DvlDescription, Other
+from ..simulator_export.dvl_description import NOT_EXPLAINED, DvlDescription, Other
 from .scenario import Scenario
 from .sensors import JANUS_FROM_VERTICAL, DvlErrors
 

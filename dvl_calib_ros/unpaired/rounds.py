@@ -22,12 +22,12 @@ from ..disk.text_files import write_json
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..errors import InputError
-from ..export.description import load_description
 from ..recordings.recording import open_recording
 from ..recordings.topics import Topics
 from ..simulation.diagnosed import with_dvl
 from ..simulation.recorded import MotionSource
 from ..simulation.scenario import Scenario, write_bag
+from ..simulator_export.dvl_description import load_description
 from ..verdict.answering import Answering
 from ..verdict.reasons import Reason, finding
 from .compare import compare, compare_logs

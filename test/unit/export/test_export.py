@@ -17,9 +17,9 @@ from scipy.spatial.transform import Rotation
 from yaml_text import parsed, written
 
 from dvl_calib_ros.disk.yaml_files import load_yaml
-from dvl_calib_ros.export.description import DvlDescription, Other, load_description
-from dvl_calib_ros.export.simulator import export
-from dvl_calib_ros.export.simulators import SIMULATORS
+from dvl_calib_ros.simulator_export.dvl_description import DvlDescription, Other, load_description
+from dvl_calib_ros.simulator_export.registry import SIMULATORS
+from dvl_calib_ros.simulator_export.writer import export
 
 STD = (0.0103, 0.0103, 0.00266)  # of beams 20 degrees from vertical with 5 mm/s each
 FOUND = DvlDescription(

@@ -16,7 +16,6 @@ from dvl_calib_ros.calibration.samples import DvlSample
 from dvl_calib_ros.effects.base import NoiseEffect
 from dvl_calib_ros.effects.registry import EFFECTS, NOISE_EFFECTS
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.export.description import DvlDescription, Other
 from dvl_calib_ros.messages.decode import MessageDecoder
 from dvl_calib_ros.messages.drivers import DVL_TYPES
 from dvl_calib_ros.node.dvl_message import fill
@@ -26,6 +25,7 @@ from dvl_calib_ros.simulation.live import Follower, MotionSample, in_order
 from dvl_calib_ros.simulation.scenario import Scenario, motion_of, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.simulation.waves import Waves
+from dvl_calib_ros.simulator_export.dvl_description import DvlDescription, Other
 
 SCENARIO = Scenario(
     trajectory="free", seconds=16.0, seed=3, waves=Waves(0.3, 5.0), gnss_std=0.02, outages=((6.0, 8.0),),

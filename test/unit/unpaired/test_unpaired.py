@@ -21,13 +21,13 @@ from dvl_calib_ros.diagnosis.results import diagnosis_document
 from dvl_calib_ros.disk.text_files import write_json
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
-from dvl_calib_ros.export.description import load_description
 from dvl_calib_ros.present.documents import DOCUMENTS
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
+from dvl_calib_ros.simulator_export.dvl_description import load_description
 from dvl_calib_ros.unpaired.compare import compare, compare_logs
 from dvl_calib_ros.unpaired.logs import Log, RecordedSide, is_copied, read_log
 from dvl_calib_ros.unpaired.noise import Scatter, at_one_motion, block_levels, slopes_of

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 
-from .description import DvlDescription
-from .simulator import Settings, Simulator, beams_of, comment, numbers, split
-from .xml_text import xml_text
+from .dvl_description import DvlDescription
+from .writer import Settings, Simulator, beams_of, comment, numbers, split, xml_text
 
 XACRO = "http://www.ros.org/wiki/xacro"
 TITLE = "DAVE"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 
-from .description import DvlDescription
-from .simulator import Settings, Simulator, beams_of, split
+from .dvl_description import DvlDescription
+from .writer import Settings, Simulator, beams_of, split
 
 TITLE = "HoloOcean"
 ELEVATION_DEG = 22.5

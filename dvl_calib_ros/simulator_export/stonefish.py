@@ -7,9 +7,8 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from ..calibration.frames import FLU_FROM_FRD, rotation_from_rpy, rpy_from_rotation
-from .description import DvlDescription
-from .simulator import Settings, Simulator, comment, equal_std, numbers, split
-from .xml_text import xml_text
+from .dvl_description import DvlDescription
+from .writer import Settings, Simulator, comment, equal_std, numbers, split, xml_text
 
 TITLE = "Stonefish"
 DEFAULTS = {

@@ -15,8 +15,8 @@ import numpy as np
 import yaml
 
 from ..calibration.frames import rotation_from_rpy
-from .description import DvlDescription
-from .simulator import Settings, Simulator, beams_of, comment, mixed_scale, split
+from .dvl_description import DvlDescription
+from .writer import Settings, Simulator, beams_of, comment, mixed_scale, split
 
 TITLE = "DVL-Simulator"
 # Of the seeds from 1 on the first whose draws are all far from the middle, where an interval would have to be large

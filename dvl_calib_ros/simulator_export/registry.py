@@ -10,8 +10,8 @@ from ..disk.atomic import own_stream, save_all
 from ..disk.text_files import as_json
 from ..errors import InputError
 from . import dave, dvl_simulator, gazebo, holoocean, stonefish, uuv_simulator
-from .description import load_description
-from .simulator import Export, Simulator, export, export_document
+from .dvl_description import load_description
+from .writer import Export, Simulator, export, export_document
 
 SIMULATORS: Mapping[str, Simulator] = {
     "gazebo": gazebo.SIMULATOR,

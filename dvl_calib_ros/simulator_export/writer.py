@@ -1,15 +1,19 @@
-"""What a simulator can be told of a DVL, and what stays: the form that every writer has."""
+"""What a simulator can be told of a DVL, and what stays: the form that every writer has.
+
+XML as text.
+"""
 
 from __future__ import annotations
 
 import math
+import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from .description import NOT_EXPLAINED, DvlDescription
+from .dvl_description import NOT_EXPLAINED, DvlDescription
 
 # Noise of one axis that is off by less is not worth telling, as a share of the noise of all
 SAME_NOISE = 0.2
@@ -221,3 +225,9 @@ def comment(title: str, description: DvlDescription, found: Mapping[str, Any], o
     while "--" in text:
         text = text.replace("--", "- -")
     return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
+
+
+def xml_text(root: ET.Element) -> str:
+    """A document with a declaration, indented."""
+    ET.indent(root, space="  ")
+    return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 
-from .description import DvlDescription
-from .simulator import Settings, Simulator, comment, equal_std, numbers, split
-from .xml_text import xml_text
+from .dvl_description import DvlDescription
+from .writer import Settings, Simulator, comment, equal_std, numbers, split, xml_text
 
 XACRO = "http://www.ros.org/wiki/xacro"
 TITLE = "UUV Simulator"
