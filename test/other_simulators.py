@@ -20,8 +20,7 @@ from yaml_text import parsed
 from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.messages.encode import SampleWriter
-from dvl_calib_ros.simulation.trajectories import Motion, make_motion
-from dvl_calib_ros.simulation.waves import Waves, add_waves
+from dvl_calib_ros.simulation.trajectories import Motion, Waves, add_waves, make_motion
 
 GZ = "{http://gazebosim.org/schema}"
 XACRO = "{http://www.ros.org/wiki/xacro}"

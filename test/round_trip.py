@@ -29,7 +29,7 @@ from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
-from dvl_calib_ros.simulation.waves import Waves
+from dvl_calib_ros.simulation.trajectories import Waves
 from dvl_calib_ros.simulator_export.dvl_description import load_description
 from dvl_calib_ros.simulator_export.registry import SIMULATORS
 from dvl_calib_ros.simulator_export.writer import export

@@ -99,10 +99,10 @@ def run(arguments: argparse.Namespace) -> None:
     from ..bags.writer import Compression, Storage
     from ..calibration.samples import VelocityFrame
     from ..simulation.injection import injection
-    from ..simulation.recorded import MotionSource
+    from ..simulation.recorded_motion import MotionSource
     from ..simulation.scenario import Scenario, write_bag
     from ..simulation.sensors import DvlErrors, ImuErrors
-    from ..simulation.waves import Waves
+    from ..simulation.trajectories import Waves
 
     _check(arguments)
     defaults = _defaults()
@@ -160,7 +160,7 @@ def _defaults() -> argparse.Namespace:
 
 def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace, scenario: Scenario) -> Scenario:
     from ..errors import InputError
-    from ..simulation.diagnosed import with_dvl
+    from ..simulation.found_effects import with_dvl
     from ..simulator_export.dvl_description import load_description
 
     for name in OF_THE_DVL:

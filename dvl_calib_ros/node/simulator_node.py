@@ -29,7 +29,7 @@ from ..errors import InputError
 from ..messages.decode import stamp_ns
 from ..messages.drivers import TWIST_TYPE, TYPES_OF, VELOCITY_TYPES
 from ..messages.encode import FRAME_IDS
-from ..simulation.live import Follower, MotionSample, Sample, in_order, shifted
+from ..simulation.live_simulation import Follower, MotionSample, Sample, in_order, shifted
 from ..simulation.scenario import START_NS, Scenario, simulate
 from .answering import AnsweringNode
 from .dvl_message import fill

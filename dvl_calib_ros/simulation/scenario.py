@@ -20,7 +20,7 @@ from ..effects.base import ActsOn, EffectInput
 from ..effects.composition import Injection, at_dvl, late, traces, turns
 from ..messages.encode import SampleWriter
 from .injection import disturbed, injection_document
-from .recorded import MotionSource, recorded_motion
+from .recorded_motion import MotionSource, recorded_motion
 from .sensors import (
     DvlErrors,
     ImuErrors,
@@ -30,8 +30,7 @@ from .sensors import (
     measure_gnss,
     measure_imu,
 )
-from .trajectories import Motion, make_motion
-from .waves import Waves, add_waves
+from .trajectories import Motion, Waves, add_waves, make_motion
 
 MOTION_RATE_HZ = 100.0
 DEFAULT_SECONDS = 600.0

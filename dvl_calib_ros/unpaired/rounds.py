@@ -24,8 +24,8 @@ from ..effects.registry import EFFECTS
 from ..errors import InputError
 from ..recordings.recording import open_recording
 from ..recordings.topics import Topics
-from ..simulation.diagnosed import with_dvl
-from ..simulation.recorded import MotionSource
+from ..simulation.found_effects import with_dvl
+from ..simulation.recorded_motion import MotionSource
 from ..simulation.scenario import Scenario, write_bag
 from ..simulator_export.dvl_description import load_description
 from ..verdict.answering import Answering

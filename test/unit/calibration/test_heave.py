@@ -14,7 +14,7 @@ from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
 from dvl_calib_ros.evaluation.trajectories import Trajectory
 from dvl_calib_ros.simulation.scenario import Scenario, motion_of, simulate
-from dvl_calib_ros.simulation.waves import Waves
+from dvl_calib_ros.simulation.trajectories import Waves
 
 SECOND_NS = 1_000_000_000
 PARAMETERS = Parameters()

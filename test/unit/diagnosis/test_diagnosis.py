@@ -58,7 +58,7 @@ from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Run, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
-from dvl_calib_ros.simulation.waves import Waves
+from dvl_calib_ros.simulation.trajectories import Waves
 
 pytestmark = pytest.mark.slow
 

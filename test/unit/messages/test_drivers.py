@@ -45,7 +45,7 @@ from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.messages.type_recognition import recognised
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.recordings.topics import Topics
-from dvl_calib_ros.simulation.recorded import MotionSource, recorded_motion
+from dvl_calib_ros.simulation.recorded_motion import MotionSource, recorded_motion
 
 SECOND = 10**9
 MAKERS = {version: Maker(version) for version in A50_DEFINITIONS}

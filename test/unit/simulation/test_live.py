@@ -19,12 +19,12 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.decode import MessageDecoder
 from dvl_calib_ros.messages.drivers import DVL_TYPES
 from dvl_calib_ros.node.dvl_message import fill
-from dvl_calib_ros.simulation.diagnosed import with_dvl
+from dvl_calib_ros.simulation.found_effects import with_dvl
 from dvl_calib_ros.simulation.injection import Injection, injection
-from dvl_calib_ros.simulation.live import Follower, MotionSample, in_order
+from dvl_calib_ros.simulation.live_simulation import Follower, MotionSample, in_order
 from dvl_calib_ros.simulation.scenario import Scenario, motion_of, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
-from dvl_calib_ros.simulation.waves import Waves
+from dvl_calib_ros.simulation.trajectories import Waves
 from dvl_calib_ros.simulator_export.dvl_description import DvlDescription, Other
 
 SCENARIO = Scenario(

@@ -23,11 +23,10 @@ from dvl_calib_ros.effects.composition import Injection
 from dvl_calib_ros.effects.registry import EFFECTS, OWN
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.simulation.injection import injection
-from dvl_calib_ros.simulation.recorded import MotionSource, recorded_motion
+from dvl_calib_ros.simulation.recorded_motion import MotionSource, recorded_motion
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors, ImuErrors, equivalent_error_terms
-from dvl_calib_ros.simulation.trajectories import FREE_SPEEDS_MPS, TRAJECTORIES, make_motion
-from dvl_calib_ros.simulation.waves import Waves, add_waves
+from dvl_calib_ros.simulation.trajectories import FREE_SPEEDS_MPS, TRAJECTORIES, Waves, add_waves, make_motion
 
 BAGS = ROOT / "bags"
 QUIET = {"gnss_std": 0.0, "seconds": 60.0, "mounting_rpy": (0.1, -0.2, 0.7), "trajectory": "figure8"}
