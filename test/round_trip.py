@@ -33,8 +33,8 @@ from dvl_calib_ros.simulation.trajectories import Waves
 from dvl_calib_ros.simulator_export.dvl_description import load_description
 from dvl_calib_ros.simulator_export.registry import SIMULATORS
 from dvl_calib_ros.simulator_export.writer import export
-from dvl_calib_ros.unpaired.compare import compare_logs
-from dvl_calib_ros.unpaired.logs import Log, RecordedSide, read_log
+from dvl_calib_ros.unpaired.both_sides import Log, RecordedSide, read_log
+from dvl_calib_ros.unpaired.comparison import compare_logs
 
 SECONDS = 240.0
 # A number of the log that is further from the source's than that, in its own standard deviations, is another one. Of

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from ..logs.trajectories import Imported
     from ..simulator_export.writer import Export
     from ..unpaired.results import UnpairedComparison
-    from ..unpaired.rounds import ClosedGap
+    from ..unpaired.simulator_rounds import ClosedGap
 
 __all__ = [
     "Calibration",
@@ -329,8 +329,8 @@ def diagnose(
         for each in ([bags] if simulator is None else [bags, simulator])
     ]
     if simulator is not None:
-        from ..unpaired.logs import RecordedSide
-        from ..unpaired.rounds import against
+        from ..unpaired.both_sides import RecordedSide
+        from ..unpaired.simulator_rounds import against
 
         real, made = (RecordedSide(recording, found.parameters, found.topics) for recording, found in sides)
         return against(real, made, rounds, None if keep is None else Path(keep))

@@ -50,7 +50,7 @@ def _plain(result: Any) -> Callable[[], Any]:
     from ..evaluation.documents import evaluation_document
     from ..evaluation.results import Evaluation
     from ..unpaired.results import UnpairedComparison, unpaired_document
-    from ..unpaired.rounds import ClosedGap, closed_gap_document
+    from ..unpaired.simulator_rounds import ClosedGap, closed_gap_document
 
     if isinstance(result, Evaluation):
         return lambda: evaluation_document(result)

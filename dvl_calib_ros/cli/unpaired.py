@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from ..discovery.discover import Discovery
-    from ..unpaired.logs import RecordedSide
+    from ..unpaired.both_sides import RecordedSide
 
 NOT_WITH = ("apply", "twin")
 NEEDS_SIMULATOR = ("simulator_params", "rounds", "keep")
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
     from ..errors import InputError
     from ..present.documents import DOCUMENTS
     from ..unpaired.results import unpaired_document
-    from ..unpaired.rounds import ClosedGap, against, check_rounds, closed_gap_document
+    from ..unpaired.simulator_rounds import ClosedGap, against, check_rounds, closed_gap_document
 
     for option in NOT_WITH:
         if getattr(arguments, option) is not None:
@@ -85,7 +85,7 @@ def _source(
     arguments: argparse.Namespace, bags: Sequence[Path], params: Path | None, defaults: Mapping[str, float]
 ) -> tuple[RecordedSide, Discovery]:
     """One side's bags and what they say of themselves."""
-    from ..unpaired.logs import RecordedSide
+    from ..unpaired.both_sides import RecordedSide
 
     own = argparse.Namespace(**{**vars(arguments), "params": params})
     recording = common.opened(bags, common.load(own))

@@ -12,7 +12,7 @@ from ..evaluation.results import Evaluation
 from ..examination.examine import Examination
 from ..fleet_catalogue.update import Fleet
 from ..unpaired.results import UnpairedComparison
-from ..unpaired.rounds import ClosedGap
+from ..unpaired.simulator_rounds import ClosedGap
 from .comparison import comparison
 from .cross_check import cross_check
 from .diagnosis import diagnosis

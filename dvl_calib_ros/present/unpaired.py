@@ -11,7 +11,7 @@ from ..unpaired.results import (
     SimulatorVerdict,
     UnpairedComparison,
 )
-from ..unpaired.rounds import ClosedGap, Round
+from ..unpaired.simulator_rounds import ClosedGap, Round
 from ..verdict.kinds import Severity
 from .document import Answer, Cell, Columns, Document, Sentence, Table, Where, figures, section, table_by
 from .numbers import intervals, mm, p_value

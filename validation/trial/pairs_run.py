@@ -37,8 +37,8 @@ SAME_LEVEL = 1.02
 
 def compared(vehicle: Path, simulator: Path, mounting: Mapping[str, Sequence[float]]) -> Document:
     """What `dvl-calib diagnose VEHICLE --simulator SIMULATOR` says, as in its JSON."""
-    from dvl_calib_ros.unpaired.compare import compare
-    from dvl_calib_ros.unpaired.logs import RecordedSide
+    from dvl_calib_ros.unpaired.both_sides import RecordedSide
+    from dvl_calib_ros.unpaired.comparison import compare
     from dvl_calib_ros.unpaired.results import unpaired_document
 
     def source(side: str, path: Path) -> RecordedSide:

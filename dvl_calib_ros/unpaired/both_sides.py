@@ -19,7 +19,7 @@ from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
-from .stream_facts import StreamFacts, stream_facts
+from .stream_properties import StreamFacts, stream_facts
 
 # No DVL is so quiet (m/s): its resolution is 1 mm/s. One that is, is the simulator's truth
 NOISE_FREE_MPS = 2e-4

@@ -23,9 +23,9 @@ from ..diagnosis.selection import EffectSelection
 from ..diagnosis.settings import SETTINGS
 from ..diagnosis.twin import simulated, with_quiet_reference
 from ..effects.base import ActsOn, ClockEffect, Effect, EffectWithMemory
-from .logs import Log
+from .both_sides import Log
+from .effect_comparison import Size
 from .results import ComparisonStatus, Rung
-from .sizes import Size
 
 # Windows of the two-sample test: long enough that neighbours are nearly independent
 WINDOW_S, PERMUTATIONS = 10.0, 500

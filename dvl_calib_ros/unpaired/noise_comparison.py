@@ -22,9 +22,9 @@ from ..diagnosis.fitting import around
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.where import regimes
 from ..effects.base import EffectInput
-from .logs import Log
-from .streams import OUTLIER
-from .two_sides import BLOCK, FEWEST_BLOCKS, Candidate, mean_of, shares_of, welch
+from .both_sides import Log
+from .stream_comparison import OUTLIER
+from .welch_tests import BLOCK, FEWEST_BLOCKS, Candidate, mean_of, shares_of, welch
 
 # Levels that are closer than this do not matter
 WORTH_TELLING = 1.15

@@ -30,10 +30,10 @@ from ..simulation.scenario import Scenario, write_bag
 from ..simulator_export.dvl_description import load_description
 from ..verdict.answering import Answering
 from ..verdict.reasons import Reason, finding
-from .compare import compare, compare_logs
-from .logs import RecordedSide, read_log
+from .both_sides import RecordedSide, read_log
+from .comparison import compare, compare_logs
+from .gap_ladder import is_of_every_run
 from .results import ComparedEffect, Triple, UnpairedComparison, unpaired_document
-from .shrink import is_of_every_run
 
 MOST_ROUNDS = 9
 # The simulator's velocity is its truth: no more is taken off it than the corners between its samples

@@ -14,11 +14,8 @@ from ..diagnosis.selection import EffectSelection
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..verdict.reasons import Reason, finding
-from .logs import Log, RecordedSide, read_log
-from .noise import compare_noise, levels_by_regime
-from .results import ComparedEffect, ComparedNoise, ComparisonStatus, Rung, SimulatorVerdict, UnpairedComparison
-from .shrink import AS_IT_IS, NOISE, Shrunk, models, shrink
-from .sizes import (
+from .both_sides import Log, RecordedSide, read_log
+from .effect_comparison import (
     Size,
     common_names,
     compared_names,
@@ -31,8 +28,11 @@ from .sizes import (
     trace_of,
     union,
 )
-from .streams import compare_streams
-from .two_sides import Candidate
+from .gap_ladder import AS_IT_IS, NOISE, Shrunk, models, shrink
+from .noise_comparison import compare_noise, levels_by_regime
+from .results import ComparedEffect, ComparedNoise, ComparisonStatus, Rung, SimulatorVerdict, UnpairedComparison
+from .stream_comparison import compare_streams
+from .welch_tests import Candidate
 
 # Family-wise, of all that is claimed to differ
 LEVEL = 0.01

@@ -10,10 +10,10 @@ from ..calibration.frames import Array
 from ..calibration.robust import robust_std
 from ..calibration.spikes import beside, off_neighbours
 from ..diagnosis.curve import FAST_ENOUGH_S
-from .logs import DITHER_MPS, Log
+from .both_sides import DITHER_MPS, Log
 from .results import Triple
-from .stream_facts import DROPOUT_INTERVALS
-from .two_sides import BLOCK, FEWEST_BLOCKS, Candidate, mean_of, shares_of, welch
+from .stream_properties import DROPOUT_INTERVALS
+from .welch_tests import BLOCK, FEWEST_BLOCKS, Candidate, mean_of, shares_of, welch
 
 # Outliers: beyond so many standard deviations
 OUTLIER = 7.0

@@ -26,7 +26,7 @@ from ..diagnosis.shown import somewhere
 from ..diagnosis.where import BANDS_HZ, regimes
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
-from .logs import Log
+from .both_sides import Log
 from .results import Lies, Triple
 
 # An effect that a side was not found to have is there nevertheless if it is sure at this level ...
