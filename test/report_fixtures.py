@@ -25,7 +25,7 @@ from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict, FoundEf
 from dvl_calib_ros.diagnosis.series import DiagnosisSeries
 from dvl_calib_ros.diagnosis.unexplained import Unexplained
 from dvl_calib_ros.diagnosis.where import GapPlace
-from dvl_calib_ros.evaluation.bags import CrossCheck
+from dvl_calib_ros.evaluation.cross_check import CrossCheck
 from dvl_calib_ros.evaluation.results import (
     UNCALIBRATED,
     CalibrationRun,

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ..bags.recover import Recovered
     from ..bags.writer import Compression, Storage
     from ..calibration.comparison import Comparison
-    from ..evaluation.bags import CrossCheck
+    from ..evaluation.cross_check import CrossCheck
     from ..evaluation.results import Evaluation
     from ..files.apply import Applied
     from ..fleet_catalogue.update import Fleet
@@ -424,9 +424,9 @@ def evaluate(
     ----------
     Avg.VRMSE and the procedure are those of Yampolsky and Klein; see the page Evaluation.
     """
-    from ..evaluation.bags import cross_check
-    from ..evaluation.evaluate import DEFAULTS, EVALUATED
-    from ..evaluation.evaluate import evaluate as run
+    from ..evaluation.cross_check import cross_check
+    from ..evaluation.validation_study import DEFAULTS, EVALUATED
+    from ..evaluation.validation_study import evaluate as run
     from ..parallel import Workers
     from ..recordings.topics import Topics
 

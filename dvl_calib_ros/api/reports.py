@@ -46,7 +46,7 @@ def _plain(result: Any) -> Callable[[], Any]:
         from ..diagnosis.results import diagnosis_document
 
         return lambda: diagnosis_document(result)
-    from ..evaluation.bags import CrossCheck, cross_check_document
+    from ..evaluation.cross_check import CrossCheck, cross_check_document
     from ..evaluation.documents import evaluation_document
     from ..evaluation.results import Evaluation
     from ..unpaired.results import UnpairedComparison, unpaired_document

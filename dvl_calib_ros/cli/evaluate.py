@@ -47,8 +47,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..disk.atomic import save_text
     from ..errors import InputError
     from ..evaluation.documents import evaluation_csv, evaluation_document
-    from ..evaluation.evaluate import DEFAULTS, EVALUATED, evaluate
     from ..evaluation.protocol import SETS
+    from ..evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
     from ..parallel import Workers
     from ..present import evaluation as present
 
@@ -106,7 +106,7 @@ def _are_bags(paths: list[Path]) -> bool:
 
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
     from ..errors import InputError
-    from ..evaluation.bags import cross_check, cross_check_document
+    from ..evaluation.cross_check import cross_check, cross_check_document
     from ..present import cross_check as present
     from ..recordings.topics import Topics
 

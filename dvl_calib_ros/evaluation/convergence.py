@@ -12,8 +12,8 @@ from ..calibration.frames import Array
 from ..calibration.kalman import GaussianState
 from ..calibration.parameters import Parameters
 from . import protocol
-from .baselines import BASELINES
 from .estimation import SensorData, estimate
+from .metrics import BASELINES
 from .results import ConvergenceCurve, Failure, mean_of_known
 from .trajectories import Trajectory
 

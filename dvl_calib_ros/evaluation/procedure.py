@@ -14,10 +14,9 @@ from ..calibration.models import MODELS, Model
 from ..calibration.observability import OBSERVED_SHARE
 from ..calibration.parameters import Parameters
 from . import protocol
-from .baselines import BASELINES
 from .convergence import REFERENCE_STD, TIMES_S, curve_keys, squared_errors
 from .estimation import SensorData, estimate
-from .metrics import RunMoments, heading_spread, vrmse
+from .metrics import BASELINES, RunMoments, heading_spread, vrmse
 from .results import CalibrationRun, CalibrationSet, Failure, mean_of_known
 from .trajectories import Trajectory
 

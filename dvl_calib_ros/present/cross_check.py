@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..evaluation.bags import CrossCheck
+from ..evaluation.cross_check import CrossCheck
 from .document import Document, Item, Sentence, Table, Where, figures, section
 from .numbers import number
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..calibration.comparison import Comparison
 from ..diagnosis.results import Diagnosis
-from ..evaluation.bags import CrossCheck
+from ..evaluation.cross_check import CrossCheck
 from ..evaluation.results import Evaluation
 from ..examination.examine import Examination
 from ..fleet_catalogue.update import Fleet

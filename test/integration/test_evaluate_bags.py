@@ -10,7 +10,7 @@ from command_line import succeed
 from report_fixtures import drawn
 
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.evaluation import bags as evaluation_of_bags
+from dvl_calib_ros.evaluation import cross_check as evaluation_of_bags
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.comparison_words import comparison_document
 from dvl_calib_ros.diagnosis.results import diagnosis_document
 from dvl_calib_ros.disk.text_files import write_json
-from dvl_calib_ros.evaluation.bags import cross_check_document
+from dvl_calib_ros.evaluation.cross_check import cross_check_document
 from dvl_calib_ros.evaluation.documents import evaluation_document
 
 SCHEMA = json.loads((ROOT / "docs" / "json_schema.json").read_text())

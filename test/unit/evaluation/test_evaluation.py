@@ -21,9 +21,8 @@ from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.evaluation import holdout, metrics, protocol
+from dvl_calib_ros.evaluation import metrics, protocol, validation_study
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
-from dvl_calib_ros.evaluation.evaluate import DEFAULTS, EVALUATED, evaluate
 from dvl_calib_ros.evaluation.procedure import (
     Procedure,
     dvl_velocities,
@@ -34,6 +33,7 @@ from dvl_calib_ros.evaluation.procedure import (
 )
 from dvl_calib_ros.evaluation.results import UNCALIBRATED
 from dvl_calib_ros.evaluation.trajectories import Trajectory, load_folder, own_trajectories
+from dvl_calib_ros.evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
 from dvl_calib_ros.logs.dvl_log import angular_velocities
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording
 from dvl_calib_ros.parallel import Workers, run_all
@@ -194,10 +194,10 @@ def test_a_verdict_is_worked_out_with_the_models_that_are_evaluated_alone(runs, 
     """The one that finds arm and delay, which nobody asked for, took nine tenths of the time."""
     made = []
     monkeypatch.setattr(
-        holdout, "Calibrator", lambda *given, **named: made.append(Calibrator(*given, **named)) or made[-1]
+        validation_study, "Calibrator", lambda *given, **named: made.append(Calibrator(*given, **named)) or made[-1]
     )
     procedure = Procedure(runs, ("M4", "G1"), protocol.SETS[:1], Parameters(**DEFAULTS), studies=False)
-    held_out, failures = holdout.verify_set(procedure, 0, procedure.sets[0])
+    held_out, failures = validation_study.verify_set(procedure, 0, procedure.sets[0])
     assert [each.model for each in held_out] == ["M4", "G1"] and not failures
     assert {name for each in made for name in each.result().estimates} == {"M4", "G1"}
 

@@ -10,12 +10,12 @@ from report_fixtures import drawn
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.evaluation import estimation, holdout, procedure
+from dvl_calib_ros.evaluation import estimation, procedure, validation_study
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
-from dvl_calib_ros.evaluation.evaluate import DEFAULTS, evaluate
 from dvl_calib_ros.evaluation.procedure import sensor_data
 from dvl_calib_ros.evaluation.results import Failure
 from dvl_calib_ros.evaluation.trajectories import own_trajectories
+from dvl_calib_ros.evaluation.validation_study import DEFAULTS, evaluate
 
 N_SAMPLES, ENDS = 60, (20, 60)
 MODELS = ("M4", "G1", "A1")
@@ -96,7 +96,7 @@ def test_a_seed_and_a_combination_that_raise_are_left_out(monkeypatch):
         raise FloatingPointError
 
     monkeypatch.setattr(procedure, "run_seed", refusing)
-    monkeypatch.setattr(holdout, "Calibrator", none)
+    monkeypatch.setattr(validation_study, "Calibrator", none)
     found = evaluate(None, Parameters(**DEFAULTS), models=("M4",), sets=("E4",), n_seeds=2)
     assert found.seeds == (0,) and found.avg_vrmse.shape == (1, 2, 1) and np.isfinite(found.avg_vrmse).all()
     assert found.held_out == ()

@@ -38,7 +38,7 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.recordings import load_recordings
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.evaluation.bags import cross_check
+from dvl_calib_ros.evaluation.cross_check import cross_check
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.messages.drivers import DVL_TYPES, VELOCITY_TYPES, driver_table, velocity_type
 from dvl_calib_ros.messages.live_feed import MessageFeed

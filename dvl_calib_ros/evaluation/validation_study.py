@@ -1,8 +1,13 @@
-"""The published procedure over many noise seeds, and what its outcomes say."""
+"""The published procedure over many noise seeds, and what its outcomes say.
+
+Hold-out verdicts of the procedure's calibrations, by the calibrator itself.
+"""
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,17 +15,19 @@ from typing import Any
 import numpy as np
 
 from .. import __version__
+from ..calibration.calibrator import Calibrator
 from ..calibration.frames import Array
 from ..calibration.models import LINEAR_MODELS, MODELS
 from ..calibration.observations import Observations
 from ..calibration.parameters import SCHEMA, Parameters
+from ..calibration.results import Result
+from ..calibration.verification import Verification
 from ..errors import InputError
 from ..parallel import Workers, run_all
 from . import protocol
-from .baselines import BASELINES
 from .convergence import curves
-from .holdout import verify_set
-from .metrics import coverage
+from .estimation import SensorData, streams_of, true_prior
+from .metrics import BASELINES, coverage
 from .procedure import (
     NOISE_STUDY_STD,
     Procedure,
@@ -33,7 +40,19 @@ from .procedure import (
     sensor_data,
     single_headings,
 )
-from .results import CalibrationRun, Coverage, EachStudy, ErrorsInVariables, Evaluation, Failure, Trace, mean_of_known
+from .protocol import SCALES_PERCENT
+from .results import (
+    CalibrationRun,
+    CalibrationSet,
+    Coverage,
+    EachStudy,
+    ErrorsInVariables,
+    Evaluation,
+    Failure,
+    HeldOut,
+    Trace,
+    mean_of_known,
+)
 from .trajectories import Trajectory, load_folder, own_trajectories
 
 # The procedure has no lever arm and no delay, so the model that finds them would only be another name of G1
@@ -249,3 +268,58 @@ def _corrected(models: Sequence[str], corrections: Array, measured: Array) -> Ma
     return {
         name: measured @ matrix.T for name, matrix in zip(models, corrections, strict=True) if np.isfinite(matrix).all()
     }
+
+
+# One combination of every misalignment: one by one takes ten times longer than many at once
+VERIFIED = slice(None, None, len(SCALES_PERCENT))
+
+
+def verify_set(
+    procedure: Procedure, seed: int, calibration_set: CalibrationSet
+) -> tuple[tuple[HeldOut, ...], tuple[Failure, ...]]:
+    """One entry per model that runs on the set, over `VERIFIED` combinations of errors; and those that raised."""
+    failures: list[Failure] = []
+    data = sensor_data(procedure.runs[calibration_set.calibration_run], seed)
+    results = _calibrate(data, data.run.first(calibration_set.window_s), procedure, failures)
+    held_out = tuple(
+        _summary(calibration_set.name, name, [result.verifications[name] for result in results])
+        for name in procedure.models
+        if results and results[0].estimates[name].used
+    )
+    return held_out, tuple(replace(each, seed=seed) for each in failures)
+
+
+def _calibrate(data: SensorData, end: int, procedure: Procedure, failures: list[Failure]) -> list[Result]:
+    """Result of every `VERIFIED` combination over the first `end` samples, without those that raise."""
+    parameters = procedure.parameters
+    prior = true_prior(data, parameters)
+    stretch = SensorData(data.run.part(0, end), data.velocity_dvl[:, :end], data.reference[:, :end])
+    results = []
+    for variant in range(len(data.velocity_dvl))[VERIFIED]:
+        try:
+            calibrator = Calibrator(
+                parameters, prior_sway_heave=prior, block_size=end, verified=True, models=procedure.models
+            )
+            calibrator.feed(streams_of(stretch, variant))
+            results.append(calibrator.result())
+        except Exception as error:
+            failures.append(Failure.of(error, "hold-out verification", data.run.name, variant))
+    return results
+
+
+def _summary(set_name: str, model: str, found: Sequence[Verification]) -> HeldOut:
+    verdicts = Counter(each.verdict.value for each in found)
+    errors = [each.held_out for each in found if each.held_out is not None]
+
+    def rms(name: str) -> float:
+        return float(np.sqrt(np.mean([getattr(each, name) ** 2 for each in errors]))) if errors else float("nan")
+
+    return HeldOut(
+        set_name=set_name,
+        model=model,
+        verdict=verdicts.most_common(1)[0][0],
+        uncorrected=rms("uncorrected"),
+        corrected=rms("corrected"),
+        predicted=rms("predicted"),
+        verdicts=dict(verdicts),
+    )
