@@ -37,7 +37,7 @@ from dvl_calib_ros.evaluation.results import (
     HeldOut,
     Trace,
 )
-from dvl_calib_ros.present.reports import write_replay_report
+from dvl_calib_ros.present.page import write_replay_report
 from dvl_calib_ros.verdict.reasons import finding
 
 # One of each kind: most of a report's time goes into pictures of the models' estimates

@@ -17,11 +17,9 @@ OF_NO_RESULT = {
     "page",
     "terminal",
     "terminal_map",
-    "folding",
-    "exploring",
-    "style",
+    "figure_data",
+    "figure_style",
     "time_axis",
-    "typed",
 }
 PARTS = {
     "Document", "Section", "Item", "Answer", "Sentence", "Table", "Cell", "Number", "Numbers", "Commands", "Facts",

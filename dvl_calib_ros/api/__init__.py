@@ -233,7 +233,7 @@ def fleet(
     """
     from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers
-    from ..present.reports import write_report
+    from ..present.page import write_report
 
     merged, names = _parameters(params, parameters)
     asked = [str(each) for each in ([places] if isinstance(places, str | os.PathLike) else places)]

@@ -294,7 +294,7 @@ class Calibration:
         InputError
             If it cannot be written.
         """
-        from ..present.reports import write_replay_report
+        from ..present.page import write_replay_report
 
         target = Path(path)
         write_replay_report(target, self.replayed, self.bags, list(MODELS))

@@ -17,14 +17,14 @@ WIDTH = 160
 
 def printed(result: object, as_html: bool) -> str:
     """The answer of a result, with its tables."""
-    from ..present.documents import DOCUMENTS
+    from ..present.result_documents import DOCUMENTS
 
     return text_of(DOCUMENTS[type(result)](result), as_html)
 
 
 def framed(result: object) -> dict[str, pandas.DataFrame]:
     """Tables of a result by their headings. Raises InputError without pandas."""
-    from ..present.documents import DOCUMENTS
+    from ..present.result_documents import DOCUMENTS
 
     return frames_of(DOCUMENTS[type(result)](result))
 

@@ -24,12 +24,12 @@ def write(result: object, path: Path) -> None:
         result.report(path)
         return
     try:
-        from ..present import reports
+        from ..present import page
     except ModuleNotFoundError as error:
         raise InputError(
             f"{path}: a page needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2"
         ) from error
-    reports.write_report(path, result)
+    page.write_report(path, result)
 
 
 def _plain(result: Any) -> Callable[[], Any]:

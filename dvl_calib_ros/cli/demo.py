@@ -124,8 +124,8 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     from ..disk.yaml_files import load_yaml
     from ..files.result_file import load_result
     from ..present.document import Table
+    from ..present.error_terms import estimate_table
     from ..present.terminal import rich_table
-    from ..present.terms import estimate_table
 
     out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
     _, live = load_result(saved)

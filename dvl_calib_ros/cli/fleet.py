@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers
     from ..present.fleet import fleet as present
-    from ..present.reports import write_report
+    from ..present.page import write_report
 
     if arguments.jobs < 0:
         raise InputError(f"--jobs: {arguments.jobs} is negative; give a number of processes, or 0 for one per core")

@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
     from ..present import replay as present
-    from ..present.typed import options
+    from ..present.error_terms import options
 
     common.print_found(discovery, arguments.bags)
     findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])

@@ -13,7 +13,7 @@ def add_report_option(parser: argparse.ArgumentParser) -> None:
 
 
 def report_writer(arguments: argparse.Namespace, name: str = "write_report") -> Callable[..., None]:
-    """A function of present/reports.py, which nobody is to call if no report is asked for.
+    """A function of present/page.py, which nobody is to call if no report is asked for.
 
     Raises InputError, before any work is done, if a library is missing that reports are made with.
     """
@@ -22,10 +22,10 @@ def report_writer(arguments: argparse.Namespace, name: str = "write_report") -> 
     from ..errors import InputError
 
     try:
-        from ..present import reports
+        from ..present import page
     except ModuleNotFoundError as error:
         raise InputError(f"--report needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2") from error
-    write: Callable[..., None] = getattr(reports, name)
+    write: Callable[..., None] = getattr(page, name)
     return write
 
 

@@ -51,7 +51,7 @@ def check_without(arguments: argparse.Namespace) -> None:
 def run(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
     """Compare, print, save."""
     from ..errors import InputError
-    from ..present.documents import DOCUMENTS
+    from ..present.result_documents import DOCUMENTS
     from ..unpaired.results import unpaired_document
     from ..unpaired.simulator_rounds import ClosedGap, against, check_rounds, closed_gap_document
 

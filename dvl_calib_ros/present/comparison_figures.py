@@ -1,8 +1,12 @@
-"""Pictures of a comparison: every quantity over time, with a line where it is said to have changed."""
+"""Pictures of a comparison: every quantity over time, with a line where it is said to have changed.
+
+Pictures of a fleet.
+"""
 
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Collection, Sequence
 from itertools import pairwise
 
@@ -13,8 +17,10 @@ from matplotlib.figure import Figure
 
 from ..calibration.comparison import Change, Comparison
 from ..calibration.extrinsics import N_COMPONENTS, Extrinsics
+from ..fleet_catalogue.vehicle_history import CompassDeviation
 from .comparison import ComparedQuantity, shown_quantities, values_of
-from .style import INK, Picture, drawing, new_figure, picture
+from .figure_style import INK, Picture, drawing, legend_above, new_figure, picture
+from .fleet import deviation
 
 _POINT, _MOVED = "#1f6fb2", "#c0392b"
 PANEL_WIDTH, PANEL_HEIGHT = 4.6, 2.3
@@ -103,3 +109,17 @@ def _dated(calibrations: Sequence[Extrinsics]) -> bool:
 def _middle(each: Extrinsics) -> float:
     """In days since 1970, as matplotlib counts dates."""
     return 0.5 * (each.first_ns + each.last_ns) * 1e-9 / 86400.0
+
+
+def compass(known: Sequence[tuple[str, CompassDeviation]]) -> Figure:
+    """Deviation of the heading against the heading, a line a vehicle."""
+    figure, axes = new_figure()
+    north = np.linspace(0.0, 360.0, 181)
+    for name, heading in known:
+        axes.plot(north, deviation(heading, 0.5 * math.pi - np.radians(north)), label=name)
+    axes.set_xlabel("heading from north, clockwise, °")
+    axes.set_xlim(0.0, 360.0)
+    axes.set_xticks(range(0, 361, 45))
+    axes.set_ylabel("deviation, °")
+    legend_above(axes)
+    return figure

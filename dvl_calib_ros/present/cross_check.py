@@ -24,7 +24,7 @@ def cross_check(check: CrossCheck) -> Document:
         found = {name: each for name, each in by.items() if each is not None}
         if found:
             one = next(iter(found.values()))
-            pictures.append(figures("navigation_figures.navigation_pictures", one, found, f", {name}"))
+            pictures.append(figures("replay_figures.navigation_pictures", one, found, f", {name}"))
     head, nothing = ("calibrated on", "model", *check.names), ("nothing", "uncalibrated")
     errors = [(*nothing, *(number(value, 4) for value in check.uncorrected.tolist()))]
     for name, of_models in zip(check.names, check.corrected, strict=True):

@@ -181,7 +181,7 @@ def _of_series(d: Diagnosis, series: DiagnosisSeries) -> Iterator[Section]:
     table = table_by(columns, errors, (TWIN_NOTE,), words=2)
     yield section("Recorded against the simulated twin", Sentence(TWINS_NOTE, soft=True), table, where=Where.PAGE)
     for twin in series.twins:
-        yield section(twin.name, figures("twin_pictures.twin_pictures", twin, axes, has_effects), where=Where.PAGE)
+        yield section(twin.name, figures("diagnosis_pictures.twin_pictures", twin, axes, has_effects), where=Where.PAGE)
 
 
 # ------------------------------------------------------------------ sentences

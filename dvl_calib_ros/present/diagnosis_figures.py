@@ -11,8 +11,8 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from ..calibration.distributions import normal_isf, normal_sf
 from ..calibration.frames import Array
 from ..diagnosis.followed import Followed
+from .figure_style import FAINT, INK, legend_above, new_figure, plain_log_ticks
 from .replay_figures import AFTER, BAD
-from .style import FAINT, INK, legend_above, new_figure, plain_log_ticks
 from .time_axis import TimeAxis, running_mean
 
 # Points of a line: running means are smooth, so more cannot be seen

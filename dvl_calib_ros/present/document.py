@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pandas
 
     from ..calibration.navigation import Navigation
-    from .style import Picture
+    from .figure_style import Picture
 
 
 # Characters of a bar
@@ -161,7 +161,7 @@ class Figures:
         """Make them, which imports matplotlib."""
         function = getattr(import_module(f"{__package__}.{self.module}"), self.name)
         if self.title:
-            from .style import picture
+            from .figure_style import picture
 
             return [picture(self.title, self.alt, function, *self.given, caption=self.caption)]
         found = function(*self.given)
@@ -180,7 +180,7 @@ class SideBySide:
 
 
 def figures(function: str, *given: Any) -> Figures:
-    """Those that a function draws, such as ``twin_pictures.twin_pictures``."""
+    """Those that a function draws, such as ``diagnosis_pictures.twin_pictures``."""
     module, _, name = function.partition(".")
     return Figures(module, name, given)
 

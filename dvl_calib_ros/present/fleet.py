@@ -72,7 +72,9 @@ def fleet(result: Fleet) -> Document:
     several = any(len(each.recordings) > 1 for each in result.persons)
     compasses = [(each.name, each.heading) for each in vehicles if each.heading is not None]
     told = "; ".join(f"{name} up to {largest(heading):.2f}°" for name, heading in compasses)
-    drawn = figure("fleet_figures.compass", "Deviation, °", f"Deviation of the heading by heading: {told}", compasses)
+    drawn = figure(
+        "comparison_figures.compass", "Deviation, °", f"Deviation of the heading by heading: {told}", compasses
+    )
     return Document(
         title="DVL calibrations of a fleet",
         subtitle=f"{counted(len(vehicles), 'vehicle')}, {counted(recordings, 'recording')}; {done}",

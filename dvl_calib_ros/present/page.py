@@ -2,6 +2,10 @@
 
 Everything that comes from a bag or a folder is escaped by the engine. By its content security policy the page runs
 the two scripts that stand in it, known by their hashes, and nothing else, and has no access to the network.
+
+Reports that people read: one self-contained HTML file of a result.
+
+Needs matplotlib and jinja2: nobody imports this but when a report is asked for.
 """
 
 from __future__ import annotations
@@ -9,6 +13,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from functools import cache
 from pathlib import Path
@@ -18,9 +23,14 @@ import jinja2
 from markupsafe import Markup, escape
 
 from .. import __version__
-from ..disk.atomic import save_text
+from ..bag_replay.replay import Replayed
+from ..calibration.comparison import Comparison
+from ..disk.atomic import save_bytes, save_text
+from .comparison_figures import trend_png
 from .document import Document, Section, Warned, Where
-from .style import MODEL_STYLES
+from .figure_style import MODEL_STYLES
+from .replay import replayed
+from .result_documents import DOCUMENTS
 
 
 def breakable(text: str) -> Markup:
@@ -74,3 +84,22 @@ def fragment(document: Document) -> str:
     sections = [each for each in document.sections if each.where is not Where.PAGE and each.items]
     context = {"document": document, "sections": sections}
     return _environment().get_template("fragment.html").render(context).strip()
+
+
+__all__ = ["write_replay_report", "write_report"]
+
+
+def write_report(path: Path, result: Any) -> None:
+    """Write the report (HTML); of a comparison the picture alone if `path` ends in .png.
+
+    Raises InputError if it cannot be written.
+    """
+    if isinstance(result, Comparison) and path.suffix.lower() == ".png":
+        save_bytes(path, trend_png(result))
+    else:
+        write_document(path, DOCUMENTS[type(result)](result))
+
+
+def write_replay_report(path: Path, run: Replayed, bags: Sequence[Path], models: Sequence[str]) -> None:
+    """Write the report of a replay that was run with a history. models: names to show. Raises InputError."""
+    write_document(path, replayed(run, bags, models))

@@ -49,9 +49,8 @@ from .document import (
     section,
     table_by,
 )
+from .error_terms import estimate_table, typed
 from .numbers import fitting_unit
-from .terms import estimate_table
-from .typed import typed
 
 # What the verdict's word asks of the reader.
 ADVICE = {
@@ -191,7 +190,7 @@ def replayed(
                 where=Where.PAGE,
             ),
             section(_headline(run, rejected), *([Sentence(NO_MOUNTING)] if rejected else _mounting(run))),
-            section("", None if rejected else figures("mounting_figures.mounting_pictures", result), where=Where.PAGE),
+            section("", None if rejected else figures("replay_figures.mounting_pictures", result), where=Where.PAGE),
             section("", facts_by(FACTS, run), where=where),
             section(
                 "", Sentence("Corrected mounting, ready to paste:", soft=True) if is_shown else None, where=Where.PAGE
@@ -202,7 +201,7 @@ def replayed(
                 "What it means for navigation",
                 *map(Sentence, in_words(drift) if drift else ()),
                 Map(drift) if drift and drift.on_a_map else None,
-                figures("navigation_figures.navigation_pictures", drift, {"": drift}, "", history.stamps_ns)
+                figures("replay_figures.navigation_pictures", drift, {"": drift}, "", history.stamps_ns)
                 if drift and history
                 else None,
             ),

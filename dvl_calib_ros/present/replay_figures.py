@@ -1,23 +1,40 @@
-"""The figures of a replay: functions from plain arrays to a matplotlib Figure, units on every axis."""
+"""The figures of a replay: functions from plain arrays to a matplotlib Figure, units on every axis.
+
+How the DVL sits on the vehicle: its axes as configured and as found, from above and from the side.
+
+Figures of dead reckoning: the track on a map, and how far it is astray along it.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from ..calibration.frames import Array
-from .style import (
+from ..calibration.extrinsics import rotation_of, turn_between
+from ..calibration.frames import Array, rotation_from_rpy
+from ..calibration.navigation import Navigation
+from ..calibration.parameters import Parameters
+from ..calibration.results import Result
+from .figure_data import MapTrack
+from .figure_style import (
     FAINT,
     INK,
     MODEL_STYLES,
     REFERENCE_COLOUR,
+    WIDTH,
+    Picture,
     legend_above,
     line_widths,
     new_figure,
+    picture,
     plain_log_ticks,
 )
 from .time_axis import TimeAxis, running_mean, thin
@@ -180,5 +197,154 @@ def held_out_errors(labels: Sequence[str], uncorrected: Array, corrected: Array,
     axes.set_yticks(rows, labels)
     axes.set_ylim(len(labels) - 0.5, -0.5)
     axes.set_xlabel("velocity error on held-out data, m/s rms")
+    legend_above(axes)
+    return figure
+
+
+# A turn is drawn as large as this (rad) if it is smaller, by a whole number of times up to so many: 1° is not seen.
+_SEEN, _MOST_TIMES = math.radians(12.0), 20
+# Length of a vehicle whose DVL is in its middle, and of the axes drawn, m and a share of it; its height by its length
+_LENGTH, _AXIS, _SLENDER = 2.0, 0.25, 0.3
+# Two axes of the body, what the second is called, and who looks along the third
+_VIEWS = ((0, 1, "to port", "from above"), (0, 2, "up", "from starboard"))
+
+
+def mounting_pictures(result: Result) -> list[Picture]:
+    """From above and from the side; the place is drawn where it is known."""
+    parameters = Parameters.from_mapping(result.parameters)
+    nominal = rotation_from_rpy(parameters.mounting_rpy)
+    found = result.estimate.rotation_body_from_dvl(nominal.T)
+    turn = turn_between(nominal, found)
+    angle = float(np.linalg.norm(turn))
+    times = int(np.clip(round(_SEEN / max(angle, 1e-9)), 1, _MOST_TIMES))
+    place = result.position_in_body
+    how = f"The turn of {math.degrees(angle):.2f}° is drawn {times} times as large." if times > 1 else "True to scale."
+    if place is None:
+        how += " Where the DVL sits is not known: drawn in the middle."
+    return [
+        picture(
+            f"DVL on the vehicle, {where}", f"Axes of the DVL as configured and as found, {where}. {how}",
+            _view, (across, up, name), nominal, rotation_of(times * turn) @ nominal, place or (0.0, 0.0, 0.0),
+            caption=how,
+        )
+        for across, up, name, where in _VIEWS
+    ]  # fmt: skip
+
+
+def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float]) -> Figure:
+    across, up, name = axes_of
+    figure, axes = new_figure(height=2.6)
+    length = max(_LENGTH, 2.4 * float(np.abs(place).max()))
+    axes.add_patch(Ellipse((0.0, 0.0), length, _SLENDER * length, facecolor="#f1f3f5", edgecolor=FAINT))
+    axes.annotate(
+        "", (0.62 * length, 0.0), (0.5 * length, 0.0), arrowprops={"arrowstyle": "-|>", "color": FAINT, "lw": 1.5}
+    )
+    axes.text(0.64 * length, 0.0, "ahead", va="center", fontsize=8.0, color=INK)
+    for rotation, colour, label in ((nominal, FAINT, "as configured"), (found, AFTER, "as found")):
+        _axes_of_dvl(axes, rotation[[across, up]], (place[across], place[up]), _AXIS * length, colour, label)
+    axes.set_xlim(-0.6 * length, 0.85 * length)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("ahead, m")
+    axes.set_ylabel(f"{name}, m")
+    legend_above(axes)
+    return figure
+
+
+def _axes_of_dvl(axes: Axes, ends: Array, at: tuple[float, float], length: float, colour: str, label: str) -> None:
+    """Axes of a DVL, ends (2, 3) in this view, from where it is; one that points at who looks is left out."""
+    for index, axis in enumerate("xyz"):
+        along = length * ends[:, index]
+        if float(np.hypot(*along)) < 0.3 * length:
+            continue
+        tip = at[0] + along[0], at[1] + along[1]
+        axes.annotate("", tip, at, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.8})
+        if colour == AFTER:
+            axes.text(at[0] + 1.15 * along[0], at[1] + 1.15 * along[1], axis, color=colour, ha="center", va="center")
+    axes.plot([], [], color=colour, label=label)
+    axes.plot(*at, "o", color=colour, markersize=4.0)
+
+
+# A map is as high as it is wide at most, and never a strip, inches
+HIGHEST, LOWEST = WIDTH, 2.2
+_OTHERS = (AFTER, "#2a7f62", "#832db6", "#a96b59")
+
+
+def navigation_pictures(
+    one: Navigation, corrected: Mapping[str, Navigation], where: str = "", stamps_ns: Array | None = None
+) -> Sequence[Picture]:
+    """Map, if headings are known, and error along the track.
+
+    one: whose reference and uncorrected track are drawn. corrected: by what corrected it, '' for one alone; the first
+    four are drawn. stamps_ns: of figures whose cursor the map follows.
+    """
+    told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
+    alt = f"over {one.distance_m:.0f} m; off at the end: as mounted {one.before.end:.1f} m; {told}"
+    time = None if stamps_ns is None else TimeAxis(stamps_ns)
+    figures = []
+    if one.on_a_map:
+        figures.append(
+            picture(f"Track{where}", f"Map of the track {alt}", track_map, one, corrected, time,
+                    caption="From the same start; the corrected track by estimates that had not seen the data, its "
+                    "colour by how far it is off the reference.")
+        )  # fmt: skip
+    figures.append(picture(f"Error of position{where}", f"Error of dead reckoning {alt}", error_along, one, corrected))
+    return figures
+
+
+def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAxis | None = None) -> Figure:
+    """East and north, m, the same scale along both. time: of the figures whose cursor is followed."""
+    drawn = [one.reference, one.track_before, *(each.track_after for each in corrected.values())]
+    every = np.concatenate(drawn)
+    east, north = np.ptp(every, axis=0)
+    height = float(np.clip(0.85 * WIDTH * north / max(east, 1e-9) + 0.9, LOWEST, HIGHEST))
+    figure, axes = new_figure(height=height)
+    lines = axes.plot(*one.reference.T, color=INK, linewidth=2.6, alpha=0.35, label="reference")
+    lines += axes.plot(*one.track_before.T, color=BAD, linewidth=1.2, label="as mounted")
+    for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
+        lines += axes.plot(*each.track_after.T, color=colour, linewidth=1.2, label=name or "corrected")
+    if len(corrected) == 1:
+        lines[-1].set(alpha=0.0, label="_corrected")  # the bar of colours says it
+        _coloured(figure, axes, one)
+    if time is not None:
+        for line in lines:
+            axes.add_line(MapTrack(line, time.run, time(one.stamps_ns)))
+    axes.plot(*one.reference[0], "o", color=INK, markersize=4.0)
+    for track, colour in zip(drawn[1:], (BAD, *_OTHERS), strict=False):
+        axes.plot(*track[-1], "s", color=colour, markersize=3.5)
+    axes.plot(*one.reference[-1], "s", color=INK, markersize=3.5)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("east, m (● start, ■ end)")
+    axes.set_ylabel("north, m")
+    legend_above(axes)
+    return figure
+
+
+def _coloured(figure: Figure, axes: Axes, one: Navigation) -> None:
+    """The corrected track, by its distance from the reference's."""
+    off = np.linalg.norm(one.track_after - one.reference, axis=1)
+    parts = np.stack([one.track_after[:-1], one.track_after[1:]], axis=1)
+    track = LineCollection(list(parts), cmap="viridis", linewidths=1.6, zorder=3.0)
+    track.set_array(0.5 * (off[:-1] + off[1:]))
+    track.set_clim(0.0, max(float(off.max()), 1e-3))
+    axes.add_collection(track)
+    bar = figure.colorbar(track, ax=axes, shrink=0.6, aspect=24, pad=0.02)
+    bar.outline.set_visible(False)
+    bar.set_label("corrected: off by, m")
+
+
+def error_along(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:
+    """Distance of the dead-reckoned position from the reference's, m, along the track."""
+
+    def off(each: Navigation, track: Array) -> Array:
+        return np.asarray(np.linalg.norm(track - each.reference, axis=1))
+
+    figure, axes = new_figure()
+    axes.plot(one.distances, off(one, one.track_before), color=BAD, label="as mounted")
+    for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
+        axes.plot(each.distances, off(each, each.track_after), color=colour, label=name or "corrected")
+    axes.set_xlim(0.0, one.distance_m)
+    axes.set_ylim(0.0, None)
+    axes.set_xlabel("distance along the track, m")
+    axes.set_ylabel("off the reference's track, m")
     legend_above(axes)
     return figure

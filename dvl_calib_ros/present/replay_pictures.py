@@ -10,8 +10,8 @@ from ..calibration.models import MODELS
 from ..calibration.parameters import Parameters
 from ..calibration.results import Result
 from . import replay_figures as figures
-from .style import Picture, picture
-from .terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
+from .error_terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
+from .figure_style import Picture, picture
 from .time_axis import TimeAxis
 
 BODY_AXES = ("ahead", "to port", "up")

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
 from ..calibration.frames import Array
-from .exploring import BREAK_MARK, mark_time
+from .figure_data import BREAK_MARK, mark_time
 from .numbers import fitting_unit
 
 # Points of a line: more cannot be seen at this width

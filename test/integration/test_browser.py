@@ -14,7 +14,7 @@ from report_fixtures import comparison, cross_checked, diagnosis, evaluation, re
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.discovery.discover import Given
 from dvl_calib_ros.parallel import Workers
-from dvl_calib_ros.present.reports import write_report
+from dvl_calib_ros.present.page import write_report
 
 pytestmark = pytest.mark.slow
 

@@ -18,7 +18,7 @@ from dvl_calib_ros.cli.live_view import rendered
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.files.result_file import result_document, result_text
 from dvl_calib_ros.node.status import Status
-from dvl_calib_ros.present.folding import Folding
+from dvl_calib_ros.present.terminal import Folding
 
 WIDTHS = [80, 40, 20]
 

@@ -178,7 +178,7 @@ def simulators(folder: Path) -> None:
     """Five recordings at sea against a simulator's DVL: the error as it is, with what it lacks, and the noise."""
     from matplotlib.figure import Figure
 
-    from dvl_calib_ros.present.style import drawing
+    from dvl_calib_ros.present.figure_style import drawing
 
     bags, made, page = folder / "bags", folder / "gz", folder / "simulators.html"
     dvl_calib("import", snapir_ins(), "-o", bags, *IMPORT)

@@ -18,8 +18,8 @@ from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict, FoundEffect
 from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.diagnosis import rms
-from dvl_calib_ros.present.reports import write_report
-from dvl_calib_ros.present.twin_pictures import spectrum
+from dvl_calib_ros.present.diagnosis_pictures import spectrum
+from dvl_calib_ros.present.page import write_report
 from dvl_calib_ros.verdict.reasons import finding
 
 pytestmark = pytest.mark.slow  # a diagnosis and its figures take seconds each

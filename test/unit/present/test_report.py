@@ -23,10 +23,10 @@ from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
-from dvl_calib_ros.present.exploring import MapTrack, explorable
+from dvl_calib_ros.present.figure_data import MapTrack, explorable
+from dvl_calib_ros.present.figure_style import MODEL_STYLES, new_figure
+from dvl_calib_ros.present.page import write_replay_report, write_report
 from dvl_calib_ros.present.replay_figures import ModelLine, estimate_over_time, held_out_errors
-from dvl_calib_ros.present.reports import write_replay_report, write_report
-from dvl_calib_ros.present.style import MODEL_STYLES, new_figure
 from dvl_calib_ros.present.time_axis import TimeAxis
 from dvl_calib_ros.verdict.kinds import Severity
 
@@ -376,7 +376,7 @@ def test_without_the_plot_library_the_message_says_what_to_install(tmp_path, cap
 def test_a_replay_without_report_imports_no_plots(tmp_path):
     bag = write_bag(tmp_path / "bag", run())
     statement = f"from dvl_calib_ros.cli.main import main; main(['replay', {str(bag)!r}])"
-    assert in_fresh_process(statement, ["matplotlib", "jinja2", "dvl_calib_ros.present.reports"]) == []
+    assert in_fresh_process(statement, ["matplotlib", "jinja2", "dvl_calib_ros.present.page"]) == []
 
 
 # ------------------------------------------------------------------ evaluation

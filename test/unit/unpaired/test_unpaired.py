@@ -21,7 +21,7 @@ from dvl_calib_ros.diagnosis.results import diagnosis_document
 from dvl_calib_ros.disk.text_files import write_json
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
-from dvl_calib_ros.present.documents import DOCUMENTS
+from dvl_calib_ros.present.result_documents import DOCUMENTS
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection

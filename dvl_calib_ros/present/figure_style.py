@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ..calibration.models import MODELS
-from .exploring import explorable
+from .figure_data import explorable
 
 # Inches. Narrow, so that the text is still legible where a phone shows the figure 340 pixels wide.
 WIDTH, HEIGHT = 4.6, 2.9

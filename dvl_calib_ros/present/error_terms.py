@@ -1,9 +1,14 @@
-"""Error terms as people read them, and the estimates of models in them."""
+"""Error terms as people read them, and the estimates of models in them.
+
+Commands as they are typed, with the options that say what is calibrated.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import shlex
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -97,3 +102,17 @@ def _cells(estimate: Estimate, terms: Sequence[Term]) -> list[str]:
         axis = " (x)" if is_one else ""
         cells.append(with_std(*(term.factor * each[term.row] for each in (value, std)), signed=True) + axis + mark)
     return cells
+
+
+def typed(command: str, bags: Iterable[Path], *options: object) -> str:
+    """A line to type."""
+    return shlex.join(["dvl-calib", *command.split(), *map(str, bags), *map(str, options)])
+
+
+def options(
+    topics: Iterable[tuple[str, str | None]], overrides: Iterable[str], parameters: Path | None = None
+) -> list[str]:
+    """What names topics (role and name, None for those that are found) and parameters."""
+    words = [] if parameters is None else ["--params", str(parameters)]
+    words += [word for override in overrides for word in ("-p", override)]
+    return words + [word for role, name in topics if name is not None for word in (f"--{role}-topic", name)]
