@@ -11,17 +11,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from .comparisons import COMPARISONS
-from .configurations import CONFIGURATIONS
-from .diagnoses import DIAGNOSES
-from .discoveries import DISCOVERIES
+from .conclusions import COMPARISONS, DIAGNOSES, UNPAIRED
+from .configurations import CONFIGURATIONS, DISCOVERIES
 from .doctor import DOCTOR
 from .findings import FINDINGS
 from .kinds import Kind, Severity
-from .manoeuvres import MANOEUVRES
-from .selections import SELECTIONS
-from .unpaired import UNPAIRED
-from .verdicts import VERDICTS
+from .verdicts import MANOEUVRES, SELECTIONS, VERDICTS
 
 _FIELD = re.compile(r"\{[^{}]*\}")
 # What each table is of.

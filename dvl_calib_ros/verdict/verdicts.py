@@ -1,8 +1,14 @@
-"""Why a calibration is to be used, to be used with care, or not to be used: the reasons of its verdict."""
+"""Why a calibration is to be used, to be used with care, or not to be used: the reasons of its verdict.
+
+What to drive next so that a calibration becomes good enough, and that it is.
+
+Why a model's estimate is the one: as a replay and /diagnostics say it of the selected model.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 from .kinds import Kind, Severity
 
@@ -181,3 +187,115 @@ _KINDS = (
     ),
 )
 VERDICTS = tuple(replace(kind, page="troubleshooting.md#reasons-of-a-verdict") for kind in _KINDS)
+
+
+_Said = partial(Kind, page="troubleshooting.md#what-to-drive-next", severity=Severity.ACCEPT, remedy="")
+MANOEUVRES = (
+    _Said("NEXT_LEG", "drive straight, {name} ({compass:.0f}°)", "Another heading tells a current from the mounting."),
+    _Said("NEXT_AHEAD", "drive straight ahead", "Motion ahead shows yaw, pitch and scale."),
+    _Said("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", "An angle shows in proportion to the speed."),
+    _Said("NEXT_SPEEDS", "speed up and slow down by half", "A delay shows in accelerations, a bias at two speeds."),
+    _Said("NEXT_CIRCLE", "circle to {side}", "Turns show the lever arm, and average what stays with the earth."),
+    _Said("NEXT_EIGHT", "drive a figure eight", "Turns to both sides tell a lever arm from a yaw."),
+    _Said("NEXT_DIVE", "dive and rise by 10° of pitch", "Pitching shows what the vertical axis brings."),
+    _Said("NEXT_WAIT", "keep on: nothing is learnt yet", "The models have not used a sample, or the vehicle stands."),
+    _Said(
+        "NEXT_REJECTED",
+        "nothing: the findings say why this calibration is not to be used",
+        "A replay would reject it: more data of the same kind do not help.",
+    ),
+    _Said(
+        "NEXT_STANDS",
+        "keep on: the goal is reached, if it stays so",
+        "What is predicted differs from second to second, so that it has to stand for half a minute.",
+    ),
+    _Said("NEXT_IS_GOOD", "good enough: save", "The predicted drift is within target_drift."),
+    _Said(
+        "NEXT_IS_GOOD_BUT_SCALE",
+        "as good as it gets without a reference: save; the scale stays unknown",
+        "The drift by yaw is within target_drift. Only a reference velocity shows a scale.",
+    ),
+    _Said(
+        "WORTH_OF_ANOTHER_MODEL",
+        "no longer good enough: the model is {model} now",
+        "Model auto follows the reference. In an outage a model without a reference is in use, and would be saved.",
+        remedy="Wait for the reference, or name the model.",
+    ),
+    _Said(
+        "WORTH_HAS_FALLEN",
+        "no longer good enough: the predicted drift has grown to {worth:.1f} m per km",
+        "Newer data differ from the older by more than the σ had claimed.",
+        remedy="Drive on. If it happens again, look for the cause with `dvl-calib doctor`.",
+    ),
+)
+
+
+_Selected = partial(Kind, page="troubleshooting.md#why-a-model-is-selected", severity=Severity.ACCEPT)
+SELECTIONS = (
+    _Selected("MODEL_NAMED", "set by parameter model", "The parameter names one model.", ""),
+    _Selected("MODEL_CHOSEN", "{by}: {gnss}", "The parameter model is auto or iac, which go by GNSS.", ""),
+    _Selected("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}", "As MODEL_CHOSEN, and by what the data show beside.", ""),
+    _Selected("GNSS_AVAILABLE", "GNSS is available", "References keep coming (gnss_timeout).", ""),
+    _Selected("GNSS_NOT_AVAILABLE", "GNSS is not available", "No reference has come for gnss_timeout.", ""),
+    _Selected(
+        "GNSS_GOING",
+        "GNSS has stopped; the model changes if it stays away for gnss_hysteresis",
+        "No reference comes, but the outage is still short.",
+        "",
+    ),
+    _Selected(
+        "GNSS_COMING",
+        "GNSS is back; the model changes if it stays for gnss_hysteresis",
+        "References come again, but not for long yet.",
+        "",
+    ),
+    _Selected(
+        "HEADINGS_TELL_CURRENT",
+        "headings tell a current from the mounting",
+        "The mounting turns with the vehicle, a current does not.",
+        "",
+    ),
+    _Selected(
+        "HEADINGS_TOO_FEW",
+        "no attitude over headings that would tell a current from the mounting",
+        "On one heading, or without an IMU, a current looks like a mounting.",
+        "",
+    ),
+    _Selected("TRIM_KNOWN", "the trim is known", "The IMU gives roll and pitch, which a model with attitude uses.", ""),
+    _Selected(
+        "ARM_TAKEN_AS_KNOWN",
+        "{model} takes the lever arm as known, and {turns}",
+        "The model that finds the lever arm has it in σ.",
+        "",
+    ),
+    _Selected(
+        "ARM_OR_DELAY_SHOWN",
+        "{model} does not explain the data, which show {shown}",
+        "The model that finds lever arm and delay explains them.",
+        "",
+    ),
+    _Selected(
+        "ARM_LOOKS_LIKE_ANGLE",
+        "on this track a {metres:g} m error of the lever arm looks like {degrees:.1f}° of {angle}",
+        "Turns to one side at one speed do not tell a lever arm from an angle.",
+        "",
+    ),
+    _Selected(
+        "POSITIONS_NOISY",
+        "velocities made of the positions would be off by {noise:.1f} m/s, so these are compared over legs",
+        "Positions with metres of noise: USBL, plain GPS.",
+        "",
+    ),
+    _Selected(
+        "POSITIONS_SELDOM",
+        "positions come too seldom to make velocities of them, so these are compared over legs",
+        "More than three times position_window between two.",
+        "",
+    ),
+    _Selected("ARM_SHOWN", "a lever arm of {axes} m", "Another than the one that was given.", ""),
+    _Selected("DELAY_SHOWN", "DVL stamps {seconds:.2f} s {way}", "Against the clocks of reference and IMU.", ""),
+    _Selected("ARM_OR_DELAY_NOT_TOLD", "a lever arm or a delay", "Neither shows by itself.", ""),
+    _Selected(
+        "NO_EVIDENCE", "{model} explains the data as well", "Nothing speaks for another lever arm or a delay.", ""
+    ),
+)
