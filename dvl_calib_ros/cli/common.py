@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from ..calibration.parameters import Parameters
     from ..discovery.discover import Discovery, Given
-    from ..node.answering import AnsweringNode
-    from ..node.ending import Ending
+    from ..node.services import AnsweringNode
+    from ..node.shutdown import Ending
     from ..present.document import Document
     from ..recordings.recording import Recording
 
@@ -252,14 +252,14 @@ def deliver(answer: Callable[[], None], *writes: tuple[Path | None, Callable[[Pa
 def ros_node(what: str, name: str) -> Iterator[tuple[AnsweringNode, Ending]]:
     """A node of this process, and what asks the process to end. what: the command or option. Raises InputError."""
     from ..errors import needing_ros
-    from ..node.ending import Ending
+    from ..node.shutdown import Ending
 
     with Ending() as ending:
         with needing_ros(what):
             import rclpy
             from rclpy.signals import SignalHandlerOptions
 
-            from ..node.answering import AnsweringNode
+            from ..node.services import AnsweringNode
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         node = AnsweringNode(name)
         try:

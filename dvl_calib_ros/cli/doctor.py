@@ -84,7 +84,7 @@ def _record(path: Path, seconds: float) -> None:
     with common.ros_node("--live", "dvl_calib_doctor") as (node, ending):
         from rclpy.executors import SingleThreadedExecutor
 
-        from ..node.recorder import TopicRecorder
+        from ..node.topic_recorder import TopicRecorder
 
         executor = SingleThreadedExecutor()
         executor.add_node(node)

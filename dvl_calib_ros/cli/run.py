@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Translate the options for ROS 2 and run the node."""
-    from ..node.ending import Ending
+    from ..node.shutdown import Ending
 
     with Ending() as ending:  # before anything that takes long
         common.load(arguments)  # a bad file or value is said here, in one line, before ROS starts

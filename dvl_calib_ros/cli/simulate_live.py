@@ -61,7 +61,7 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
 def run(arguments: argparse.Namespace, scenario: Scenario) -> None:
     """Publish until the end, or until Ctrl-C. Raises InputError."""
     from ..errors import needing_ros
-    from ..node.ending import Ending
+    from ..node.shutdown import Ending
 
     with Ending() as ending:
         with needing_ros("--live"):

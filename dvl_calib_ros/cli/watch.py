@@ -19,8 +19,8 @@ from ..streams import say
 from . import common
 
 if TYPE_CHECKING:
-    from ..node.ending import Ending
     from ..node.listener import Listener
+    from ..node.shutdown import Ending
 
 # How long a node may take to save, s.
 PATIENCE_S = 60.0
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Watch until Ctrl-C."""
     from ..files.parameter_files import NODE_NAME
-    from ..node.ending import Ending
+    from ..node.shutdown import Ending
     from .live_view import show
 
     with Ending() as ending, _listener(arguments.node or NODE_NAME) as listener:

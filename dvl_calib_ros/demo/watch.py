@@ -22,8 +22,8 @@ from rich.table import Table
 
 from ..calibration.correction import NOT_ESTIMATED
 from ..files.parameter_files import NODE_NAME
-from ..node.answering import AnsweringNode
 from ..node.calibration_node import QUEUE
+from ..node.services import AnsweringNode
 from ..recordings.topics import Topics
 from .player import BagPlayer
 

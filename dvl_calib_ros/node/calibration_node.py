@@ -55,21 +55,18 @@ from ..messages.live_feed import MessageFeed
 from ..streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
-from .answering import AnsweringNode
-from .card import Card
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
-from .discovering import Discovering
-from .graph import input_problems, output_problems, twin_problems
-from .gravity_seen import GravitySeen
-from .inbox import Arrived, in_order_of_arrival, take
-from .late_clocks import LateClocks
+from .live_checks import GravitySeen, LateClocks, Pauses, steady_s
+from .live_discovery import Discovering
+from .message_queue import Arrived, in_order_of_arrival, take
 from .message_types import velocity_class
-from .mounting import MountingOutput
-from .parameters import declare_parameters
-from .pauses import Pauses, steady_s
+from .operator_card import Card
+from .ros_parameters import declare_parameters
+from .services import AnsweringNode
 from .status import status_name
-from .transforms import Transforms
-from .water import WaterHeard
+from .topic_graph import input_problems, output_problems, twin_problems
+from .transforms import MountingOutput, Transforms
+from .water_topics import WaterHeard
 
 # Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
 QUEUE = 5000

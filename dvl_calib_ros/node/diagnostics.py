@@ -28,7 +28,7 @@ from ..calibration.water import CauseOfScale, Water, cause_of_scale
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
-from .card import Card
+from .operator_card import Card
 
 # A stream that has brought nothing usable for so long is silent, s.
 SILENCE_S = 5.0

@@ -12,7 +12,7 @@ from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from ..errors import InputError, printable
-from .answering import AnsweringNode
+from .services import AnsweringNode
 from .status import Status, status_name
 
 # What a node can be asked for.

@@ -1,10 +1,16 @@
 """Start and stop of the node: arguments, signals, exit codes.
 
 What takes long to import is imported below, so that signals are looked after from the first moment on.
+
+Memory that goes back to the system once it is free.
+
+What glibc learns from arrays that come and go is to keep their room, and small ones that stay then cut it into pieces:
+a node's memory climbs for hours although it holds no more than at the start.
 """
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import sys
 from collections.abc import Sequence
@@ -13,7 +19,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from .ending import Ending
+    from .shutdown import Ending
 
 # A thread that computes gives way to one with a message after so long, s; by default after 0.005.
 GIVES_WAY_S = 0.0005
@@ -29,7 +35,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """
     try:
         from ..streams import open_streams
-        from .ending import Ending
+        from .shutdown import Ending
 
         open_streams()
         given = list(sys.argv[1:] if args is None else args)
@@ -52,7 +58,6 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
             from ..calibration.parameters import ParameterError
             from .calibration_node import CalibrationNode
             from .executor import ReceivingExecutor
-            from .memory import give_back_at_once
     except InputError as error:
         return _refused(error)
     if ending.requested:
@@ -106,3 +111,18 @@ def _refused(error: Exception | str) -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+# Of `mallopt` (3). Set, they stay what they are: glibc raises them otherwise with the largest array that is given back.
+_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+# Arrays of at least so many bytes have memory of their own: what comes with each message is smaller.
+LARGE = 1 << 17
+
+
+def give_back_at_once() -> bool:
+    """Have large arrays be given back to the system when they are freed; False where that cannot be asked for."""
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):  # no glibc
+        return False
+    return all(mallopt(what, LARGE) for what in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))

@@ -31,10 +31,9 @@ from ..messages.drivers import TWIST_TYPE, TYPES_OF, VELOCITY_TYPES
 from ..messages.encode import FRAME_IDS
 from ..simulation.live_simulation import Follower, MotionSample, Sample, in_order, shifted
 from ..simulation.scenario import START_NS, Scenario, simulate
-from .answering import AnsweringNode
-from .dvl_message import fill
-from .ending import Ending
-from .message_types import message_class
+from .message_types import fill, message_class
+from .services import AnsweringNode
+from .shutdown import Ending
 
 NODE_NAME = "dvl_simulator"
 # Messages that may wait for a slow subscriber, or in the queue of the odometry

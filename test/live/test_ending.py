@@ -22,8 +22,8 @@ from stress_ending import stress
 
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.disk.yaml_files import load_yaml
-from dvl_calib_ros.node.ending import ENDING, Ending
 from dvl_calib_ros.node.main import parameter_files
+from dvl_calib_ros.node.shutdown import ENDING, Ending
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 
 # ---------------------------------------------------------------- the flag
@@ -47,7 +47,7 @@ def test_a_signal_becomes_a_flag_wakes_who_waits_and_raises_nothing(number):
 
 IN_THE_MIDST = """
 import signal, sys
-from dvl_calib_ros.node.ending import Ending
+from dvl_calib_ros.node.shutdown import Ending
 
 def again(frame, event, argument):
     global left
@@ -71,7 +71,7 @@ def test_a_signal_that_comes_while_another_is_taken_does_not_wait_for_it():
 
 def test_who_is_told_is_told_again_until_it_has_heard(monkeypatch):
     """A wake-up that the middleware loses must not leave a node that waits for ever."""
-    monkeypatch.setattr("dvl_calib_ros.node.ending.AGAIN_S", 0.2)
+    monkeypatch.setattr("dvl_calib_ros.node.shutdown.AGAIN_S", 0.2)
     before = signal.getsignal(signal.SIGINT)
     told = threading.Semaphore(0)
     with Ending() as ending:

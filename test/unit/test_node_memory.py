@@ -7,7 +7,7 @@ import sys
 
 _WORK = """
 import numpy as np
-from dvl_calib_ros.node.memory import give_back_at_once
+from dvl_calib_ros.node.main import give_back_at_once
 
 def resident():
     with open("/proc/self/statm") as file:

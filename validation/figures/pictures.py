@@ -118,8 +118,8 @@ def watch(folder: Path) -> None:
     from dvl_calib_ros.calibration.parameters import Parameters
     from dvl_calib_ros.cli.live_view import rendered
     from dvl_calib_ros.messages.live_feed import MessageFeed
-    from dvl_calib_ros.node.card import Card
     from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
+    from dvl_calib_ros.node.operator_card import Card
     from dvl_calib_ros.node.status import Status
 
     calibrator = Calibrator(Parameters())

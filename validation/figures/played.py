@@ -15,7 +15,7 @@ from dvl_calib_ros.calibration.folds import FOLDS, folds_of
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import Streams
 from dvl_calib_ros.messages.decode import MessageDecoder
-from dvl_calib_ros.node.card import Card
+from dvl_calib_ros.node.operator_card import Card
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.verdict.kinds import Severity

@@ -12,7 +12,7 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.calibration.worth import PredictedDrift, predicted_drift
-from dvl_calib_ros.node.card import LEAST_LOOKS, SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, RecentWorth
+from dvl_calib_ros.node.operator_card import LEAST_LOOKS, SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, RecentWorth
 
 RUN = MatchedRun("box", 120.0, (0.0, 0.0, 0.05), dvl_std=0.01, gnss_std=0.03, frame=VelocityFrame.ENU)
 
@@ -74,7 +74,7 @@ def predicted_drift_of(calibrator, estimate):
 
 def test_what_to_drive_next_is_thought_of_now_and_then(monkeypatch):
     calls = []
-    from dvl_calib_ros.node import card as module
+    from dvl_calib_ros.node import operator_card as module
 
     real = module.outlook
     monkeypatch.setattr(module, "outlook", lambda *given: calls.append(1) or real(*given))

@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'"
 from dvl_calib_ros.calibration.parameters import Parameters
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.drivers import TWIST_TYPE
-from dvl_calib_ros.node.discovering import Discovering
+from dvl_calib_ros.node.live_discovery import Discovering
 
 
 def searching(*topics):
@@ -62,7 +62,7 @@ def test_a_full_disk_ends_the_search(monkeypatch):
 def test_a_topic_that_brings_something_each_10_s_is_listened_to_for_longer(monkeypatch, heard, after, is_enough):
     """As a USBL: of two positions there is one difference, of one none."""
     now = 100.0
-    monkeypatch.setattr("dvl_calib_ros.node.discovering.time", SimpleNamespace(monotonic=lambda: now))
+    monkeypatch.setattr("dvl_calib_ros.node.live_discovery.time", SimpleNamespace(monotonic=lambda: now))
     search = searching("/dvl")
     search.step()
     recorder = search._recording.recorder

@@ -9,7 +9,7 @@ import pytest
 
 from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.node.gravity_seen import GravitySeen
+from dvl_calib_ros.node.live_checks import GravitySeen
 
 
 def message(at_s, *, sign=1.0, unit=9.81, inverted=False):

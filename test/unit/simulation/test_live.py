@@ -18,7 +18,7 @@ from dvl_calib_ros.effects.registry import EFFECTS, NOISE_EFFECTS
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.decode import MessageDecoder
 from dvl_calib_ros.messages.drivers import DVL_TYPES
-from dvl_calib_ros.node.dvl_message import fill
+from dvl_calib_ros.node.message_types import fill
 from dvl_calib_ros.simulation.found_effects import with_dvl
 from dvl_calib_ros.simulation.injection import Injection, injection
 from dvl_calib_ros.simulation.live_simulation import Follower, MotionSample, in_order

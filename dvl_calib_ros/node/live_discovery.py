@@ -22,7 +22,7 @@ from ..errors import InputError
 
 if TYPE_CHECKING:
     from ..discovery.discover import Discovery
-    from .recorder import TopicRecorder
+    from .topic_recorder import TopicRecorder
 
 # So long is recorded, s; longer, where a topic that has a publisher has not brought so many messages yet: a USBL gives
 # a position each 5 to 10 s.
@@ -106,7 +106,7 @@ class Discovering:
         self._node.get_logger().info(f"nobody publishes the DVL's topic; looking through the others ({topics}) ...")
         try:
             from ..bags.writer import BagWriter
-            from .recorder import TopicRecorder
+            from .topic_recorder import TopicRecorder
         except ImportError as error:
             raise InputError(f"discover needs rosbags ({error}); pip install dvl_calib_ros, or remap topics") from error
         folder, ends = TemporaryDirectory(prefix="dvl_calib_"), ExitStack()

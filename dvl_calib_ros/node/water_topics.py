@@ -16,7 +16,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from ..calibration.water import Water
 from ..errors import InputError
 from ..messages.water_properties import WaterCollector, readers, water_of
-from .inbox import take
+from .message_queue import take
 from .message_types import message_class
 
 # New topics are looked for each so many seconds; of each so many of the last readings are kept, one a second.
