@@ -18,8 +18,8 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from dvl_calib_ros.calibration.frames import Array
+from dvl_calib_ros.cli.demo import private_domain
 from dvl_calib_ros.disk.yaml_files import load_yaml
-from dvl_calib_ros.node.domain import private_domain
 
 from . import Measurement
 

@@ -21,7 +21,7 @@ from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
 
-from dvl_calib_ros.node.domain import give_back, take_domain
+from dvl_calib_ros.cli.demo import give_back, take_domain
 from dvl_calib_ros.node.main import main
 
 PATIENCE_S = 60.0

@@ -28,7 +28,7 @@ from ..recordings.recording import Recording, open_recording
 from ..simulation.scenario import Scenario
 from ..verdict.answering import Answering
 from .calibrated import Calibration, Mounting
-from .printed import framed, printed
+from .output import framed, printed
 
 if TYPE_CHECKING:
     from ..bags.recover import Recovered
@@ -658,7 +658,7 @@ def report(
     InputError
         If the file cannot be written, or a page needs what was not kept or is not installed.
     """
-    from .reports import write
+    from .output import write
 
     target = Path(path)
     write(result, target)

@@ -104,7 +104,7 @@ class Calibration:
 
     def _repr_html_(self) -> str:
         from ..present.replay import replayed
-        from .printed import text_of
+        from .output import text_of
 
         return text_of(replayed(self.replayed, self.bags, ()), as_html=True)
 
@@ -200,7 +200,7 @@ class Calibration:
             Without pandas.
         """
         from ..present.replay import replayed
-        from .printed import frames_of
+        from .output import frames_of
 
         return frames_of(replayed(self.replayed, self.bags, tuple(MODELS)))
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from ..streams import give_up
 from . import common
-from .reporting import add_report_option, report_writer
+from .common import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from ..calibration.extrinsics import Extrinsics

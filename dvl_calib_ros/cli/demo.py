@@ -4,19 +4,24 @@ Starts the real node in a process of its own, plays a bag with a GNSS outage to 
 a ROS domain of its own), shows the estimates converge, switches a model by the parameter service, then replays the
 same bag offline and prints both results beside the truth; last, it asks whether anything is left that a simulator
 would lack.
+
+A ROS domain of one's own, so as neither to hear nor to disturb a vehicle that is running.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import random
+import socket
 import subprocess
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..errors import InputError
 from . import common
-from .reporting import add_report_option, report_writer
+from .common import add_report_option, report_writer
 from .watch import node_command
 
 if TYPE_CHECKING:
@@ -39,7 +44,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Play, watch, compare."""
     from ..calibration.models import MODELS
     from ..errors import InputError, needing_ros
-    from ..node.domain import private_domain
 
     if not 0.1 <= arguments.speed <= 1000.0:
         raise InputError("--speed: give a number in 0.1 .. 1000")
@@ -154,3 +158,57 @@ def _show_diagnosis(out: Any, bag: Path) -> None:
     out.print("\n[bold]3. Diagnosis[/]: what a simulator would lack beside this bag, `dvl-calib diagnose`\n")
     diagnosis = diagnose([bag], Parameters(min_speed=0.0))
     out.print(f"[bold]{diagnosis.verdict.value}[/]: {diagnosis.sentence}", soft_wrap=True)
+
+
+# Of RTPS (DDS Interoperability Wire Protocol 2.5, section 9.6.2): port of the first participant's discovery traffic
+PORT_BASE, DOMAIN_GAIN, FIRST_PARTICIPANT = 7400, 250, 10
+# Above, ports are those that systems give to outgoing connections.
+DOMAINS = range(1, 101)
+# By domain, what keeps others from taking it until a participant is there: a name that only one socket of this host can
+# have, and that is free again when its process ends, however it ends.
+_taken: dict[int, socket.socket] = {}
+
+
+def private_domain() -> dict[str, str]:
+    """Environment variables of processes that are on a free domain and heard on this host only."""
+    return {"ROS_DOMAIN_ID": str(take_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+
+
+def take_domain() -> int:
+    """Take a domain, at random, that nobody took and on which this host has no participant.
+
+    It stays taken until `give_back` or the end of this process. Raises InputError if there is none.
+    """
+    for domain in random.sample(DOMAINS, len(DOMAINS)):
+        if _take(domain):
+            if not _has_participant(domain):
+                return domain
+            give_back(domain)
+    raise InputError(
+        f"every ROS domain from {DOMAINS[0]} to {DOMAINS[-1]} has a participant on this host; end some of them"
+    )
+
+
+def give_back(domain: int) -> None:
+    """Let others take a domain that this process took."""
+    _taken.pop(domain).close()
+
+
+def _take(domain: int) -> bool:
+    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        claim.bind(f"\0dvl_calib_ros/domain/{domain}")
+    except OSError:
+        claim.close()
+        return False
+    _taken[domain] = claim
+    return True
+
+
+def _has_participant(domain: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", PORT_BASE + DOMAIN_GAIN * domain + FIRST_PARTICIPANT))
+        except OSError:
+            return True
+    return False

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 from ..streams import say
 from . import common
-from .reporting import add_report_option, report_writer
+from .common import add_report_option, report_writer
 
 LIVE_S = 20.0
 # New topics are looked for so often, s.

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from . import common
-from .reporting import add_report_option, report_writer
+from .common import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from ..bag_replay.replay import Replayed

@@ -24,9 +24,9 @@ from std_srvs.srv import Trigger
 from wholes import assert_sound
 
 from dvl_calib_ros.calibration.parameters import SCHEMA
+from dvl_calib_ros.cli.demo import give_back, take_domain
 from dvl_calib_ros.files.result_file import load_result
 from dvl_calib_ros.node.calibration_node import CalibrationNode
-from dvl_calib_ros.node.domain import give_back, take_domain
 
 _STEPS_NS = (0, 50_000_000, 200_000_000, -50_000_000, 3 * 10**9, -(10**9), 60 * 10**9, 10**17)
 _AT_RUN_TIME = tuple(name for name, spec in SCHEMA.items() if not spec.read_only and name != "result_file")

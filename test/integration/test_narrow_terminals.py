@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.table import Table
 
 from dvl_calib_ros.cli import common
-from dvl_calib_ros.cli.live_view import rendered
 from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.cli.watch import rendered
 from dvl_calib_ros.files.result_file import result_document, result_text
 from dvl_calib_ros.node.status import Status
 from dvl_calib_ros.present.terminal import Folding

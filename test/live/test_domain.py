@@ -13,26 +13,26 @@ from command_line import fail
 from conftest import ROOT
 from ros import World
 
+from dvl_calib_ros.cli import demo
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.node import domain
 
 
 def test_a_domain_with_a_participant_is_not_free_and_without_a_free_one_the_demo_says_so(monkeypatch, capsys):
     world = World()
-    monkeypatch.setattr(domain, "DOMAINS", range(world.domain, world.domain + 1))
-    domain.give_back(world.domain)
+    monkeypatch.setattr(demo, "DOMAINS", range(world.domain, world.domain + 1))
+    demo.give_back(world.domain)
     with pytest.raises(InputError, match="every ROS domain"):
-        domain.take_domain()
+        demo.take_domain()
     assert "every ROS domain from" in fail(capsys, "demo")
-    assert domain._take(world.domain)
+    assert demo._take(world.domain)
     world.close()
-    assert domain.take_domain() == world.domain
-    domain.give_back(world.domain)
+    assert demo.take_domain() == world.domain
+    demo.give_back(world.domain)
 
 
 def test_of_many_that_ask_at_once_before_any_participant_is_there_no_two_get_one_domain():
     script = (
-        "from dvl_calib_ros.node.domain import take_domain\n"
+        "from dvl_calib_ros.cli.demo import take_domain\n"
         "print(*(take_domain() for _ in range(15)), flush=True)\ninput()"
     )
     command = [sys.executable, "-c", script]
@@ -47,15 +47,15 @@ def test_of_many_that_ask_at_once_before_any_participant_is_there_no_two_get_one
 
 
 def test_a_domain_is_free_again_when_the_process_that_took_it_was_killed(monkeypatch):
-    script = "from dvl_calib_ros.node.domain import take_domain\nprint(take_domain(), flush=True)\ninput()"
+    script = "from dvl_calib_ros.cli.demo import take_domain\nprint(take_domain(), flush=True)\ninput()"
     process = subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT
     )
     taken = int(process.stdout.readline())
-    monkeypatch.setattr(domain, "DOMAINS", range(taken, taken + 1))
+    monkeypatch.setattr(demo, "DOMAINS", range(taken, taken + 1))
     with pytest.raises(InputError, match="every ROS domain"):
-        domain.take_domain()
+        demo.take_domain()
     process.kill()
     process.communicate()
-    assert domain.take_domain() == taken
-    domain.give_back(taken)
+    assert demo.take_domain() == taken
+    demo.give_back(taken)

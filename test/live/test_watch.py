@@ -23,7 +23,7 @@ from runs import MatchedRun, calibrate, make_samples
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.observability import observability
 from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.cli.live_view import LINE_S, SILENCE_S, SURE_S, Keys, line, rendered, show
+from dvl_calib_ros.cli.watch import LINE_S, SILENCE_S, SURE_S, Keys, line, rendered, show
 from dvl_calib_ros.node.status import Status
 
 PATIENCE_S = 30.0
@@ -135,7 +135,7 @@ def test_without_a_terminal_a_line_is_written_when_something_changes_and_now_and
     changes = [None, status(), status(), status(convergence="fine"), status(1, "check", convergence="fine")]
     statuses = iter([*changes, changes[-1], changes[-1]])
     clock = iter([100.0, 100.5, 101.0, 101.5, 102.0, 102.5, 102.6 + LINE_S])
-    monkeypatch.setattr("dvl_calib_ros.cli.live_view.time.monotonic", lambda: next(clock))
+    monkeypatch.setattr("dvl_calib_ros.cli.watch.time.monotonic", lambda: next(clock))
     running = iter([True] * 7 + [False])
     out = io.StringIO()
     show(Console(file=out, width=40), SimpleNamespace(latest=lambda _: next(statuses)), lambda: next(running))
@@ -308,5 +308,5 @@ def test_bad_ros_arguments_are_said_without_a_traceback(world):
 
 
 def test_the_view_needs_no_ros():
-    code = "import sys; sys.modules['rclpy'] = None; import dvl_calib_ros.cli.live_view, dvl_calib_ros.node.status"
+    code = "import sys; sys.modules['rclpy'] = None; import dvl_calib_ros.cli.watch, dvl_calib_ros.node.status"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0

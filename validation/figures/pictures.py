@@ -116,7 +116,7 @@ def watch(folder: Path) -> None:
     from dvl_calib_ros.bags.reader import BagReader
     from dvl_calib_ros.calibration.calibrator import Calibrator
     from dvl_calib_ros.calibration.parameters import Parameters
-    from dvl_calib_ros.cli.live_view import rendered
+    from dvl_calib_ros.cli.watch import rendered
     from dvl_calib_ros.messages.live_feed import MessageFeed
     from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
     from dvl_calib_ros.node.operator_card import Card

@@ -1,17 +1,67 @@
-"""Results as pages and as JSON, by what they are."""
+"""Results as text, as HTML of a notebook, and as data frames: what the commands print of them.
+
+Results as pages and as JSON, by what they are.
+"""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..calibration.comparison import Comparison
 from ..diagnosis.results import Diagnosis
 from ..disk.text_files import write_json
 from ..errors import InputError
 from ..examination.examine import Examination
+from ..present.document import Document
 from .calibrated import Calibration
+
+if TYPE_CHECKING:
+    import pandas
+
+# Columns of what is printed, as of the commands into a pipe
+WIDTH = 160
+
+
+def printed(result: object, as_html: bool) -> str:
+    """The answer of a result, with its tables."""
+    from ..present.result_documents import DOCUMENTS
+
+    return text_of(DOCUMENTS[type(result)](result), as_html)
+
+
+def framed(result: object) -> dict[str, pandas.DataFrame]:
+    """Tables of a result by their headings. Raises InputError without pandas."""
+    from ..present.result_documents import DOCUMENTS
+
+    return frames_of(DOCUMENTS[type(result)](result))
+
+
+def frames_of(document: Document) -> dict[str, pandas.DataFrame]:
+    """Tables of a document by their headings. Raises InputError without pandas."""
+    try:
+        return document.frames()
+    except ModuleNotFoundError:
+        raise InputError("tables need the Python package pandas; pip install pandas") from None
+
+
+def text_of(document: Document, as_html: bool) -> str:
+    """A document as it would be on a terminal, as text or as HTML."""
+    if as_html:
+        from ..present.page import fragment
+
+        return fragment(document)
+    from rich.console import Console
+
+    from ..present.terminal import shown
+
+    # in a notebook rich would show it by itself, beside what is returned
+    console = Console(file=io.StringIO(), record=True, width=WIDTH, force_jupyter=False, highlight=False, emoji=False)
+    for each in shown(document):
+        console.print(each)
+    return "\n".join(line.rstrip() for line in console.export_text().splitlines())
 
 
 def write(result: object, path: Path) -> None:
