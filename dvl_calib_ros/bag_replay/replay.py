@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
 from ..calibration.advice import data_advice, gate_advice, message_advice, reference_advice
 from ..calibration.calibrator import Calibrator
 from ..calibration.comparison import Comparison
@@ -42,6 +41,7 @@ from ..recordings.requirements import check_topics, missing_imu
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
+from ..version import __version__
 from .run_history import Recorder, RunHistory
 
 # Samples that the models are updated by at once: more make the arrays too large for the processor's caches.

@@ -1,10 +1,4 @@
-"""The command line of ``dvl-calib``: its parser, and what becomes of errors, signals and closed streams.
-
-Whether recordings changed while a command read them, as those do that are still being written.
-
-Commands read a recording several times: what is found the first time is used the second. All of that must be of one
-recording.
-"""
+"""The command line of ``dvl-calib``: its parser, and what becomes of errors, signals, closed streams and changed files."""
 
 from __future__ import annotations
 
@@ -19,8 +13,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
 
-from .. import __version__
 from ..streams import give_up, open_streams, say
+from ..version import __version__
 from .commands import COMMANDS
 
 

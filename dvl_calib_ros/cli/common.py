@@ -1,7 +1,4 @@
-"""What several commands share: parameter and topic options, progress, tables of estimates.
-
---report, for the commands that have one.
-"""
+"""Options, progress, reports and tables that several commands share."""
 
 from __future__ import annotations
 

@@ -4,8 +4,6 @@ Starts the real node in a process of its own, plays a bag with a GNSS outage to 
 a ROS domain of its own), shows the estimates converge, switches a model by the parameter service, then replays the
 same bag offline and prints both results beside the truth; last, it asks whether anything is left that a simulator
 would lack.
-
-A ROS domain of one's own, so as neither to hear nor to disturb a vehicle that is running.
 """
 
 from __future__ import annotations

@@ -2,8 +2,6 @@
 
 With --simulator: what a simulator's DVL lacks beside the vehicle's. One sentence with the answer comes first. Several
 bags must be of one vehicle; whole bags are then held out.
-
-`dvl-calib diagnose REAL --simulator SIM`, with --rounds or without: options and output.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Write a bag from a motion, an error model and any effects. The same options and seed give the same bag.
 
 With --live, publish the same on ROS 2 instead, or what the sensors measure on a vehicle whose odometry is followed.
-
-The live part of `simulate`: publish what would be written, or follow a vehicle of another simulator.
 """
 
 from __future__ import annotations

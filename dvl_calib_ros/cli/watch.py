@@ -2,11 +2,6 @@
 
 Ctrl-C or q ends the view, not the node; s saves, r twice forgets all. ``dvl-calib run --watch`` starts a node and
 watches it; there they end both.
-
-What the running node says of itself, for an operator: the mounting, what it is worth, what to drive next.
-
-Everything comes from one status of /diagnostics, so the view works beside the node as well as far from it. By keys the
-result is saved, forgotten, or the view left.
 """
 
 from __future__ import annotations

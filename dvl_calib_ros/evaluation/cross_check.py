@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
 from ..bag_replay.replay import replay
 from ..calibration.calibrator import Calibrator
 from ..calibration.delay.hold_out import Terms, ThinnedRecording
@@ -30,6 +29,7 @@ from ..recordings.requirements import hold_the_same
 from ..recordings.topic_messages import Recorded
 from ..recordings.topics import Topics
 from ..verdict.answering import Answering
+from ..version import __version__
 from .metrics import RunMoments, vrmse
 from .results import Failure
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
 from ..calibration.calibrator import Calibrator
 from ..calibration.frames import Array
 from ..calibration.models import LINEAR_MODELS, MODELS
@@ -24,6 +23,7 @@ from ..calibration.results import Result
 from ..calibration.verification import Verification
 from ..errors import InputError
 from ..parallel import Workers, run_all
+from ..version import __version__
 from . import protocol
 from .convergence import curves
 from .estimation import SensorData, streams_of, true_prior

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
 from ..calibration.correction import lever_arm
 from ..calibration.error_model import corrected_mounting
 from ..calibration.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of
@@ -30,6 +29,7 @@ from ..calibration.parameters import FRD, ParameterError, Parameters
 from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity
+from ..version import __version__
 from .parameter_files import NODE_NAME, as_yaml, changed_parameters, load_parameters, new_file, with_parameters
 from .result_file import load_result, static_transform_arguments
 from .urdf import Urdf, UrdfMounting, numbers

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from .. import __version__
 from ..calibration.assembly import prior
 from ..calibration.folds import with_states_of
 from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
@@ -33,6 +32,7 @@ from ..calibration.water import Water, water_document
 from ..disk.atomic import own_stream, save_bytes
 from ..disk.yaml_files import load_yaml
 from ..errors import InputError, printable
+from ..version import __version__
 
 _ANY_FORMAT = "dvl_calib_ros result"
 FORMAT = f"{_ANY_FORMAT} 1"

@@ -8,13 +8,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from .. import __version__
 from ..calibration.parameters import Parameters
 from ..discovery.discover import Given
 from ..errors import InputError
 from ..files.output_paths import check_outputs
 from ..parallel import Lost, Workers, outcomes_as_done
 from ..verdict.answering import Answering
+from ..version import __version__
 from .parquet_parts import PAGE, SCHEMA, Catalogue, CataloguePart
 from .recording_entry import Task, entry_of, failed
 from .recording_search import StoredRecording, as_text, recordings_in, vehicle_pattern

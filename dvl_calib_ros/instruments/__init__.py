@@ -1,1 +1,1 @@
-"""TODO."""
+"""Settings of DVLs and autopilots, and the protocol that sends them to an instrument."""

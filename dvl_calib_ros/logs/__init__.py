@@ -1,1 +1,1 @@
-"""TODO."""
+"""Logs of instruments and autopilots, and trajectories as CSV or NPY, read as samples."""

@@ -1,4 +1,4 @@
-"""TODO."""
+"""Columns of numbers and stamps in CSV files."""
 
 from __future__ import annotations
 

@@ -22,10 +22,10 @@ from typing import Any
 import jinja2
 from markupsafe import Markup, escape
 
-from .. import __version__
 from ..bag_replay.replay import Replayed
 from ..calibration.comparison import Comparison
 from ..disk.atomic import save_bytes, save_text
+from ..version import __version__
 from .comparison_figures import trend_png
 from .document import Document, Section, Warned, Where
 from .figure_style import MODEL_STYLES

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from .. import __version__
 from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..effects.base import ActsOn, EffectInput
 from ..effects.composition import Injection, at_dvl, late, traces, turns
 from ..messages.encode import SampleWriter
+from ..version import __version__
 from .injection import disturbed, injection_document
 from .recorded_motion import MotionSource, recorded_motion
 from .sensors import (

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from .. import __version__
 from ..disk.atomic import own_stream, save_all
 from ..disk.text_files import as_json
 from ..errors import InputError
+from ..version import __version__
 from . import dave, dvl_simulator, gazebo, holoocean, stonefish, uuv_simulator
 from .dvl_description import load_description
 from .writer import Export, Simulator, export, export_document
