@@ -8,13 +8,13 @@ from collections.abc import Callable
 import numpy as np
 
 from dvl_calib_ros.bag_replay.replay import BLOCK_SIZE
-from dvl_calib_ros.calibration import kalman
 from dvl_calib_ros.calibration.assembly import Assembler
 from dvl_calib_ros.calibration.bank import Group, groups_of
-from dvl_calib_ros.calibration.frames import Array
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, Needs
-from dvl_calib_ros.calibration.observations import Observations
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.base import Observations
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics import kalman
+from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.estimation import heave_joined
 

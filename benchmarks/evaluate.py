@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from dvl_calib_ros.calibration.assembly import Assembler
-from dvl_calib_ros.calibration.frames import Array
 from dvl_calib_ros.calibration.height import HeightOfLate
-from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS, Model, Needs
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import Array
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.estimation import SensorData, aligned, heave_joined

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import theilslopes
 
-from dvl_calib_ros.calibration.frames import Array
+from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.cli.demo import private_domain
 from dvl_calib_ros.disk.yaml_files import load_yaml
 

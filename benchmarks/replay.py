@@ -24,7 +24,7 @@ ROUNDS = 3
 # Each runs in a process of its own, so that CPU time and peak memory are its alone.
 _OURS = """
 from pathlib import Path
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.bag_replay.replay import replay
 def work(bag):
     counts = replay([Path(bag)], Parameters()).result.counts
@@ -32,7 +32,7 @@ def work(bag):
 """
 _DOCTOR = """
 from pathlib import Path
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.examination.examine import examine
 def work(bag):
     return sum(content.messages for content in examine([Path(bag)], Parameters()).contents)

@@ -14,7 +14,7 @@ from io_fixtures import Sample, storage_file
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample, VelocityFrame
 
 TWIST = "geometry_msgs/msg/TwistWithCovarianceStamped"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dvl_calib_ros.calibration.kalman import Measurements
+from dvl_calib_ros.calibration.numerics.kalman import Measurements
 
 
 def random_problem(rng, k=3, n_samples=150, n=4, m=3, outliers=0.0, weights=False, gate=np.inf):

@@ -16,11 +16,11 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.results import Result
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.messages.live_feed import MessageFeed

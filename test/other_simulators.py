@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from yaml_text import parsed
 
 from dvl_calib_ros.bags.writer import BagWriter
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.messages.encode import SampleWriter
 from dvl_calib_ros.simulation.trajectories import Motion, Waves, add_waves, make_motion
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample
 from dvl_calib_ros.messages.drivers import POSE_TYPE
 from dvl_calib_ros.messages.encode import SampleWriter
 

@@ -14,10 +14,11 @@ from matplotlib.ticker import FixedLocator
 
 from dvl_calib_ros.bag_replay.replay import Replayed, replay
 from dvl_calib_ros.calibration.comparison import Comparison, compare
-from dvl_calib_ros.calibration.extrinsics import Extrinsics, rotation_of
+from dvl_calib_ros.calibration.extrinsics import Extrinsics
 from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.navigation import Drift, Navigation
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import rotation_of
 from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.followed import Followed
 from dvl_calib_ros.diagnosis.noise_findings import NoiseFinding

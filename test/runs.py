@@ -8,9 +8,9 @@ from functools import cache
 import numpy as np
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import (
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import (
     FRAME_CODES,
     Covariances,
     DvlSample,

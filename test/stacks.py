@@ -18,7 +18,7 @@ from driver_fixtures import Maker
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, cross, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, cross, rotation_from_rpy
 from dvl_calib_ros.simulation.trajectories import Motion, make_motion
 
 START_NS = 1_760_000_000_000_000_000

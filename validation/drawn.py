@@ -20,7 +20,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import beta
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.verdict.verdicts import VERDICTS
 
 from .stacks import ROOT, command, rpy_std_deg

@@ -44,14 +44,14 @@ MUTANTS = (
     ),
     Mutant(
         "frame",
-        "dvl_calib_ros/calibration/frames.py",
+        "dvl_calib_ros/calibration/numerics/frames.py",
         "[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])",
         "[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])",
         (UNIT + "calibration/test_calibrator.py::test_gnss_models_recover_the_errors_from_a_reference_in_any_frame",),
     ),
     Mutant(
         "gate",
-        "dvl_calib_ros/calibration/kalman.py",
+        "dvl_calib_ros/calibration/numerics/kalman.py",
         "use = usable[i] and nis_i <= gate[i]",
         "use = usable[i]",
         (UNIT + "calibration/test_kalman.py",),
@@ -65,7 +65,7 @@ MUTANTS = (
     ),
     Mutant(
         "covariance",
-        "dvl_calib_ros/calibration/kalman.py",
+        "dvl_calib_ros/calibration/numerics/kalman.py",
         "p = ikh @ p @ ikh.T + gain @ r_i @ gain.T",
         "p = ikh @ p @ ikh.T",
         (UNIT + "calibration/test_kalman.py",),

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from dvl_calib_ros.calibration.assembly import prior
 from dvl_calib_ros.calibration.displacement.legs import DeadReckoning, Fixes
 from dvl_calib_ros.calibration.displacement.solve import DisplacementFit, solve
-from dvl_calib_ros.calibration.frames import Array
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import Stamps
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import Array
+from dvl_calib_ros.calibration.numerics.samples import Stamps
 
 
 @dataclass(frozen=True)

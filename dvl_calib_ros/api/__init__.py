@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..calibration.models import BY_VELOCITY
-from ..calibration.parameters import ParameterError, Parameters
+from ..calibration.models.parameter_spec import ParameterError
+from ..calibration.models.parameters import Parameters
 from ..diagnosis.results import Diagnosis
 from ..discovery.discover import Discovery, Given, discover
 from ..errors import InputError

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..bag_replay.replay import Replayed
-from ..calibration.frames import Array
 from ..calibration.models import MODELS
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array
 from ..calibration.quantities import Quantity, quantities
 from ..discovery.discover import Discovery
 from ..errors import InputError

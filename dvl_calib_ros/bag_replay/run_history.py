@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.frames import Array
 from ..calibration.history import StateTrace
 from ..calibration.models import MODELS, Needs
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import AlignedBlock, Codes, Pairing, Stamps
 from ..calibration.observe import Observer
-from ..calibration.parameters import Parameters
 from ..calibration.results import Estimate
-from ..calibration.samples import AlignedBlock, Codes, Pairing, Stamps
 
 # Rows kept of each series at most: a figure shows no more.
 KEPT_STATES, KEPT_VELOCITIES = 300, 800

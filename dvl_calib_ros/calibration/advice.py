@@ -10,7 +10,7 @@ import numpy as np
 from ..verdict.reasons import Reason, finding
 from .comparison_words import date
 from .days import OFFSETS, OFTEN_OFF
-from .parameters import Parameters
+from .models.parameters import Parameters
 from .results import Day, Estimate
 from .told_arm import ARM
 

@@ -14,11 +14,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from .frames import Array
+from .models.parameters import Parameters
+from .numerics.frames import Array
+from .numerics.samples import AlignedBlock, Stream, Streams
 from .one_by_one import OneByOne
-from .parameters import Parameters
 from .partners import add_count
-from .samples import AlignedBlock, Stream, Streams
 from .streams import LONG_AGO_NS
 from .stretch import NO_DECISIONS, Decisions, Events, OrderedStreams, ScreenedStreams, decisions, ordered, screened
 

@@ -7,15 +7,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from . import kalman
-from .chi_square import chi2_cdf, chi2_isf
-from .correction_parameters import PriorOnErrors, of_unseen_roll, to_correction, to_errors
-from .frames import Array
-from .kalman import GaussianState
 from .models import Model
-from .observations import Observations, Unmeasured
-from .parameters import Parameters
-from .samples import Mask
+from .models.base import Observations, Unmeasured
+from .models.parameters import Parameters
+from .numerics import kalman
+from .numerics.chi_square import chi2_cdf, chi2_isf
+from .numerics.error_model import PriorOnErrors, of_unseen_roll, to_correction, to_errors
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
+from .numerics.samples import Mask
 
 
 class Assembler:

@@ -16,9 +16,9 @@ from itertools import product as all_of
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .frames import ENU_FROM_NED, Array, product, rotation_from_quaternion, rotation_vector
 from .imu_alignment import quaternion_product
-from .samples import Index
+from .numerics.frames import ENU_FROM_NED, Array, product, rotation_from_quaternion, rotation_vector
+from .numerics.samples import Index
 
 # The attitude is differentiated over so long, s: 0.05° of its noise are then 0.1 °/s. Longer gaps are passed over.
 SPAN_S, LONGEST_S = 0.5, 1.6

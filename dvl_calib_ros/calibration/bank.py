@@ -17,22 +17,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import kalman
 from .assembly import Assembler
 from .block_scatter import BlockScatter
 from .block_terms import BlockTerms, turns_of
 from .dvl_bias import OfBias
 from .folds import FOLDS, FoldInformation, Moments, folds_of, with_states_of
-from .frames import Array
 from .heading_states import prior_std
 from .heave import HeaveRows, HeaveSums, with_heave
 from .height import HeightOfLate
 from .history import Counts, Standing
-from .kalman import GaussianState
 from .models import Model, Needs
-from .observations import Observations
-from .parameters import Parameters
-from .samples import Index, Mask, Stamps
+from .models.base import Observations
+from .models.parameters import Parameters
+from .numerics import kalman
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
+from .numerics.samples import Index, Mask, Stamps
 
 Ends = Index
 # Blocks by whose scatter σ is checked, s: as long as the noise of a vehicle's motion lasts.

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from .block_terms import BlockTerms, TermsOfBlock, all_told, with_terms
-from .frames import Array
 from .heading_states import HeadingEvidence, HeadingStates, heading_states
-from .kalman import GaussianState
-from .samples import Index, Stamps
-from .time_blocks import TimeBlocks
+from .numerics.block_covariance import TimeBlocks
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
+from .numerics.samples import Index, Stamps
 
 _NO_CUTS = np.zeros(0, dtype=np.intp)
 

@@ -23,10 +23,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .frames import Array, cross, product, skew
-from .robust import median
-from .samples import Index, Stamps
-from .time_blocks import TimeBlocks
+from .numerics.block_covariance import TimeBlocks
+from .numerics.frames import Array, cross, product, skew
+from .numerics.robust import median
+from .numerics.samples import Index, Stamps
 
 # Terms of a block: three axes of a bias of the DVL; sine and cosine of its heading and of twice that, time (s), and
 # one, where references are of the earth, else zeros.

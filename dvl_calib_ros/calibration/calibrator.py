@@ -26,22 +26,19 @@ from .delay.hold_out import Terms, ThinnedRecording
 from .delay.workers import Worker
 from .estimates import Estimates
 from .estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
-from .frames import Array, Vector, rotation_from_quaternion
 from .further import FurtherEstimators
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
 from .judging import Judge
-from .kalman import GaussianState
 from .message_counts import counted
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
+from .models.base import Observations
+from .models.parameter_spec import ParameterError
+from .models.parameters import IAC, Parameters
 from .navigation import Navigation
-from .observations import Observations
-from .observe import Observer
-from .parameters import IAC, ParameterError, Parameters
-from .positions import are_positions, check_model
-from .register.registration import Registration
-from .results import Day, Estimate, Result
-from .samples import (
+from .numerics.frames import Array, Vector, rotation_from_quaternion
+from .numerics.kalman import GaussianState
+from .numerics.samples import (
     FRAME_CODES,
     AlignedBlock,
     DvlSample,
@@ -55,6 +52,10 @@ from .samples import (
     Streams,
     VelocityFrame,
 )
+from .observe import Observer
+from .positions import are_positions, check_model
+from .register.registration import Registration
+from .results import Day, Estimate, Result
 from .selection import Selection
 from .stream_clocks import StreamClocks
 from .verification import Verification

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
-from .chi_square import chi2_sf
 from .extrinsics import (
     GROUPS,
     LEVER_ARM,
@@ -34,9 +33,9 @@ from .extrinsics import (
     TIME_OFFSET,
     TURN,
     Extrinsics,
-    rotation_of,
 )
-from .frames import Array, rotation_vector
+from .numerics.chi_square import chi2_sf
+from .numerics.frames import Array, rotation_of, rotation_vector
 
 # A difference that chance brings more seldom than this is none of chance, over all that is looked at together.
 CHANCE = 0.01

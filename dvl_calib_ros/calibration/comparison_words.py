@@ -11,7 +11,7 @@ import numpy as np
 from ..verdict.reasons import Reason, finding
 from .comparison import CHANCE, Change, Comparison, Difference
 from .extrinsics import COMPONENTS, LEVER_ARM, MOUNTING, ONLY_CLOCK, ONLY_SCALE, SCALE, TIME_OFFSET, TURN
-from .frames import rpy_from_rotation
+from .numerics.frames import rpy_from_rotation
 
 # An axis that takes more than this share of a turn is the one that it is about.
 ABOUT = 0.9

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .error_model import correction_jacobian, correction_matrix
-from .frames import Array
-from .kalman import GaussianState
 from .models import Model
+from .numerics.error_model import correction_jacobian, correction_matrix
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
 
 _SCALE_FIRST = [3, 4, 5, 0, 1, 2]
 NOT_ESTIMATED = -1.0  # variance of a component that the model does not estimate

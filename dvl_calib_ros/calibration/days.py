@@ -17,9 +17,9 @@ from math import atan2, cos, hypot, sin
 
 import numpy as np
 
-from .frames import Array
 from .models import Model
-from .parameters import Parameters
+from .models.parameters import Parameters
+from .numerics.frames import Array
 
 # References are off by so many times `reference_offset_std` without being broken.
 OFTEN_OFF = 4.0

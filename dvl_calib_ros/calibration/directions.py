@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from .frames import Array
+from .numerics.frames import Array
 
 # So many samples, and a speed (m/s), tell a direction.
 ENOUGH, SLOW = 60, 0.2

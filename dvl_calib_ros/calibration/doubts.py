@@ -9,8 +9,8 @@ from ..verdict.reasons import Reason, finding
 from .advice import one_heading_advice
 from .heading_deviation import heading_advice, how_bad
 from .left_over import finds_nothing, lag_of, left_over_advice, std_along
+from .models.parameters import Parameters
 from .navigation import Navigation
-from .parameters import Parameters
 from .positions import are_positions
 from .results import Estimate
 from .told_arm import told_arm_advice

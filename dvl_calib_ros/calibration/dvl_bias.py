@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .frames import Array
-from .kalman import GaussianState
-from .samples import Mask
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
+from .numerics.samples import Mask
 
 
 class OfBias(NamedTuple):

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .frames import Array
-from .robust import median, steps
+from .numerics.frames import Array
+from .numerics.robust import median, steps
 
 # Blocks of so many samples are looked at; so many of them tell anything.
 FEWEST, ENOUGH = 12, 6

@@ -11,12 +11,12 @@ from . import told_arm
 from .assembly import nis_bounds
 from .days import day_covariance, offset_covariance
 from .estimator import Estimator
-from .frames import Array
 from .further import FurtherEstimators
-from .kalman import GaussianState
 from .models import EXTENDED_BY, MODELS, Model
+from .models.parameters import Parameters
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
 from .observability import MEASURES_VERTICAL, convergence, observability
-from .parameters import Parameters
 from .results import Estimate
 
 # Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.

@@ -21,16 +21,17 @@ from .delay.hold_out import Terms, ThinnedRecording
 from .delay.workers import Worker
 from .dvl_bias import OfBias
 from .folds import Moments
-from .frames import Array
 from .history import Counts, Numbers, StateTrace
-from .kalman import GaussianState
 from .models import Model
-from .models.plugged import load
+from .models.parameter_spec import ParameterError
+from .models.parameters import Parameters
+from .models.plugins import load
 from .navigation import Navigation
-from .parameters import ParameterError, Parameters
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
+from .numerics.samples import Index, Stamps
 from .register.registration import Registration
 from .results import Day
-from .samples import Index, Stamps
 from .selection import NO_EVIDENCE, Evidence
 from .verification import HeldOutError, held_out_error
 

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .days import day_covariance
-from .error_model import corrected_mounting
-from .frames import Array, quaternion_from_rotation, rotation_vector, skew
-from .kalman import GaussianState
 from .models import Model
+from .models.parameters import FLU, FRD, Parameters
+from .numerics.error_model import corrected_mounting
+from .numerics.frames import Array, quaternion_from_rotation, turn_between
+from .numerics.kalman import GaussianState
 from .observability import OBSERVED_SHARE
-from .parameters import FLU, FRD, Parameters
 
 COMPONENTS = (
     "turn_x", "turn_y", "turn_z", "lever_arm_x", "lever_arm_y", "lever_arm_z", "scale", "time_offset",
@@ -176,17 +176,3 @@ def _unknown(p: Parameters) -> Array:
     """(8,) standard deviations without data."""
     angle, scale = p.initial_std_misalignment, p.initial_std_scale
     return np.array([*[angle] * 3, *[p.initial_std_lever_arm] * 3, scale, p.initial_std_time_offset])
-
-
-def turn_between(before: Array, after: Array) -> Array:
-    """Axis times angle (3,) rad of the turn from one mounting (3, 3) to another, about the body's axes."""
-    return rotation_vector(quaternion_from_rotation(after @ before.T))
-
-
-def rotation_of(vector: Array) -> Array:
-    """Inverse of `turn_between` from no turn at all: (3,) rad -> (3, 3) (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0.0:
-        return np.eye(3)
-    k = skew(np.asarray(vector) / angle)
-    return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * k @ k)

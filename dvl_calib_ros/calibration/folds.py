@@ -14,11 +14,11 @@ from copy import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from .frames import Array
-from .kalman import GaussianState, Measurements
-from .observations import Observations
-from .parameters import Parameters
-from .samples import Stamps
+from .models.base import Observations
+from .models.parameters import Parameters
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState, Measurements
+from .numerics.samples import Stamps
 
 FOLDS = 5
 

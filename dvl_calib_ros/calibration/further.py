@@ -12,8 +12,8 @@ from ..verdict.reasons import Reason
 from .delay.clocks import Rest
 from .delay.hold_out import ThinnedRecording
 from .estimator import NEVER, Estimator
+from .numerics.samples import Index, Stamps
 from .register.registration import Registration
-from .samples import Index, Stamps
 
 _Answer = TypeVar("_Answer")
 

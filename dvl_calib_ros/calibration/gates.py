@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .frames import Array, Vector
-from .parameters import Parameters
-from .samples import Codes, Mask, SampleUse, Stamps
+from .models.parameters import Parameters
+from .numerics.frames import Array, Vector
+from .numerics.samples import Codes, Mask, SampleUse, Stamps
 
 
 class Gates:

@@ -27,10 +27,10 @@ import numpy as np
 
 from .block_terms import N_BIAS, N_TERMS
 from .dvl_bias import OfBias
-from .frames import Array, product
-from .kalman import GaussianState
-from .samples import Index, Mask
-from .time_blocks import BlocksOfOne, TimeBlocks, inflations
+from .numerics.block_covariance import BlocksOfOne, TimeBlocks, inflations
+from .numerics.frames import Array, product
+from .numerics.kalman import GaussianState
+from .numerics.samples import Index, Mask
 
 # Prior σ of the coefficients of the heading, of heading_deviation_std: one cycle, two cycles, and a drift from first to
 # last.

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from .frames import Array
+from .models.base import Observations
 from .models.own import UPRIGHT
-from .observations import Observations
-from .parameters import Parameters
-from .samples import Mask, Stamps
+from .models.parameters import Parameters
+from .numerics.frames import Array
+from .numerics.samples import Mask, Stamps
 from .streams import LONG_AGO_NS
 
 # Judged once in so long, by stamps: whoever feeds samples in blocks comes to the same answer.

@@ -24,10 +24,10 @@ import numpy as np
 
 from .block_terms import N_BIAS, N_TERMS
 from .folds import FoldSums, folds_of
-from .frames import Array, product
-from .kalman import GaussianState
-from .parameters import Parameters
-from .samples import Index, Mask, Stamps
+from .models.parameters import Parameters
+from .numerics.frames import Array, product
+from .numerics.kalman import GaussianState
+from .numerics.samples import Index, Mask, Stamps
 
 # Waves have periods of up to 20 s.
 BLOCK_NS = 20_000_000_000

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from .frames import Array
-from .samples import Stamps
+from .numerics.frames import Array
+from .numerics.samples import Stamps
 
 # What was so long ago is forgotten, s: a pitch that is wrong by 3 degrees adds up to 10 m at 2 m/s, and stays there,
 # where a model takes it for a part of its constant current.

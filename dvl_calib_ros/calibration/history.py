@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .frames import Array
+from .numerics.frames import Array
 
 Numbers = NDArray[np.int64]
 

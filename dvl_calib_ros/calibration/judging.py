@@ -9,13 +9,13 @@ import numpy as np
 from ..verdict.reasons import Reason
 from .delay.hold_out import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
 from .doubts import doubts
-from .error_model import correction_matrix
 from .estimates import Estimates
 from .folds import Moments, folds_of
-from .frames import Array
-from .kalman import GaussianState
 from .models import MODELS, Model
 from .navigation import Navigation, dead_reckoned, objections
+from .numerics.error_model import correction_matrix
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
 from .results import Estimate
 from .told_arm import finds_arm
 from .verification import SEVERAL, HeldOutError, Verification, calibration_error, verify

@@ -24,13 +24,13 @@ import numpy as np
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .attitude_rates import LEVEL_BELOW
-from .frames import Array, cross, skew
 from .models import MODELS
-from .parameters import Parameters
+from .models.parameters import Parameters
+from .numerics.block_covariance import alike_of, of_few
+from .numerics.frames import Array, cross, skew
+from .numerics.robust import median, robust_std
+from .numerics.samples import Index
 from .results import Estimate
-from .robust import median, robust_std
-from .samples import Index
-from .time_blocks import alike_of, of_few
 from .told_arm import ARM
 
 # Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.

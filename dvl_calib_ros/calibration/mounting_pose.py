@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from .correction import NOT_ESTIMATED, lever_arm
-from .error_model import corrected_mounting
-from .frames import FLU_FROM_FRD, Array, rpy_from_rotation
-from .kalman import GaussianState
 from .models import Model
+from .models.parameters import FROM_REFERENCE, TOLD, UNKNOWN, Parameters
+from .numerics.error_model import corrected_mounting
+from .numerics.frames import FLU_FROM_FRD, Array, rpy_from_rotation
+from .numerics.kalman import GaussianState
+from .numerics.samples import Mask
 from .observability import observability, scale_std_ahead
-from .parameters import FROM_REFERENCE, TOLD, UNKNOWN, Parameters
-from .samples import Mask
 from .told_arm import stands
 
 _ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")

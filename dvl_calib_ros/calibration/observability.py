@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from .assembly import prior
-from .frames import Array
 from .models import Model
-from .parameters import Parameters
+from .models.parameters import Parameters
+from .numerics.frames import Array
 
 # A parameter counts as observed once the data has halved its prior standard deviation: it then holds three times the
 # information of the prior.

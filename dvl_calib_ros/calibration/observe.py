@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from .frames import ENU_FROM_NED, Array, rotation_from_quaternion, skew
 from .models import Needs
-from .observations import Assumptions, Observations, Unmeasured
-from .parameters import Parameters
-from .samples import FRAME_CODES, AlignedBlock, Codes, VelocityFrame
+from .models.base import Assumptions, Observations, Unmeasured
+from .models.parameters import Parameters
+from .numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion, skew
+from .numerics.samples import FRAME_CODES, AlignedBlock, Codes, VelocityFrame
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 _BITS = np.array([1, 2, 4], dtype=np.uint8)

@@ -15,22 +15,13 @@ import numpy as np
 
 from .clocks import SECOND_NS, Clocks
 from .dropouts import DROPOUT_NS, Dropouts
-from .frames import Array, Vector
+from .models.parameters import Parameters
 from .new_days import SHORTEST_PAUSE_NS, NewDays
-from .parameters import Parameters
+from .numerics.frames import Array, Vector
+from .numerics.samples import FRAME_CODES, DvlSample, ImuSample, Index, Mask, ReferenceSample, Stamps, Stream
 from .partners import Partners, add_count
 from .reference_track import ReferenceTrack
 from .rows import Rows
-from .samples import (
-    FRAME_CODES,
-    DvlSample,
-    ImuSample,
-    Index,
-    Mask,
-    ReferenceSample,
-    Stamps,
-    Stream,
-)
 from .screening import ALL_AXES, CovarianceScreen, is_valid_rate, is_valid_velocity, unit_quaternion
 from .streams import LONG_AGO_NS, Order, Sequencer, Track
 

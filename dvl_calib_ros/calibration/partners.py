@@ -12,12 +12,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from .frames import slerps
 from .gates import Gates, PriorWindow
 from .models import Needs
-from .parameters import Parameters
+from .models.parameters import Parameters
+from .numerics.frames import slerps
+from .numerics.samples import FRAME_CODES, Mask, Pairing, SampleUse, Stamps, VelocityFrame
 from .rows import Rows
-from .samples import FRAME_CODES, Mask, Pairing, SampleUse, Stamps, VelocityFrame
 from .streams import LONG_AGO_NS, Track
 
 BODY = FRAME_CODES[VelocityFrame.BODY]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .frames import Array
 from .models import WITH_POSITIONS
-from .parameters import ParameterError, Parameters
+from .models.parameter_spec import ParameterError
+from .models.parameters import Parameters
+from .numerics.frames import Array
 
 # Velocities made of positions are of no use from this noise on, m/s.
 NOISY_MPS = 0.3

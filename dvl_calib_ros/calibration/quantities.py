@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from .comparison_words import date
-from .frames import rpy_from_rotation
-from .kalman import GaussianState
 from .models import MODELS
+from .models.parameters import Parameters
 from .mounting_pose import rpy_std, scale_and_delay
+from .numerics.frames import rpy_from_rotation
+from .numerics.kalman import GaussianState
 from .observability import OBSERVED_SHARE
-from .parameters import Parameters
 from .results import Result
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .frames import Array
-from .parameters import XY, XYZ, Parameters
-from .samples import FRAMES, Codes, Mask, Stamps, VelocityFrame
+from .models.parameters import XY, XYZ, Parameters
+from .numerics.frames import Array
+from .numerics.samples import FRAMES, Codes, Mask, Stamps, VelocityFrame
 from .screening import VERTICAL
 from .streams import Track
 

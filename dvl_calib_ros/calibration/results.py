@@ -10,13 +10,13 @@ import numpy as np
 
 from ..verdict.reasons import Reason
 from .dvl_bias import OfBias
-from .error_model import correct, corrected_mounting
-from .frames import Array
-from .kalman import GaussianState
 from .models import MODELS
+from .models.parameters import Parameters
 from .mounting_pose import position_in_body
+from .numerics.error_model import correct, corrected_mounting
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
 from .observability import Convergence, Observability
-from .parameters import Parameters
 from .selection import Segment
 from .verification import Verification
 

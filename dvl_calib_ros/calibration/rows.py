@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from .frames import Array
-from .samples import AlignedBlock, Codes, Mask, Pairing, SampleUse, Stamps
-from .tables import RowTable
+from .numerics.frames import Array
+from .numerics.samples import AlignedBlock, Codes, Mask, Pairing, SampleUse, Stamps
+from .numerics.tables import RowTable
 
 
 class Rows(RowTable):

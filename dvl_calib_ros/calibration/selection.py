@@ -11,8 +11,8 @@ import numpy as np
 
 from ..verdict.reasons import Reason, finding
 from .models import EXTENDED_BY, WITH_HEADINGS, WITH_POSITIONS
-from .parameters import AUTO, IAC, Parameters
-from .samples import Mask, Stamps
+from .models.parameters import AUTO, IAC, Parameters
+from .numerics.samples import Mask, Stamps
 
 # The published selection; the first and the last are what the paper recommends
 IAC_G = ("M3", "M4")

@@ -19,9 +19,9 @@ import math
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .frames import Array
-from .robust import median
-from .samples import Mask
+from .numerics.frames import Array
+from .numerics.robust import median
+from .numerics.samples import Mask
 
 # Streams slower than this, s, show what waves do in their differences; a reference may be this slow beside a fast DVL.
 SLOWEST_S, SLOWEST_REFERENCE_S = 0.3, 1.2

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .parameters import Parameters
+from .models.parameters import Parameters
+from .numerics.robust import median
+from .numerics.samples import SampleBlock, Stamps, Stream, Streams
 from .register.arrival import apart
-from .robust import median
-from .samples import SampleBlock, Stamps, Stream, Streams
 
 SPOKEN: Mapping[Stream, str] = {
     Stream.DVL: "the DVL's",

@@ -12,9 +12,9 @@ from typing import ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from .frames import Array
-from .samples import Codes, Index, Mask, Stamps
-from .tables import RowTable
+from .numerics.frames import Array
+from .numerics.samples import Codes, Index, Mask, Stamps
+from .numerics.tables import RowTable
 
 # Earlier than any stamp, and so far from the ends of 64 bits that a timeout can be added.
 LONG_AGO_NS = -(2**62)

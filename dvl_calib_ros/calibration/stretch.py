@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .clocks import Clocks
-from .frames import Array
+from .numerics.frames import Array
+from .numerics.samples import Codes, Index, Mask, Stamps, Stream, Streams
 from .partners import BODY, Partners
 from .rows import Rows
-from .samples import Codes, Index, Mask, Stamps, Stream, Streams
 from .screening import ALL_AXES, are_valid_velocities, screen_columns, unit_quaternions, valid_rates
 from .streams import LONG_AGO_NS, Admitted, Sequencer, Track
 

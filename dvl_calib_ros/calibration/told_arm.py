@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .kalman import GaussianState
 from .models import MODELS, Model
-from .parameters import Parameters
-from .samples import Mask
+from .models.parameters import Parameters
+from .numerics.kalman import GaussianState
+from .numerics.samples import Mask
 
 if TYPE_CHECKING:
     from .results import Estimate

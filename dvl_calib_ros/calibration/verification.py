@@ -16,14 +16,14 @@ import numpy as np
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, by_severity, finding
-from .chi_square import chi2_isf
-from .error_model import CORRECTION_JACOBIAN, correction_matrix
 from .folds import FOLDS, Moments
-from .frames import Array
-from .kalman import GaussianState
 from .models import Model
+from .models.parameters import Parameters
+from .numerics.chi_square import chi2_isf
+from .numerics.error_model import CORRECTION_JACOBIAN, correction_matrix
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
 from .observability import OBSERVED_SHARE, Convergence, body_angle_std
-from .parameters import Parameters
 
 # Fewer samples with a reference prove nothing.
 ENOUGH_SAMPLES = 20

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .frames import Array, skew
 from .models import MODELS, Model
-from .observations import Assumptions, Observations
-from .parameters import Parameters
+from .models.base import Assumptions, Observations
+from .models.parameters import Parameters
+from .numerics.frames import Array, skew
 from .results import Estimate
 
 KM = 1000.0

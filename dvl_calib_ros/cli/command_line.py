@@ -98,7 +98,7 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 def _run(argv: Sequence[str]) -> int:
     arguments = build_parser(argv).parse_args(argv)
-    from ..calibration.parameters import ParameterError
+    from ..calibration.models.parameter_spec import ParameterError
     from ..errors import InputError, printable
 
     recordings = recordings_now(arguments)

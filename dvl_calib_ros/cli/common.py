@@ -15,7 +15,7 @@ from ..streams import give_up
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from ..calibration.parameters import Parameters
+    from ..calibration.models.parameters import Parameters
     from ..discovery.discover import Discovery, Given
     from ..node.services import AnsweringNode
     from ..node.shutdown import Ending
@@ -33,7 +33,7 @@ def add_parameter_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _parameter_completions(**_: Any) -> list[str]:
-    from ..calibration.parameters import SCHEMA
+    from ..calibration.models.parameters import SCHEMA
 
     choices = [f"{name}:={choice}" for name, spec in SCHEMA.items() for choice in spec.choices]
     return choices + [f"{name}:=" for name, spec in SCHEMA.items() if not spec.choices]

@@ -150,7 +150,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
 
 
 def _show_diagnosis(out: Any, bag: Path) -> None:
-    from ..calibration.parameters import Parameters
+    from ..calibration.models.parameters import Parameters
     from ..diagnosis.diagnose import diagnose
 
     out.print("\n[bold]3. Diagnosis[/]: what a simulator would lack beside this bag, `dvl-calib diagnose`\n")

@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> None:
     import math
 
     from ..bags.writer import Compression, Storage
-    from ..calibration.samples import VelocityFrame
+    from ..calibration.numerics.samples import VelocityFrame
     from ..simulation.injection import injection
     from ..simulation.recorded_motion import MotionSource
     from ..simulation.scenario import Scenario, write_bag

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .composed import Hypothesis, Problem, Seen
 from .fitting import Fit, prior_std
 from .least_squares import WhitenedLeastSquares

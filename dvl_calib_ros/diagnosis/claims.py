@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.distributions import normal_isf
-from ..calibration.frames import Array
+from ..calibration.numerics.distributions import normal_isf
+from ..calibration.numerics.frames import Array
 
 if TYPE_CHECKING:
     from .composed import Problem, Seen

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.samples import Index
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import Index
 from ..effects.base import Effect
 from .composed import Hypothesis, Values
 from .fitting import Fit, Fitter, around

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .composed import Hypothesis, Problem
 from .fitting import Fit, Fitter
 from .folds import fitted_without, folds_of, stretch_of

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..calibration.parameters import SCHEMA, Parameters
+from ..calibration.models.parameters import SCHEMA, Parameters
 from .clock_or_arm import ARM_PARAMETERS
 from .results import Diagnosis
 

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..calibration.frames import Array, cross, skew
-from ..calibration.samples import VelocityFrame
+from ..calibration.numerics.frames import Array, cross, skew
+from ..calibration.numerics.samples import VelocityFrame
 from ..effects.base import (
     ActsOn,
     ClockEffect,

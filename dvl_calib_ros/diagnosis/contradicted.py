@@ -11,9 +11,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
-from ..calibration.robust import robust_std
-from ..calibration.samples import VelocityFrame
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import robust_std
+from ..calibration.numerics.samples import VelocityFrame
 from ..effects.base import ActsOn
 from ..effects.composition import late
 from .composed import Hypothesis, Problem

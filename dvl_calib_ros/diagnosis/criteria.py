@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.distributions import chi2_isf, chi2_logsf, f_sf
-from ..calibration.frames import Array
+from ..calibration.numerics.distributions import chi2_isf, chi2_logsf, f_sf
+from ..calibration.numerics.frames import Array
 from ..effects.base import Effect
 from .beside import FittedBeside
 from .composed import Problem, is_time_of_run

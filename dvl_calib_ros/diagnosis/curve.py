@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.fft import dst, idst
 from scipy.interpolate import make_interp_spline
 
-from ..calibration.frames import Array
-from ..calibration.robust import robust_std
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import robust_std
 from ..calibration.spikes import beside, off_neighbours, without_spikes
 from .claims import loudness
 from .settings import SETTINGS

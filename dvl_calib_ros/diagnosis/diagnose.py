@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..calibration.distributions import normal_isf
-from ..calibration.frames import Array
-from ..calibration.parameters import Parameters
-from ..calibration.samples import VelocityFrame
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.distributions import normal_isf
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import VelocityFrame
 from ..effects.base import ClockEffect, Effect, EffectNeeds
 from ..effects.registry import EFFECTS
 from ..errors import InputError

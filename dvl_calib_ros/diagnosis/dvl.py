@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array
 from ..effects.registry import EFFECTS
 from .composed import Hypothesis, Problem, Values
 from .curve import Curve

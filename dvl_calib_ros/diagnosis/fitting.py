@@ -12,8 +12,8 @@ from functools import cached_property, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
-from ..calibration.robust import robust_std
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import robust_std
 from ..effects.base import Effect
 from .composed import Hypothesis, Problem, Seen, SeenAgain, Values, amplitudes, is_time_of_run, whose_parameters
 from .least_squares import WhitenedLeastSquares

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .composed import Hypothesis, Problem
 from .fitting import Fit, Fitter
 from .noise import Noise

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..effects.base import EffectInput
 from .composed import Problem
 from .dictionary import FADES_S, faded

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..effects.base import MountingEffect
 from .beside import FittedBeside
 from .composed import Problem, is_time_of_run

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 
 # Share of a direction's squares from which on it is mostly noise
 MOSTLY = 0.5

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.distributions import chi2_sf
-from ..calibration.frames import Array
+from ..calibration.numerics.distributions import chi2_sf
+from ..calibration.numerics.frames import Array
 from ..effects.base import EffectNeeds
 from .claims import Claims, claims_of, exponents, followed, stretches_of
 from .composed import Problem, Seen

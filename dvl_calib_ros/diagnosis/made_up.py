@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 
-from ..calibration.frames import Array
-from ..calibration.samples import VelocityFrame
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import VelocityFrame
 from ..effects.base import ActsOn
 from ..effects.composition import late
 from .composed import Hypothesis, Problem, Seen

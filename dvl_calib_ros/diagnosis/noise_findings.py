@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.distributions import binomial_interval, binomial_sf, chi2_sf, normal_isf, normal_sf
-from ..calibration.frames import Array
-from ..calibration.robust import robust_std
+from ..calibration.numerics.distributions import binomial_interval, binomial_sf, chi2_sf, normal_isf, normal_sf
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import robust_std
+from ..calibration.numerics.tests import holm
 from .claims import claims_of, followed, stretches_of
 from .closure import claimed_std, high_frequency_variance
 from .composed import Problem
 from .fitting import OF_INTERVAL, Fit, Fitter, around
-from .holm import holm
 from .levels import SIGNIFICANT, fit_claims, fit_level
 from .made_up import made_up
 from .noise import Arma, Noise

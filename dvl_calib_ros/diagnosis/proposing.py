@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..effects.base import Effect
 from .clock_or_arm import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
 from .composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run, no_effect

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.clocks import Clocks
-from ..calibration.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
+from ..calibration.numerics.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
 from ..calibration.positions import NOISY_MPS
 from ..calibration.register.fine import white_noise
 from ..calibration.register.registration import Registration
-from ..calibration.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
 from ..calibration.screening import SMALLEST_VARIANCE
 from ..effects.base import EffectNeeds
 from ..errors import InputError

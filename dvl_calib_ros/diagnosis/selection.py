@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..effects.base import Effect
 from .called_for import once_where_borne_out, only_borne_out, only_called_for, without_nothing
 from .clock_or_arm import (

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .closure import HeldOutResiduals
 from .followed import Followed, what_it_follows
 from .noise import segments_of

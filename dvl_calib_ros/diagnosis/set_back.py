@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 
 # Two steps of a stream are one where it is stamped twice: shorter than so many usual steps, so many times running
 TWO_STEPS, FEWEST = 1.25, 4

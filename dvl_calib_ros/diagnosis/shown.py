@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..effects.base import Effect
 from .clock_or_arm import ARM
 from .composed import Problem, Seen, Values, amplitudes, is_time_of_run, no_effect

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.frames import Array, cross
-from ..calibration.samples import VelocityFrame
+from ..calibration.numerics.frames import Array, cross
+from ..calibration.numerics.samples import VelocityFrame
 from ..effects.base import ActsOn, EffectInput
 from ..effects.composition import at_dvl, late, traces, turns
 from .composed import Hypothesis, Problem

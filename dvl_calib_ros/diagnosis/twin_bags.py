@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from ..bags.writer import BagWriter, Compression, Storage
-from ..calibration.frames import Array
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from ..messages.encode import SampleWriter
 from .twin import Twin
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.distributions import chi2_isf, chi2_logsf
-from ..calibration.frames import Array
+from ..calibration.numerics.distributions import chi2_isf, chi2_logsf
+from ..calibration.numerics.frames import Array
 from ..effects.base import Effect
 from ..verdict.reasons import Reason, finding
 from .beside import FittedBeside

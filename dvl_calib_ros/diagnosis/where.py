@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.tests import holm
 from ..effects.base import EffectInput, EffectNeeds
 from .composed import Problem, Seen
 from .fitting import Fit, Fitter
-from .holm import holm
 from .least_squares import WhitenedLeastSquares
 from .noise import Noise
 from .unexplained import explained, orthonormal

@@ -13,12 +13,12 @@ from itertools import product
 
 import numpy as np
 
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.samples import SampleBlock, Stream, Streams
 from ..calibration.register.far import Far, far_clocks
 from ..calibration.register.fine import white_noise
 from ..calibration.register.motion import MotionStreams, motion_of
 from ..calibration.register.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
-from ..calibration.samples import SampleBlock, Stream, Streams
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
 from ..recordings.topic_preview import Look, Survey

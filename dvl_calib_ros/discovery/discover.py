@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from ..calibration.delay.rows import ImuColumns
-from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
-from ..calibration.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
+from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
+from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.register.arrival import limit_s
 from ..calibration.register.fine import white_noise
 from ..calibration.register.motion import MotionStreams, in_order, make_motion
@@ -31,7 +32,6 @@ from ..calibration.register.readings import (
     nominal_rpy,
     turns_right,
 )
-from ..calibration.samples import VelocityFrame
 from ..calibration.screening import unit_quaternions
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named

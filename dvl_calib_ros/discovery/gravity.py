@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array, rotation_from_quaternion
+from ..calibration.numerics.frames import Array, rotation_from_quaternion
 from ..calibration.screening import unit_quaternions
 from ..verdict.reasons import Reason, finding
 

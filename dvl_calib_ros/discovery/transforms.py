@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array, rotation_from_quaternion, rotation_from_rpy, rpy_from_rotation
-from ..calibration.parameters import FLU, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
+from ..calibration.models.parameters import FLU, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
+from ..calibration.numerics.frames import Array, rotation_from_quaternion, rotation_from_rpy, rpy_from_rotation
 from ..errors import InputError
 from ..files.urdf import parse_urdf
 from ..verdict.reasons import Reason, finding

@@ -16,8 +16,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calibration.frames import Array
-from ..calibration.samples import VelocityFrame
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import VelocityFrame
 from ..errors import InputError
 
 HOUR_S = 3600.0

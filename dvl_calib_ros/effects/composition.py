@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .base import ActsOn, AnyEffect, ClockEffect, Effect, EffectInput, MountingEffect
 
 

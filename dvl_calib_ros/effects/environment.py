@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter
 
 _CURRENT = "{} component of the added velocity (the negative of the current)"

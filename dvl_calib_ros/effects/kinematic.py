@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.frames import Array, cross
+from ..calibration.numerics.frames import Array, cross
 from .base import ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter, along_axes, vector
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .base import ActsOn, Disturbance, EffectInput, EffectNeeds, EffectParameter, NoiseEffect
 
 _SHARE = "share of the samples, 0 .. 1"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 
 
 def slopes(time: Array, values: Array) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectParameter, MountingEffect, along_axes, vector
 
 

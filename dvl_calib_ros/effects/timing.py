@@ -10,9 +10,9 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.register.coarse import LONGEST_S
-from ..calibration.samples import VelocityFrame
 from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory
 from .recursion import recursion, slopes
 

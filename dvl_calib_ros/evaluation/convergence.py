@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calibration.frames import Array
-from ..calibration.kalman import GaussianState
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.kalman import GaussianState
 from . import protocol
 from .estimation import SensorData, estimate
 from .metrics import BASELINES

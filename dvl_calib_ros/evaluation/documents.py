@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .convergence import curves_document
 from .protocol import MANOEUVRING
 from .results import Coverage, EachStudy, Evaluation

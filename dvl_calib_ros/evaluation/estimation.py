@@ -15,18 +15,18 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration import kalman
 from ..calibration.alignment import align
 from ..calibration.assembly import Assembler
-from ..calibration.frames import Array
 from ..calibration.heave import HeaveRows, HeaveSums, with_heave
 from ..calibration.height import HeightOfLate
-from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model, Needs
-from ..calibration.observations import Observations
+from ..calibration.models.base import Observations
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics import kalman
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.kalman import GaussianState
+from ..calibration.numerics.samples import AlignedBlock, Mask, Stamps, Stream, Streams, no_samples, sample_block
 from ..calibration.observe import Observer
-from ..calibration.parameters import Parameters
-from ..calibration.samples import AlignedBlock, Mask, Stamps, Stream, Streams, no_samples, sample_block
 from .results import Failure
 from .trajectories import Trajectory
 

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.distributions import normal_isf
-from ..calibration.frames import Array, nearest_rotation
+from ..calibration.numerics.distributions import normal_isf
+from ..calibration.numerics.frames import Array, nearest_rotation
 from .results import Coverage
 
 

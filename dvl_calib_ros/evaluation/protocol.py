@@ -13,7 +13,7 @@ from zlib import crc32
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, Array
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array
 from ..simulation.sensors import DvlErrors, equivalent_error_terms, measure_dvl, measure_gnss
 from .results import UNCALIBRATED, CalibrationSet
 

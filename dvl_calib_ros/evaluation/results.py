@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import Array
 from ..calibration.models import MODELS
+from ..calibration.numerics.frames import Array
 from ..verdict.answering import Answering
 
 UNCALIBRATED = "uncalibrated"

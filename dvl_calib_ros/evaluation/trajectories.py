@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calibration.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_frd
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, attitude_enu_flu_from_ned_frd
 from ..errors import InputError
 from ..logs.dvl_log import angular_velocities
 from ..logs.trajectories import read_columns

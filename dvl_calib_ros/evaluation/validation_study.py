@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.frames import Array
 from ..calibration.models import LINEAR_MODELS, MODELS
-from ..calibration.observations import Observations
-from ..calibration.parameters import SCHEMA, Parameters
+from ..calibration.models.base import Observations
+from ..calibration.models.parameters import SCHEMA, Parameters
+from ..calibration.numerics.frames import Array
 from ..calibration.results import Result
 from ..calibration.verification import Verification
 from ..errors import InputError

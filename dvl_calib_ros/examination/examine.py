@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, Array, rotation_from_rpy
-from ..calibration.parameters import FRD, FROM_MESSAGE, Parameters
+from ..calibration.models.parameters import FRD, FROM_MESSAGE, Parameters
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
+from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.positions import NOISY_MPS
 from ..calibration.register.readings import FITS
-from ..calibration.samples import VelocityFrame
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S

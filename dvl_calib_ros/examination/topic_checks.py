@@ -6,10 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.parameters import SCHEMA, Parameters
+from ..calibration.models.parameters import SCHEMA, Parameters
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import Stream
 from ..calibration.register.arrival import apart
-from ..calibration.samples import Stream
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Recorded
 from ..verdict.reasons import Reason, finding

@@ -18,14 +18,21 @@ from typing import Any
 import numpy as np
 
 from ..calibration.correction import lever_arm
-from ..calibration.error_model import corrected_mounting
 from ..calibration.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of
-from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
-from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
+from ..calibration.models.parameter_spec import ParameterError
+from ..calibration.models.parameters import FRD, Parameters
 from ..calibration.mounting_pose import position_in_body, scale_and_delay
+from ..calibration.numerics.error_model import corrected_mounting
+from ..calibration.numerics.frames import (
+    FLU_FROM_FRD,
+    Array,
+    quaternion_from_rotation,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
+from ..calibration.numerics.kalman import GaussianState
 from ..calibration.observability import Convergence, observability
-from ..calibration.parameters import FRD, ParameterError, Parameters
 from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity

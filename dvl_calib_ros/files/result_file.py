@@ -20,12 +20,18 @@ import yaml
 
 from ..calibration.assembly import prior
 from ..calibration.folds import with_states_of
-from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
-from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.models.parameters import FLU, FRD, Parameters
 from ..calibration.mounting_pose import mounting_pose, position_in_body, scale_and_delay
+from ..calibration.numerics.frames import (
+    FLU_FROM_FRD,
+    Array,
+    quaternion_from_rotation,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
+from ..calibration.numerics.kalman import GaussianState
 from ..calibration.observability import Convergence
-from ..calibration.parameters import FLU, FRD, Parameters
 from ..calibration.results import Estimate, Result
 from ..calibration.verification import verification_document
 from ..calibration.water import Water, water_document

@@ -10,7 +10,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from ..calibration.frames import Array, rotation_from_rpy, rpy_from_rotation
+from ..calibration.numerics.frames import Array, rotation_from_rpy, rpy_from_rotation
 from ..disk.text_files import read_file
 from ..errors import InputError
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
 from ..discovery.discover import Given
 from ..errors import InputError
 from ..files.output_paths import check_outputs

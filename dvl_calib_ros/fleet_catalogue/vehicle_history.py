@@ -16,8 +16,8 @@ import numpy as np
 
 from ..calibration.comparison import Comparison, compare, fused
 from ..calibration.extrinsics import Extrinsics
-from ..calibration.frames import Array
 from ..calibration.models import MODELS
+from ..calibration.numerics.frames import Array
 from ..errors import InputError
 from .recording_entry import HEADING_ERRORS, Row
 

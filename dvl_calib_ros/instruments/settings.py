@@ -14,7 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, Array, quaternion_from_rotation, rotation_from_rpy, rpy_from_rotation
+from ..calibration.numerics.frames import (
+    FLU_FROM_FRD,
+    Array,
+    quaternion_from_rotation,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
 from ..errors import InputError, printable
 from ..files.mounting import POSITION_UNKNOWN, CalibratedMounting
 from ..files.urdf import numbers

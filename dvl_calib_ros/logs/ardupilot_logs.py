@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, Array, over_ground
-from ..calibration.samples import DvlSample, ReferenceSample, VelocityFrame
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, over_ground
+from ..calibration.numerics.samples import DvlSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from .dvl_log import DvlLog, imu_samples
 

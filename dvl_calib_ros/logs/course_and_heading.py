@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..calibration.frames import Array, over_ground
-from ..calibration.samples import ImuSample, ReferenceSample, VelocityFrame
+from ..calibration.numerics.frames import Array, over_ground
+from ..calibration.numerics.samples import ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from ..messages.encode import SatelliteFix
 from .csv_columns import cells, numbers_of, stamps_ns

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from ..calibration.numerics.frames import Array, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
+from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from ..messages.encode import WaterReading
 
 

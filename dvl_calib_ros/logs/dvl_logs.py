@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, Array
-from ..calibration.samples import DvlSample
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array
+from ..calibration.numerics.samples import DvlSample
 from ..errors import InputError
 from ..messages.encode import WaterReading
 from .dvl_log import DvlLog, imu_samples

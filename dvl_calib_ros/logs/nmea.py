@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..calibration.frames import over_ground
-from ..calibration.samples import ReferenceSample, VelocityFrame
+from ..calibration.numerics.frames import over_ground
+from ..calibration.numerics.samples import ReferenceSample, VelocityFrame
 from ..errors import InputError
 
 _RMC = re.compile(rb"\$(\w{2}RMC,[^*\r\n]*)\*([0-9A-Fa-f]{2})")

@@ -14,8 +14,8 @@ from datetime import datetime, timezone
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD
-from ..calibration.samples import DvlSample
+from ..calibration.numerics.frames import FLU_FROM_FRD
+from ..calibration.numerics.samples import DvlSample
 from ..messages.encode import WaterReading
 
 _SYNC, _BOTTOM_TRACK = 0xA5, 0x1B

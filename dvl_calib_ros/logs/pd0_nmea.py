@@ -15,8 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..calibration.frames import Array, over_ground
-from ..calibration.samples import ReferenceSample, VelocityFrame
+from ..calibration.numerics.frames import Array, over_ground
+from ..calibration.numerics.samples import ReferenceSample, VelocityFrame
 from ..messages.positions import FixDifference
 from .nmea import KNOT, STANDING, xor
 

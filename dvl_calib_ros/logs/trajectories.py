@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..bags.writer import BagWriter, Compression, Storage
-from ..calibration.frames import FLU_FROM_FRD, Array
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array
+from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from ..messages.encode import SampleWriter, SatelliteFix
 from .csv_columns import EXPECTED, N_COLUMNS, SHOWN, _is_number, cells, numbers_of, stamps_ns

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.parameters import Parameters
-from ..calibration.samples import VelocityFrame
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.samples import VelocityFrame
 from ..errors import InputError
 from ..verdict.reasons import Reason, finding
 from .positions import POSE, SATELLITES, PositionType

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..bags.writer import BagWriter
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, Sample, VelocityFrame
+from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Sample, VelocityFrame
 from .drivers import IMU_TYPE, TWIST_TYPE
 
 FIX_TYPE = "sensor_msgs/msg/NavSatFix"

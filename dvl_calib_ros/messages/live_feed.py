@@ -11,8 +11,8 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.frames import Array
-from ..calibration.samples import (
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import (
     FRAME_CODES,
     WIDTH,
     Codes,
@@ -28,7 +28,7 @@ from ..calibration.samples import (
     Streams,
     sample_block,
 )
-from ..calibration.tables import FULL, RowTable
+from ..calibration.numerics.tables import FULL, RowTable
 from .decode import MessageDecoder, Refusal
 
 AnySample = TypeVar("AnySample", DvlSample, ReferenceSample, ImuSample)

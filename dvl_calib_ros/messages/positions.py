@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array, Vector
+from ..calibration.numerics.frames import Array, Vector
 
 # WGS 84: semi-major axis (m) and first eccentricity squared
 SEMI_MAJOR_M, ECCENTRICITY_SQUARED = 6_378_137.0, 6.694_379_990_141e-3

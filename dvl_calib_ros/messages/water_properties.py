@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..calibration.water import SALINITIES, TEMPERATURES, THERMOMETER, Water
 
 _FLOATS = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")

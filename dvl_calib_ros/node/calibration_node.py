@@ -26,15 +26,16 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
-from ..calibration import kalman
 from ..calibration.calibrator import Calibrator
 from ..calibration.correction import NOT_ESTIMATED, Correction, lever_arm, twist_terms
-from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS, Model
+from ..calibration.models.parameter_spec import ParameterError
+from ..calibration.models.parameters import SCHEMA, Parameters
 from ..calibration.mounting_pose import mounting_pose
-from ..calibration.parameters import SCHEMA, ParameterError, Parameters
+from ..calibration.numerics import kalman
+from ..calibration.numerics.kalman import GaussianState
+from ..calibration.numerics.samples import DvlSample, VelocityFrame
 from ..calibration.positions import check_model
-from ..calibration.samples import DvlSample, VelocityFrame
 from ..calibration.water import Water
 from ..discovery.gravity import believed_heading
 from ..discovery.transforms import Frames, not_default, placement

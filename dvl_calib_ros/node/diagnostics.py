@@ -17,13 +17,13 @@ from ..calibration.advice import (
     reference_advice,
 )
 from ..calibration.calibrator import Calibrator
-from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
+from ..calibration.models.parameters import Parameters
 from ..calibration.mounting_pose import scale_and_delay
-from ..calibration.parameters import Parameters
+from ..calibration.numerics.kalman import GaussianState
+from ..calibration.numerics.samples import Stream
 from ..calibration.register.arrival import apart
 from ..calibration.results import Estimate
-from ..calibration.samples import Stream
 from ..calibration.water import CauseOfScale, Water, cause_of_scale
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import rotation_from_rpy
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import rotation_from_rpy
 from ..calibration.register.registration import ALIKE_S, OFFSETS, Registration
 from ..discovery.gravity import Gravity
 from ..verdict.reasons import Reason, finding

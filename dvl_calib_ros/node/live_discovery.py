@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rclpy.node import Node
 
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
 from ..discovery.topic_choice import may_be_dvl
 from ..errors import InputError
 

@@ -55,7 +55,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
             import rclpy
             from rclpy.signals import SignalHandlerOptions
 
-            from ..calibration.parameters import ParameterError
+            from ..calibration.models.parameter_spec import ParameterError
             from .calibration_node import CalibrationNode
             from .executor import ReceivingExecutor
     except InputError as error:

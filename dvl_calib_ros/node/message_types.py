@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD
-from ..calibration.samples import DvlSample
+from ..calibration.numerics.frames import FLU_FROM_FRD
+from ..calibration.numerics.samples import DvlSample
 from ..errors import InputError
 from ..messages.drivers import (
     BOTTOM_TRACK,

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.frames import rpy_from_rotation
-from ..calibration.kalman import GaussianState
 from ..calibration.models import MODELS
 from ..calibration.mounting_pose import rpy_std, scale_and_delay
+from ..calibration.numerics.frames import rpy_from_rotation
+from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results import Estimate
 from ..calibration.worth import (
     KM,

@@ -9,7 +9,8 @@ from typing import Any
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterType
 from rclpy.node import Node
 
-from ..calibration.parameters import SCHEMA, Parameters, ParameterSpec
+from ..calibration.models.parameter_spec import ParameterSpec
+from ..calibration.models.parameters import SCHEMA, Parameters
 from ..files.parameter_files import is_ros_parameter, names_of_others
 
 _TYPES = {

@@ -22,8 +22,8 @@ from rclpy.qos import HistoryPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolic
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
 
-from ..calibration.frames import rotation_from_quaternion
-from ..calibration.samples import DvlSample, ReferenceSample
+from ..calibration.numerics.frames import rotation_from_quaternion
+from ..calibration.numerics.samples import DvlSample, ReferenceSample
 from ..calibration.screening import unit_quaternion
 from ..errors import InputError
 from ..messages.decode import stamp_ns

@@ -9,10 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..bag_replay.replay import Replayed
-from ..calibration.error_model import corrected_mounting
-from ..calibration.frames import Array, rpy_from_rotation
+from ..calibration.models.parameters import Parameters
 from ..calibration.mounting_pose import rpy_std
-from ..calibration.parameters import Parameters
+from ..calibration.numerics.error_model import corrected_mounting
+from ..calibration.numerics.frames import Array, rpy_from_rotation
 from ..calibration.quantities import quantities
 
 _COLOURS = ("#1f6fb2", "#2a7f62", "#c0392b")

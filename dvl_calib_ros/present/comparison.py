@@ -13,7 +13,7 @@ import numpy as np
 from ..calibration.comparison import ChiSquare, Comparison, Difference
 from ..calibration.comparison_words import date, reasons, remarks
 from ..calibration.extrinsics import MOUNTING, Extrinsics
-from ..calibration.frames import Array, rpy_from_rotation
+from ..calibration.numerics.frames import Array, rpy_from_rotation
 from .document import Answer, Columns, Document, Section, Sentence, Table, Where, columns_for, figures, table_by
 from .numbers import with_std
 

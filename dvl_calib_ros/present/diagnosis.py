@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..diagnosis.clock_or_arm import LAG
 from ..diagnosis.noise_findings import NoiseFinding
 from ..diagnosis.results import Diagnosis, FoundEffect

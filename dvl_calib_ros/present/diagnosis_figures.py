@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from ..calibration.distributions import normal_isf, normal_sf
-from ..calibration.frames import Array
+from ..calibration.numerics.distributions import normal_isf, normal_sf
+from ..calibration.numerics.frames import Array
 from ..diagnosis.followed import Followed
 from .figure_style import FAINT, INK, legend_above, new_figure, plain_log_ticks
 from .replay_figures import AFTER, BAD

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import welch
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..diagnosis.series import DiagnosisSeries, HeldOutTwin
 from . import diagnosis_figures as figures
 from .diagnosis import twin_errors

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
 from ..calibration.models import MODELS, Model
+from ..calibration.numerics.frames import Array
 from ..calibration.results import Estimate, Result
 from .document import Table
 from .numbers import with_std

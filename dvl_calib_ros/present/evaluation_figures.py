@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .evaluation import CLAIMED
 from .figure_data import mark_time
 from .figure_style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure

@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 
 # Points of a line or cloud: a zoom of ten times still shows some, and a page stays small enough to be sent from a ship
 POINTS = 1500

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from ..bag_replay.replay import Replayed
-from ..calibration.frames import FLU_FROM_FRD, rpy_from_rotation
 from ..calibration.models import MODELS
+from ..calibration.models.parameters import Parameters
 from ..calibration.navigation import in_words, metres
-from ..calibration.parameters import Parameters
+from ..calibration.numerics.frames import FLU_FROM_FRD, rpy_from_rotation
+from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.quantities import not_shown, quantities
 from ..calibration.results import Result
-from ..calibration.samples import VelocityFrame
 from ..calibration.verification import Verification
 from ..files.result_file import result_document
 from ..files.urdf import origin_tag

@@ -18,10 +18,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from ..calibration.extrinsics import rotation_of, turn_between
-from ..calibration.frames import Array, rotation_from_rpy
+from ..calibration.models.parameters import Parameters
 from ..calibration.navigation import Navigation
-from ..calibration.parameters import Parameters
+from ..calibration.numerics.frames import Array, rotation_from_rpy, rotation_of, turn_between
 from ..calibration.results import Result
 from .figure_data import MapTrack
 from .figure_style import (

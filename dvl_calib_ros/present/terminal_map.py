@@ -11,8 +11,8 @@ from ..calibration.navigation import Navigation
 if TYPE_CHECKING:
     from rich.text import Text
 
-    from ..calibration.frames import Array
-    from ..calibration.samples import Index
+    from ..calibration.numerics.frames import Array
+    from ..calibration.numerics.samples import Index
 
 # Of the first character of Unicode's Braille, and the bits of its dots by row and column
 _BLANK = 0x2800

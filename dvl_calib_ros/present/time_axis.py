@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import ArrayLike
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .figure_data import BREAK_MARK, mark_time
 from .numbers import fitting_unit
 

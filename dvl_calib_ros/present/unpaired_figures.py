@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..unpaired.gap_ladder import ALL, AS_IT_IS, NOISE, Shrunk
 from ..unpaired.results import UnpairedComparison
 from .figure_style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks

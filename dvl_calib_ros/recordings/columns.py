@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..bags.channels import Channel, Decoder, DecodingError
 from ..bags.columns import MessageColumns, Part
-from ..calibration.frames import Array
-from ..calibration.parameters import Parameters
-from ..calibration.samples import Codes, Covariances, Index, Stamps
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import Codes, Covariances, Index, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES, VelocityType
 

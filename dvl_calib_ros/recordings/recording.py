@@ -19,9 +19,9 @@ import numpy as np
 
 from ..bags.columns import windows
 from ..bags.reader import BagReader
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.samples import Stamps, Stream, Streams, no_samples
 from ..calibration.register.registration import Registration
-from ..calibration.samples import Stamps, Stream, Streams, no_samples
 from ..calibration.water import Water
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Set
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.samples import Stamps, VelocityFrame
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import Stamps, VelocityFrame
 from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES
 from ..verdict.reasons import Reason, finding

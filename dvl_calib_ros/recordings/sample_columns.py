@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, Array
-from ..calibration.samples import (
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array
+from ..calibration.numerics.samples import (
     FRAME_CODES,
     Covariances,
     DvlSample,

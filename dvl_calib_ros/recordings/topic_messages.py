@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.parameters import Parameters
-from ..calibration.samples import Codes, Stamps
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import Codes, Stamps
 from ..calibration.screening import NOT_MEASURED_VARIANCE, screen_columns
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES

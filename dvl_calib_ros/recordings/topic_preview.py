@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.robust import median
-from ..calibration.samples import Index, Stamps
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import median
+from ..calibration.numerics.samples import Index, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.positions import SELDOM_S, FixDifference, PositionType

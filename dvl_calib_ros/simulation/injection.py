@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..effects.base import ActsOn, AnyEffect, EffectInput, NoiseEffect
 from ..effects.composition import Injection
 from ..effects.registry import EFFECTS, NOISE_EFFECTS

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from ..effects.base import ActsOn, EffectInput, NoiseEffect
 from ..effects.composition import Injection
 from .scenario import GNSS_PHASE_S, START_NS, Run, Scenario, Seeds, dvl_at, gnss_at, imu_at, world_of

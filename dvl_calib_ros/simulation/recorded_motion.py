@@ -12,9 +12,18 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from ..calibration.frames import ENU_FROM_NED, Array
-from ..calibration.parameters import Parameters
-from ..calibration.samples import FRAME_CODES, Codes, Index, SampleBlock, Stamps, Stream, VelocityFrame, no_samples
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import ENU_FROM_NED, Array
+from ..calibration.numerics.samples import (
+    FRAME_CODES,
+    Codes,
+    Index,
+    SampleBlock,
+    Stamps,
+    Stream,
+    VelocityFrame,
+    no_samples,
+)
 from ..calibration.screening import are_valid_velocities, unit_quaternions
 from ..errors import InputError
 from ..messages.decode import MessageDecoder

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..bags.writer import BagWriter, Compression, Storage
-from ..calibration.frames import Array, quaternion_from_rotation, rotation_from_rpy
-from ..calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from ..calibration.numerics.frames import Array, quaternion_from_rotation, rotation_from_rpy
+from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..effects.base import ActsOn, EffectInput
 from ..effects.composition import Injection, at_dvl, late, traces, turns
 from ..messages.encode import SampleWriter

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calibration.error_model import distort
-from ..calibration.frames import Array, rotation_from_rpy
+from ..calibration.numerics.error_model import distort
+from ..calibration.numerics.frames import Array, rotation_from_rpy
 
 JANUS_FROM_VERTICAL = np.deg2rad(20.0)
 JANUS_AZIMUTHS = np.deg2rad([45.0, 135.0, 225.0, 315.0])

@@ -11,7 +11,7 @@ from itertools import cycle
 
 import numpy as np
 
-from ..calibration.frames import Array, rotation_from_rpy
+from ..calibration.numerics.frames import Array, rotation_from_rpy
 
 SPEED_MPS = 1.5
 TURN_RATE = np.deg2rad(9.0)

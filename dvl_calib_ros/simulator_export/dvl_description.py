@@ -11,7 +11,7 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from ..calibration.frames import rotation_from_rpy, rpy_from_rotation
+from ..calibration.numerics.frames import rotation_from_rpy, rpy_from_rotation
 from ..disk.text_files import read_file
 from ..effects.base import ActsOn, AnyEffect
 from ..effects.registry import EFFECTS, NOISE_EFFECTS

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..calibration.frames import rotation_from_rpy
+from ..calibration.numerics.frames import rotation_from_rpy
 from .dvl_description import DvlDescription
 from .writer import Settings, Simulator, beams_of, comment, mixed_scale, split
 

@@ -6,7 +6,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from ..calibration.frames import FLU_FROM_FRD, rotation_from_rpy, rpy_from_rotation
+from ..calibration.numerics.frames import FLU_FROM_FRD, rotation_from_rpy, rpy_from_rotation
 from .dvl_description import DvlDescription
 from .writer import Settings, Simulator, comment, equal_std, numbers, split, xml_text
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array
 from ..diagnosis.curve import Curve
 from ..diagnosis.diagnose import diagnose_recordings
 from ..diagnosis.recordings import RecordedStreams, load_recordings

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+from ..calibration.numerics.tests import holm
 from ..diagnosis.diagnose import VISIBLE_TIMES_TYPICAL
-from ..diagnosis.holm import holm
 from ..diagnosis.results import Diagnosis
 from ..diagnosis.results import DiagnosisVerdict as Explained
 from ..diagnosis.selection import EffectSelection

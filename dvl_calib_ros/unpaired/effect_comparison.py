@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import f as f_distribution
 from scipy.stats import norm, t
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from ..diagnosis.clock_or_arm import ATTITUDE_CLOCK, CLOCKS
 from ..diagnosis.composed import Values, amplitudes, whose_parameters
 from ..diagnosis.criteria import blocks_of

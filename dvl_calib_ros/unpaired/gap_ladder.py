@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
-from ..calibration.robust import robust_std
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import robust_std
 from ..diagnosis.composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run
 from ..diagnosis.folds import fitted_without, stretch_of
 from ..diagnosis.selection import EffectSelection

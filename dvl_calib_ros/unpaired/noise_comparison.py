@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
-from ..calibration.frames import Array
-from ..calibration.robust import robust_std
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import robust_std
 from ..diagnosis.curve import FAST_ENOUGH_S
 from ..diagnosis.fitting import around
 from ..diagnosis.noise_findings import NoiseFinding

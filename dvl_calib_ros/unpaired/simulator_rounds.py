@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..bags.writer import Compression, Storage
-from ..calibration.parameters import Parameters
+from ..calibration.models.parameters import Parameters
 from ..diagnosis.composed import amplitudes
 from ..diagnosis.results import Diagnosis, diagnosis_document
 from ..disk.text_files import write_json

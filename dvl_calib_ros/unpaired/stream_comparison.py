@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..calibration.frames import Array
-from ..calibration.robust import robust_std
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import robust_std
 from ..calibration.spikes import beside, off_neighbours
 from ..diagnosis.curve import FAST_ENOUGH_S
 from .both_sides import DITHER_MPS, Log

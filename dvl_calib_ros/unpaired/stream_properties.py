@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.frames import Array
-from ..calibration.parameters import Parameters
-from ..calibration.samples import SampleBlock, Stamps
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import SampleBlock, Stamps
 from ..diagnosis.recordings import zeros_while_moving
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import fisher_exact, t
 
-from ..calibration.frames import Array
+from ..calibration.numerics.frames import Array
 from .results import Triple
 
 # Samples of a block, and blocks that a level needs

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dvl_calib_ros.calibration.frames import Array
+from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.effects.base import ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from dvl_calib_ros.calibration.parameters import SCHEMA
+from dvl_calib_ros.calibration.models.parameters import SCHEMA
 
 T = TypeVar("T")
 # What sensors send and what they should not; the other bytes are numbers from -4 to 4

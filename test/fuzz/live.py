@@ -23,7 +23,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 from wholes import assert_sound
 
-from dvl_calib_ros.calibration.parameters import SCHEMA
+from dvl_calib_ros.calibration.models.parameters import SCHEMA
 from dvl_calib_ros.cli.demo import give_back, take_domain
 from dvl_calib_ros.files.result_file import load_result
 from dvl_calib_ros.node.calibration_node import CalibrationNode

@@ -27,9 +27,10 @@ from dvl_calib_ros.bags.salvage.damage import DamagedError
 from dvl_calib_ros.bags.salvage.mcap_file import salvage_mcap_stream
 from dvl_calib_ros.bags.salvage.sqlite_file import salvage_sqlite_stream
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.frames import rotation_from_rpy
-from dvl_calib_ros.calibration.parameters import ParameterError, Parameters
-from dvl_calib_ros.calibration.samples import Stream
+from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import Stream
 from dvl_calib_ros.disk.yaml_files import parse_scalar
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import load_parameters

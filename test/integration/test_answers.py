@@ -14,10 +14,10 @@ from io_fixtures import run, write_bag
 from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion, true_mounting
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.calibration.frames import rpy_from_rotation
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.navigation import Drift, Navigation, objections
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.calibration.numerics.frames import rpy_from_rotation
+from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.verdict.kinds import Severity
 from validation.surveys.physics import DVL_BIAS_STD, draw, write_survey

@@ -20,8 +20,8 @@ from yaml_text import parsed, written
 import dvl_calib_ros as dc
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.rows import BEYOND
-from dvl_calib_ros.calibration.error_model import distort
+from dvl_calib_ros.calibration.models.own import BEYOND
+from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import printable
 from dvl_calib_ros.files.mounting import angle_between, load_calibrated_mounting, scale_advice

@@ -10,7 +10,7 @@ import pytest
 from conftest import ROOT, few
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.diagnosis.compensation import compensated
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_folder
 

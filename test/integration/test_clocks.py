@@ -9,7 +9,7 @@ from io_fixtures import rewrite
 from runs import MatchedRun, make_samples
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 
 RUN = MatchedRun(phi=(0.02, -0.03, 0.04), dvl_std=0.01, gnss_std=0.05, frame=VelocityFrame.ENU, seconds=60.0)
 

@@ -12,8 +12,8 @@ from report_fixtures import drawn
 from runs import START_NS
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 
 SECONDS, RATE_HZ = 120.0, 5.0
 CLAIMED = 0.02**2 * np.eye(3)

@@ -17,7 +17,7 @@ from command_line import fail, room_for, succeed
 from conftest import ROOT
 from io_fixtures import run, write_bag
 
-from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.cli import common
 from dvl_calib_ros.cli.main import main
 

@@ -15,7 +15,7 @@ from other_simulators import READERS, driven
 from scipy.spatial.transform import Rotation
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 
 EXAMPLE = ROOT / "examples" / "gazebo"
 BRIDGE = {each["ros_topic_name"]: each for each in yaml.safe_load((EXAMPLE / "bridge.yaml").read_text())}

@@ -15,7 +15,7 @@ from io_fixtures import replayed, selected_alone
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.bags.writer import Compression, Storage
-from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy, rpy_from_rotation
+from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rotation_from_rpy, rpy_from_rotation
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.mounting import load_calibrated_mounting

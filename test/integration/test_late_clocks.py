@@ -11,8 +11,8 @@ from io_fixtures import rewrite
 import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.writer import Compression, Storage
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.discovery.discover import Given, discover
 from dvl_calib_ros.files.parameter_files import load_parameters

@@ -131,8 +131,8 @@ def test_no_live_message_waits_for_an_import():
 import sys
 from dvl_calib_ros.calibration import kalman
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 kalman.prepare()
 before = set(sys.modules)
 calibrator = Calibrator(Parameters(), block_size=512)

@@ -8,7 +8,7 @@ from io_fixtures import live
 
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.writer import Compression, Storage
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.files.mounting import load_calibrated_mounting
 from dvl_calib_ros.files.result_file import result_document, save_result

@@ -11,9 +11,9 @@ from rosbags.typesys import get_types_from_msg
 from stacks import DVL_STD, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion
 
 from dvl_calib_ros.bag_replay.replay import replay
-from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, FLU_FROM_FRD
+from dvl_calib_ros.calibration.numerics.samples import ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.discovery.discover import Given, discover
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal, frame_named

@@ -15,7 +15,7 @@ from io_fixtures import write_bag
 import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.checked_replay import checked_replay
 from dvl_calib_ros.bag_replay.replay import replay
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.verdict.kinds import Severity

@@ -11,9 +11,9 @@ import pytest
 from dvl_calib_ros.bag_replay.checked_replay import checked_replay
 from dvl_calib_ros.bag_replay.replay import extrinsics_of_replay, replay
 from dvl_calib_ros.calibration.comparison import compare
-from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rpy_from_rotation
 from dvl_calib_ros.calibration.models import MODELS, Needs
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rpy_from_rotation
 from dvl_calib_ros.evaluation.protocol import COMBINATIONS, GNSS_STD, TRAJECTORIES
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording, read_columns
 from dvl_calib_ros.simulation.sensors import measure_dvl, measure_gnss

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from yaml_text import written
 
 from dvl_calib_ros.bag_replay.replay import replay
-from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, FLU_FROM_FRD
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.files.result_file import result_document, result_text
 from dvl_calib_ros.simulation.scenario import Scenario, simulate

@@ -14,7 +14,7 @@ from std_srvs.srv import Trigger
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.simulation.injection import injection

@@ -20,7 +20,7 @@ from live_fixtures import Live, Offline, assert_agree, received, sent
 from ros import PATIENCE_S, until
 from stress_ending import stress
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.node.main import parameter_files
 from dvl_calib_ros.node.shutdown import ENDING, Ending

@@ -32,8 +32,8 @@ from std_srvs.srv import Trigger
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
-from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.files.result_file import result_document, save_result

@@ -23,8 +23,8 @@ from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here,
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import WITH_POSITIONS
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.drivers import POSE_TYPE, VELOCITY_TYPES

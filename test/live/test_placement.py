@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.disk.yaml_files import load_yaml

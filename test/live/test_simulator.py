@@ -24,8 +24,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros import PATIENCE_S, World, refused_at_start, until
 from sensor_msgs.msg import Imu
 
-from dvl_calib_ros.calibration.frames import quaternion_from_rotation
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.simulation.injection import injection

@@ -8,7 +8,7 @@ from own_models import PRIOR_STD
 from dvl_calib_ros.calibration.bank import ModelCounts
 from dvl_calib_ros.calibration.delay.hold_out import Terms
 from dvl_calib_ros.calibration.estimator import Estimator, EstimatorSetup
-from dvl_calib_ros.calibration.kalman import GaussianState
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 
 
 class MeanRise(Estimator):

@@ -9,9 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from dvl_calib_ros.calibration.models import Model, Needs, Nuisance
-from dvl_calib_ros.calibration.models.base import SHOWN_WITH_GNSS
+from dvl_calib_ros.calibration.models.base import SHOWN_WITH_GNSS, Observations
 from dvl_calib_ros.calibration.models.own import G1_NUISANCE, SCALE_PER_AXIS, linearise_g1
-from dvl_calib_ros.calibration.observations import Observations
 
 PRIOR_STD = 0.1
 

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import DifferentWorkError, Measurement, batch, check_same, evaluate
 from benchmarks.__main__ import PARTS, main
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.procedure import Procedure, run_seed
 from dvl_calib_ros.evaluation.trajectories import own_trajectories

@@ -115,7 +115,7 @@ def watch(folder: Path) -> None:
     """The live view 250 s into a run."""
     from dvl_calib_ros.bags.reader import BagReader
     from dvl_calib_ros.calibration.calibrator import Calibrator
-    from dvl_calib_ros.calibration.parameters import Parameters
+    from dvl_calib_ros.calibration.models.parameters import Parameters
     from dvl_calib_ros.cli.watch import rendered
     from dvl_calib_ros.messages.live_feed import MessageFeed
     from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose

@@ -12,8 +12,8 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.hold_out import ThinnedRecording
 from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.folds import FOLDS, folds_of
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import Streams
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import Streams
 from dvl_calib_ros.messages.decode import MessageDecoder
 from dvl_calib_ros.node.operator_card import Card
 from dvl_calib_ros.recordings.recording import open_recording

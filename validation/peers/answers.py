@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 
 from .forward import AXES, CLOCKS, COLUMNS, LINEAR, N_PARTS, Clock, Forward
 from .search import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 
 from .answers import Document, Found, answer, chance_of_left, is_seeing, named, parameters_from, searched, times_of
 from .search import Fitted, sizes_of

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from scipy import stats
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 
 from .answers import Document, Found, answer, is_seeing, parameters_from
 from .residual import residual

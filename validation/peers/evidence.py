@@ -17,7 +17,7 @@ import numpy as np
 from scipy.fft import dct
 from scipy.linalg import cho_factor, cho_solve
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 
 from .answers import EXPECTED, Document, Found, answer, is_seeing, named, parameters_from, searched, times_of
 from .forward import CLOCKS, COLUMNS, EFFECTS, N_PARTS

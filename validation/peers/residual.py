@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 
 from .answers import calibration_of, slope
 from .forward import CLOCKS, COLUMNS, LINEAR, N_CALIBRATION, Clock, Forward

@@ -17,8 +17,8 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import FRAMES, SampleBlock, VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import FRAMES, SampleBlock, VelocityFrame
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.decode import MessageDecoder
 from dvl_calib_ros.recordings.recording import open_recording

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.writer import BagWriter
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.messages.encode import SampleWriter
 
 from .cases import Drawn, draw

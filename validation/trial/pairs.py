@@ -17,7 +17,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.errors import InputError
 
 from .generator import BETWEEN_RECORDINGS_NS, START_NS, Noise, Sample, _dvl, _gnss, _imu, _write

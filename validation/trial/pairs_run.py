@@ -19,7 +19,7 @@ from typing import Any
 
 from scipy.stats import binomtest
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.recordings.recording import open_recording

@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.parallel import outcomes_on_cores

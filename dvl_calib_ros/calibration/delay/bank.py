@@ -19,19 +19,20 @@ from functools import reduce
 import numpy as np
 
 from ..block_terms import all_told, block_terms, turns_of, with_terms
-from ..correction_parameters import PriorOnErrors, of_unseen_roll, to_correction
 from ..dvl_bias import OfBias
 from ..folds import FOLDS, FoldInformation, folds_of, with_states_of
-from ..frames import Array, product
 from ..heading_states import HeadingEvidence, heading_states, prior_std
 from ..heave import HeaveRows, HeaveSums, with_heave
-from ..kalman import GaussianState
-from ..parameters import Parameters
-from ..robust import median
-from ..samples import Index, Mask
-from ..time_blocks import TimeBlocks
+from ..models.own import BEYOND, DELAY, LEVER_ARM, N_ERRORS, N_STATE
+from ..models.parameters import Parameters
+from ..numerics.block_covariance import TimeBlocks
+from ..numerics.error_model import PriorOnErrors, of_unseen_roll, to_correction
+from ..numerics.frames import Array, product
+from ..numerics.kalman import GaussianState
+from ..numerics.robust import median
+from ..numerics.samples import Index, Mask
 from .known import After, BlockRows, DayState, Ended, Hypotheses, Known, Likely, Posterior, Sums, Told, parts
-from .rows import BEYOND, DELAY, DELAYS_S, LEVER_ARM, N_ERRORS, N_STATE, OF_DAY, STEP_S, STEPS, DelayedRows
+from .rows import DELAYS_S, OF_DAY, STEP_S, STEPS, DelayedRows
 from .told import innovation_squared, told_by
 
 # Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.

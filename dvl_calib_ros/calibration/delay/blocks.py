@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from ..frames import Array
-from ..samples import Codes, Index, Stamps
+from ..numerics.frames import Array
+from ..numerics.samples import Codes, Index, Stamps
 from .rows import MARGIN_S
 
 MARGIN_NS = round(MARGIN_S * 1e9)

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..frames import ENU_FROM_NED, Array
-from ..parameters import Parameters
+from ..models.parameters import Parameters
+from ..numerics.frames import ENU_FROM_NED, Array
+from ..numerics.robust import median, steps
+from ..numerics.samples import FRAME_CODES, Index, Mask, Stamps, VelocityFrame
 from ..positions import are_positions, of_moments
-from ..robust import median, steps
-from ..samples import FRAME_CODES, Index, Mask, Stamps, VelocityFrame
 from ..spikes import without_spikes
 from .blocks import Block, ImuSamples, ReferenceSamples
 from .hold_out import NOT_MEASURED, thinned

@@ -13,14 +13,14 @@ import numpy as np
 
 from ...verdict.reasons import Reason
 from ..folds import folds_of
-from ..frames import Array
+from ..models.parameters import Parameters
 from ..navigation import Navigation, dead_reckoned
-from ..parameters import Parameters
+from ..numerics.frames import Array
+from ..numerics.samples import FRAMES, Codes, Mask
+from ..numerics.tables import RowTable
 from ..register.configuration import fitting_configuration
 from ..register.motion import MotionStreams, make_motion
 from ..register.registration import Registration, register
-from ..samples import FRAMES, Codes, Mask
-from ..tables import RowTable
 from ..verification import HeldOutError
 from .bank import DelayBank
 from .hold_out import (

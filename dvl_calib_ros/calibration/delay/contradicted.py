@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..frames import Array
-from ..robust import robust_std
-from ..samples import Index, Mask
+from ..numerics.frames import Array
+from ..numerics.robust import robust_std
+from ..numerics.samples import Index, Mask
 from ..spikes import beside, off_neighbours
 from .rows import DelayedRows, DvlColumns
 

@@ -23,21 +23,22 @@ from ..bank import ModelCounts
 from ..dvl_bias import OfBias
 from ..estimator import Estimator, EstimatorSetup
 from ..folds import Moments
-from ..frames import Array
 from ..history import Counts, Numbers, StateTrace
-from ..kalman import GaussianState
+from ..models.own import BEYOND, DELAY, LEVER_ARM, N_G1, N_STATE
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from ..numerics.samples import Index, SampleUse, Stamps
+from ..numerics.tables import RowTable
 from ..register.registration import Registration
 from ..results import Day
-from ..samples import Index, SampleUse, Stamps
 from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..streams import LONG_AGO_NS, LONGEST_NS
-from ..tables import RowTable
 from ..verification import HeldOutError
 from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .clocks import Rest
 from .hold_out import Terms, ThinnedBlock, ThinnedRecording, held_out_error
 from .known import DayState, Posterior
-from .rows import BEYOND, DELAY, LEVER_ARM, LONGEST_DELAY_S, N_G1, N_STATE
+from .rows import LONGEST_DELAY_S
 from .solver import BlockSolver, Outcome
 from .workers import AtOnce, Solved
 

@@ -8,15 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..error_model import CORRECTION_JACOBIAN, correction_matrix
 from ..folds import folds_of
-from ..frames import Array, cross, skew
-from ..kalman import GaussianState
-from ..parameters import Parameters
-from ..robust import median, steps
-from ..samples import Index, Mask, Stamps
+from ..models.own import DELAY, LEVER_ARM
+from ..models.parameters import Parameters
+from ..numerics.error_model import CORRECTION_JACOBIAN, correction_matrix
+from ..numerics.frames import Array, cross, skew
+from ..numerics.kalman import GaussianState
+from ..numerics.robust import median, steps
+from ..numerics.samples import Index, Mask, Stamps
 from ..verification import HeldOutError, held_out_from_sums
-from .rows import DELAY, LEVER_ARM, DvlColumns, ImuColumns, ReferenceColumns, attitude_at
+from .rows import DvlColumns, ImuColumns, ReferenceColumns, attitude_at
 
 # What is kept comes no faster than this, s: a velocity error is judged as well by five a second.
 KEPT_EVERY_S = 0.19

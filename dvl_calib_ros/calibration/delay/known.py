@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..dvl_bias import OfBias
-from ..frames import Array
 from ..heading_states import HeadingEvidence
-from ..kalman import GaussianState
-from ..samples import Index, Mask, Stamps
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from ..numerics.samples import Index, Mask, Stamps
 from .rows import DelayedRows
 
 

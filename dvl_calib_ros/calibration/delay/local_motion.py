@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..frames import Array
+from ..numerics.frames import Array
 from .parts import Near, places
 
 # Samples on each side that a fit needs: with fewer it extrapolates.

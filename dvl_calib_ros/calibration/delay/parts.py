@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..frames import Array
-from ..samples import Index, Mask
+from ..numerics.frames import Array
+from ..numerics.samples import Index, Mask
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,12 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from ..frames import Array, Vector, cross, rotation_from_quaternion, skew, slerps, squared
-from ..kalman import whitening
-from ..models.own import g1_errors, g1_heave_errors
-from ..robust import median, steps
-from ..samples import Index, Mask
+from ..models.own import DELAY, G2, LEVER_ARM, N_STATE, g1_errors, g1_heave_errors
+from ..numerics.frames import Array, Vector, cross, rotation_from_quaternion, skew, slerps, squared
+from ..numerics.kalman import whitening
+from ..numerics.robust import median, steps
+from ..numerics.samples import Index, Mask
 from .local_motion import local_fit, reach_at, spacing_at
-from .model import G2
 from .parts import Near, Parts, places
 
 # Delays are tried this far apart: a vehicle's velocity is straight enough over half of it for the rest to be a state
@@ -41,9 +40,6 @@ LEAST_REACH_S, LEAST_SLOPE_REACH_S = 0.6, 1.0
 MOST_REACH_S = 3.4
 # How far beyond a block of references the other streams have to be known.
 MARGIN_S = 7.0
-N_ERRORS, N_G1, N_STATE = 5, 8, 12
-LEVER_ARM, DELAY = slice(8, 11), 11
-BEYOND = slice(N_G1, N_STATE)  # what G1 has not
 # What rows say of the DVL's errors and of the delay is another thing for every delay; of the reference's constant error
 # and of the lever arm it is the same; of a constant heave they say nothing.
 OF_DELAY: Index = np.array([0, 1, 2, 3, 4, DELAY])

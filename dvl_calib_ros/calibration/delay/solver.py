@@ -18,11 +18,11 @@ from ...verdict.reasons import Reason, finding
 from ..attitude_rates import AttitudeRates
 from ..bank import ModelCounts
 from ..dvl_stream import DvlStream
-from ..frames import Array
-from ..kalman import GaussianState
-from ..parameters import Parameters
+from ..models.parameters import Parameters
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from ..numerics.samples import Stamps
 from ..register.registration import Registration
-from ..samples import Stamps
 from ..shared_noise import SharedNoise
 from .bank import DelayBank
 from .blocks import MARGIN_NS, Block

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..frames import Array
-from ..kalman import GaussianState, distance_squared
-from ..samples import Index, Mask
-from .rows import N_STATE, OF_DELAY, OF_NONE, DelayedRows
+from ..models.own import N_STATE
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState, distance_squared
+from ..numerics.samples import Index, Mask
+from .rows import OF_DELAY, OF_NONE, DelayedRows
 
 # Columns of what rows hold for each delay, and the states that they say anything of.
 _MOVING: Index = np.append(OF_DELAY, N_STATE)

@@ -20,12 +20,12 @@ from ..delay.hold_out import Terms
 from ..delay.workers import AtOnce, Solved
 from ..estimator import NEVER, Estimator, EstimatorSetup
 from ..folds import FOLDS, Moments
-from ..frames import Array
 from ..history import Counts, Numbers, StateTrace
-from ..kalman import GaussianState
 from ..navigation import Navigation
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from ..numerics.samples import Index, SampleUse, Stamps
 from ..positions import NOISY_MPS, are_positions
-from ..samples import Index, SampleUse, Stamps
 from ..selection import NO_EVIDENCE, Evidence
 from ..verification import HeldOutError
 from .judge import held_out, leg_length_s

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..frames import Array, rotation_from_quaternion
 from ..heading_states import N_HEADING
-from ..samples import Index, Stamps
+from ..numerics.frames import Array, rotation_from_quaternion
+from ..numerics.samples import Index, Stamps
 
 # No vehicle is so far from where it began, m.
 FARTHEST_M = 1e6

@@ -14,12 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..error_model import correction_matrix
-from ..frames import Array
-from ..kalman import GaussianState
-from ..parameters import Parameters
-from ..robust import median, robust_std
-from ..samples import Index, Mask
+from ..models.parameters import Parameters
+from ..numerics.error_model import correction_matrix
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from ..numerics.robust import median, robust_std
+from ..numerics.samples import Index, Mask
 from .legs import FARTHEST_M, Legs
 
 N_ERRORS, N_THETA = 4, 13

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..frames import Array
-from ..kalman import GaussianState
+from ..models.parameters import Parameters
 from ..navigation import POINTS, SHORTEST_M, Navigation, drift_over, ends_of_stretches
-from ..parameters import Parameters
-from ..samples import Index
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from ..numerics.samples import Index
 from .legs import Legs
 from .solve import N_ERRORS, DisplacementFit, linear_about
 

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ..delay.model import G2
-from ..displacement.model import D1
 from .base import N_MEASUREMENT, Linearised, Model, Needs, Nuisance
-from .own import OWN
-from .plugged import plugged_models
+from .own import D1, G2, OWN
+from .plugins import plugged_models
 from .published import PUBLISHED
 
 __all__ = [

@@ -1,17 +1,20 @@
 """G1, F1 and A1, our own linear models; derivations are in the docstrings of `linearise_g1`, `_f1` and `_a1`.
 
 G2, G1 with more states, is in `calibration.delay`. All hold in any right-handed frame with x ahead.
+
+G2's entry in the table of models: G1 with a lever arm and a delay, which no linear filter can begin to find.
+
+D1's entry in the table of models: positions with metres of noise, by where dead reckoning leads between them.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..correction_parameters import ALONG_FROM
-from ..frames import Array, skew, turned_skew
-from ..observations import Observations
-from ..samples import Mask
-from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuisance
+from ..numerics.error_model import ALONG_FROM
+from ..numerics.frames import Array, skew, turned_skew
+from ..numerics.samples import Mask
+from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuisance, Observations
 
 # A DVL axis shows its scale from this speed along it, m/s: a DVL noise of 0.01 m/s then pulls by 0.1 per cent at most,
 # while a scale error of 0.5 per cent that is left out costs 1.5 mm/s.
@@ -218,3 +221,65 @@ OWN = (
         motion_is_noise=True,
     ),
 )  # fmt: skip
+
+
+# What shows the states that G1 has not, by name.
+_SHOWN_TO_G2 = {
+    "lever_arm_x": "turns to both sides, or of different sharpness (needs angular velocity)",
+    "lever_arm_y": "turns to both sides, or of different sharpness (needs angular velocity)",
+    "lever_arm_z": "rolling and pitching: waves, or dives (needs angular velocity)",
+    "time_offset": "speeding up and slowing down, entering and leaving turns (needs angular velocity)",
+}
+
+
+G2 = Model(
+    "G2", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS | _SHOWN_TO_G2,
+    assumes="as G1, with a DVL anywhere on the vehicle whose stamps are off by up to 3 s; needs angular velocity",
+    wrong_when="the delay changes along the run; a vehicle that bends",
+    scale_axes=SCALE_PER_AXIS,
+    nuisance=(
+        *G1_NUISANCE,
+        Nuisance("lever_arm_x", "m", "initial_std_lever_arm"),
+        Nuisance("lever_arm_y", "m", "initial_std_lever_arm"),
+        Nuisance("lever_arm_z", "m", "initial_std_lever_arm"),
+        Nuisance("time_offset", "s", "initial_std_time_offset", of_the_day=True),
+    ),
+    noise=noise_in_body,
+    heave=g1_heave,
+    vertical_from_reference=True,
+    rows_in_body=True,
+    in_correction_parameters=True,
+    extends="G1",
+    estimator="dvl_calib_ros.calibration.delay.filter:DelayFilter",
+)  # fmt: skip
+
+
+def _per_second(seen: Observations) -> Linearised:
+    """z = -Tᵀv, H = [Tᵀ[v×], -Tᵀv] on φ and δk: what is displaced in a second, of which `legs` takes the integral."""
+    t, v = seen.rotation_dvl_from_body.T, seen.velocity_dvl
+    h = np.empty((len(v), 3, 4))
+    h[:, :, :3] = turned_skew(t, v.T).transpose(2, 0, 1)
+    h[:, :, 3] = -seen.velocity_in_body
+    return -seen.velocity_in_body, h
+
+
+D1 = Model(
+    "D1", Needs.ATTITUDE, 3, _per_second,
+    SHOWN_WITH_GNSS | {
+        "roll": "positions with their height, while rolling or moving across the bow",
+        "pitch": "positions with their height (USBL), and legs of minutes",
+        "yaw": "legs of minutes, out and back on several headings",
+        "scale": "legs of minutes, out and back",
+    },
+    assumes="attitude, and positions with any noise, also one that lasts for minutes, and outliers (USBL, plain GPS); "
+    "the DVL anywhere within initial_std_lever_arm",
+    wrong_when="the positions' frame is turned or scaled: a map off true north, a USBL with a wrong sound speed",
+    scale_axes=(("delta_k", (0, 1, 2)),),
+    from_positions=True,
+    estimator="dvl_calib_ros.calibration.displacement.filter:Displacements",
+)  # fmt: skip
+
+
+N_ERRORS, N_G1, N_STATE = 5, 8, 12
+LEVER_ARM, DELAY = slice(8, 11), 11
+BEYOND = slice(N_G1, N_STATE)  # what G1 has not

@@ -9,9 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from ..frames import skew
-from ..observations import Observations
-from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs
+from ..numerics.frames import skew
+from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Observations
 
 
 def _gnss_aided(

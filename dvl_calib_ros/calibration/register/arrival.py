@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 from ..delay.rows import LONGEST_DELAY_S
-from ..parameters import Parameters
-from ..samples import Stream
+from ..models.parameters import Parameters
+from ..numerics.samples import Stream
 
 
 class Apart(NamedTuple):

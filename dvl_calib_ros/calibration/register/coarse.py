@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..delay.rows import attitude_at
-from ..frames import Array
-from ..robust import median
+from ..numerics.frames import Array
+from ..numerics.robust import median
 from .motion import MotionStreams
 
 # Clocks further apart than this are looked for nowhere, s.

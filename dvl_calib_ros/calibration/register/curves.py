@@ -8,9 +8,9 @@ import numpy as np
 
 from ..delay.local_motion import REACH_INTERVALS, local_fit, reach_at, spacing_at
 from ..delay.rows import LEAST_SLOPE_REACH_S, MOST_REACH_S, angular_velocity_at
-from ..frames import Array
-from ..robust import median
-from ..samples import Index, Mask
+from ..numerics.frames import Array
+from ..numerics.robust import median
+from ..numerics.samples import Index, Mask
 from .motion import MotionStreams
 
 # Curves are smoothed on a grid of this step, s, and of a long recording of so many times; of so many at once.

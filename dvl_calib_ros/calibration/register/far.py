@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ...verdict.reasons import Reason, finding
 from ..delay.rows import attitude_at
-from ..frames import Array
-from ..robust import median
+from ..numerics.frames import Array
+from ..numerics.robust import median
 from .coarse import HOLE_S, LONGEST_S
 from .motion import MotionStreams
 

@@ -18,11 +18,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..delay.rows import attitude_at
-from ..extrinsics import rotation_of, turn_between
-from ..frames import Array, cross, nearest_rotation, skew, squared
-from ..robust import median
-from ..samples import Index, Mask
-from ..time_blocks import TimeBlocks
+from ..numerics.block_covariance import TimeBlocks
+from ..numerics.frames import Array, cross, nearest_rotation, rotation_of, skew, squared, turn_between
+from ..numerics.robust import median
+from ..numerics.samples import Index, Mask
 from .curves import GAP_S, Curves
 from .motion import MotionStreams
 

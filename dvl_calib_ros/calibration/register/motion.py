@@ -9,11 +9,11 @@ import numpy as np
 
 from ..clocks import Clocks
 from ..delay.rows import DvlColumns, ImuColumns, TurnRates, binned
-from ..frames import ENU_FROM_NED, Array
 from ..imu_alignment import ImuAlignment
-from ..parameters import Parameters
+from ..models.parameters import Parameters
+from ..numerics.frames import ENU_FROM_NED, Array
+from ..numerics.samples import FRAME_CODES, Index, SampleBlock, Streams, VelocityFrame
 from ..positions import are_positions, of_moments
-from ..samples import FRAME_CODES, Index, SampleBlock, Streams, VelocityFrame
 from ..screening import measured_axes, screen_columns, unit_quaternions
 from ..spikes import without_spikes
 

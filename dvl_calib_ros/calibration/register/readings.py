@@ -16,20 +16,20 @@ import numpy as np
 
 from ..delay.rows import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..directions import Directions
-from ..extrinsics import rotation_of
-from ..frames import (
+from ..imu_alignment import quaternion_product
+from ..numerics.frames import (
     ENU_FROM_NED,
     FLU_FROM_FRD,
     Array,
     cross,
     nearest_rotation,
     quaternion_from_rotation,
+    rotation_of,
     rpy_from_rotation,
     squared,
     whole_degrees,
 )
-from ..imu_alignment import quaternion_product
-from ..samples import VelocityFrame
+from ..numerics.samples import VelocityFrame
 from .configuration import DRAWN, angle_between, misfit, nearest
 from .curves import GAP_S, Curves
 from .far import covered, velocity_at

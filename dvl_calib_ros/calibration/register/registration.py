@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..frames import Array
-from ..parameters import Parameters
+from ..models.parameters import Parameters
+from ..numerics.frames import Array
 from .coarse import LONGEST_S, places
 from .curves import Curves
 from .fine import (

@@ -15,8 +15,8 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..delay.rows import DvlColumns, ImuColumns, TurnRates
-from ..frames import Array
-from ..samples import Index, Mask
+from ..numerics.frames import Array
+from ..numerics.samples import Index, Mask
 from .fine import APART, ARM, LATE, Fitted, MotionFit, N
 from .motion import MotionStreams
 

@@ -25,7 +25,7 @@ from dvl_calib_ros.bags import channels, sources
 from dvl_calib_ros.bags.channels import Channel, DecodingError, Definition, is_empty
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Storage
-from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS, TWIST_TYPE
 

@@ -30,7 +30,7 @@ from yaml_text import parsed, written
 from dvl_calib_ros.bags import batches, sources
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
-from dvl_calib_ros.calibration.samples import DvlSample, VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, VelocityFrame
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.messages.drivers import TWIST_TYPE

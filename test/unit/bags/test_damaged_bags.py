@@ -28,7 +28,7 @@ from mcap.writer import CompressionType
 
 from dvl_calib_ros.bags import files
 from dvl_calib_ros.bags.salvage import mcap_file
-from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
 

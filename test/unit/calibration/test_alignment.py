@@ -12,15 +12,8 @@ from runs import SECOND, START_NS, feed
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import (
-    FRAMES,
-    AlignedBlock,
-    Covariances,
-    Stream,
-    Streams,
-    sample_block,
-)
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import FRAMES, AlignedBlock, Covariances, Stream, Streams, sample_block
 
 # Absolutely, and of σ: where the gate rejects most of what comes, the last bit has grown to 1.3e-9 of σ.
 STATES_EQUAL, OF_SIGMA = 1e-12, 1e-8

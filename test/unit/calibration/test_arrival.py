@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import Stream
 from dvl_calib_ros.calibration.register.arrival import apart, limit_s
-from dvl_calib_ros.calibration.samples import Stream
 
 DVL, REFERENCE, IMU = Stream.DVL, Stream.REFERENCE, Stream.IMU
 P = Parameters()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.attitude_rates import CONVENTIONS, AttitudeRates
-from dvl_calib_ros.calibration.frames import (
+from dvl_calib_ros.calibration.numerics.frames import (
     ENU_FROM_NED,
     quaternion_from_rotation,
     rotation_from_quaternion,

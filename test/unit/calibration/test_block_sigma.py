@@ -11,11 +11,11 @@ from runs import ONE_HERTZ, START_NS, MatchedRun, calibrate, make_samples
 from dvl_calib_ros.calibration.advice import one_heading_advice, reference_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.days import day_covariance
-from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.calibration.time_blocks import TimeBlocks
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.worth import predicted_drift
 from dvl_calib_ros.files.result_file import result_document
 

@@ -16,8 +16,9 @@ from dvl_calib_ros.calibration import bank
 from dvl_calib_ros.calibration.advice import data_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
-from dvl_calib_ros.calibration.parameters import SCHEMA, ParameterError, Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
+from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 
 PHI, SCALE = (2e-5, -3e-5, 4e-5), 3e-5
 EXACT = MatchedRun(phi=PHI, scale=SCALE)

@@ -14,12 +14,12 @@ from dvl_calib_ros.calibration.comparison import (
     fused,
 )
 from dvl_calib_ros.calibration.comparison_words import comparison_document, reasons, remarks
-from dvl_calib_ros.calibration.error_model import corrected_mounting
-from dvl_calib_ros.calibration.extrinsics import COMPONENTS, Extrinsics, extrinsics_of, rotation_of, turn_between
-from dvl_calib_ros.calibration.frames import rotation_from_rpy
-from dvl_calib_ros.calibration.kalman import GaussianState
+from dvl_calib_ros.calibration.extrinsics import COMPONENTS, Extrinsics, extrinsics_of
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy, rotation_of, turn_between
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.errors import InputError
 
 DAY_NS = 86_400_000_000_000

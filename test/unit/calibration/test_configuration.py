@@ -9,12 +9,17 @@ import pytest
 from conftest import few
 from runs import START_NS, calibrate
 
-from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, quaternion_from_rotation, rotation_from_rpy
-from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import (
+    ENU_FROM_NED,
+    FLU_FROM_FRD,
+    quaternion_from_rotation,
+    rotation_from_rpy,
+)
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.observability import Convergence
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.verification import HeldOutError, verify
 from dvl_calib_ros.verdict.kinds import Severity
 

@@ -8,7 +8,7 @@ from runs import MatchedRun, calibrate, make_samples
 from scipy.stats import chi2
 
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 
 pytestmark = pytest.mark.slow  # hundreds of simulated runs
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from dvl_calib_ros.calibration.correction_parameters import (
+from dvl_calib_ros.calibration.numerics.error_model import (
     PriorOnErrors,
     correction_from_errors,
     errors_from_correction,
     of_unseen_roll,
 )
-from dvl_calib_ros.calibration.frames import rotation_from_rpy, skew
-from dvl_calib_ros.calibration.kalman import GaussianState
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy, skew
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 
 # of misalignment (rad) and scale: such as a user would give, and hardly any
 PRIORS = {"tight": (0.05, 0.006), "wide": (0.5, 0.006), "of any scale": (0.5, 0.03)}

@@ -9,9 +9,9 @@ import pytest
 from runs import MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.frames import rotation_from_rpy, skew
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy, skew
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.files.result_file import result_document
 
 MOUNTING = (0.1, -0.2, 0.8)

@@ -18,15 +18,15 @@ from dvl_calib_ros.calibration.correction import lever_arm
 from dvl_calib_ros.calibration.delay import contradicted
 from dvl_calib_ros.calibration.delay import solver as delay_solver
 from dvl_calib_ros.calibration.delay.local_motion import local_fit, reach_at, spacing_at
-from dvl_calib_ros.calibration.delay.rows import BEYOND
-from dvl_calib_ros.calibration.delay.rows import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.delay.workers import AtOnce
-from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
-from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.calibration.time_blocks import MOST, TimeBlocks
+from dvl_calib_ros.calibration.models.own import BEYOND
+from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.block_covariance import MOST, TimeBlocks
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.simulation.sensors import measure_dvl_matched
 from dvl_calib_ros.simulation.trajectories import body_rates
 from dvl_calib_ros.verdict.kinds import Severity

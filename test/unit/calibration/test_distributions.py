@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dvl_calib_ros.calibration import chi_square, distributions
-from dvl_calib_ros.calibration.robust import median, robust_std
+from dvl_calib_ros.calibration.numerics import chi_square, distributions
+from dvl_calib_ros.calibration.numerics.robust import median, robust_std
 
 TAILS = (1e-12, 1e-4, 0.01, 0.3, 0.5, 0.9, 0.9999)
 

@@ -9,11 +9,11 @@ import pytest
 from conftest import few
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.heading_deviation import FIRST, heading_advice, heading_deviation, how_bad
-from dvl_calib_ros.calibration.kalman import GaussianState
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.verdict.kinds import Severity
 
 START_NS, STEP_S, LEG_S = 1_600_000_000_000_000_000, 0.5, 40.0

@@ -10,11 +10,11 @@ import pytest
 
 from dvl_calib_ros.calibration import heading_states as module
 from dvl_calib_ros.calibration.block_terms import N_BIAS, BlockTerms, TermsOfBlock, block_terms, with_terms
-from dvl_calib_ros.calibration.frames import skew
 from dvl_calib_ros.calibration.heading_states import N_BEFORE, HeadingEvidence, heading_states, prior_std
 from dvl_calib_ros.calibration.heave import HeaveSums
-from dvl_calib_ros.calibration.kalman import GaussianState
-from dvl_calib_ros.calibration.time_blocks import TimeBlocks
+from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
+from dvl_calib_ros.calibration.numerics.frames import skew
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 
 N, ROWS, STD, PRIOR = 4, 30, math.radians(0.5), math.radians(5.0)
 TURNS = np.eye(N, 3)  # of a DVL along the vehicle's axes

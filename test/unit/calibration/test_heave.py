@@ -8,8 +8,8 @@ from runs import feed
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.heave import HeaveRows, with_heave
-from dvl_calib_ros.calibration.kalman import GaussianState
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
 from dvl_calib_ros.evaluation.trajectories import Trajectory

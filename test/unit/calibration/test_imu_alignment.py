@@ -10,10 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.frames import ENU_FROM_NED, attitude_enu_flu_from_ned_frd, quaternion_from_rotation
 from dvl_calib_ros.calibration.imu_alignment import ImuAlignment
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import ImuSample, Stream, sample_block
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import (
+    ENU_FROM_NED,
+    attitude_enu_flu_from_ned_frd,
+    quaternion_from_rotation,
+)
+from dvl_calib_ros.calibration.numerics.samples import ImuSample, Stream, sample_block
 
 ANGLES = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
 

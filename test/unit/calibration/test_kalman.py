@@ -9,8 +9,8 @@ from filter_problems import random_problem
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dvl_calib_ros.calibration import kalman
-from dvl_calib_ros.calibration.kalman import Measurements
+from dvl_calib_ros.calibration.numerics import kalman
+from dvl_calib_ros.calibration.numerics.kalman import Measurements
 
 
 def least_squares(x, p, data, k):

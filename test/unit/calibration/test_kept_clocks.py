@@ -8,7 +8,7 @@ from runs import MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.delay import clocks
 from dvl_calib_ros.calibration.delay.hold_out import ThinnedRecording
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 
 
 @pytest.fixture(scope="module")

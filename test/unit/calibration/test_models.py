@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from dvl_calib_ros.calibration import kalman
 from dvl_calib_ros.calibration.assembly import Assembler
 from dvl_calib_ros.calibration.bank import groups_of
-from dvl_calib_ros.calibration.error_model import correct, distort
-from dvl_calib_ros.calibration.frames import FLU_FROM_FRD, rotation_from_rpy, skew
 from dvl_calib_ros.calibration.heave import HeaveRows, with_heave
 from dvl_calib_ros.calibration.height import HeightOfLate
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
-from dvl_calib_ros.calibration.observations import Observations
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.base import Observations
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics import kalman
+from dvl_calib_ros.calibration.numerics.error_model import correct, distort
+from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rotation_from_rpy, skew
 
 # T = rotation_dvl_from_body: flush, a DVL turned by 45 degrees, a tilted one, and one hung upside down
 MOUNTINGS = {"none": (0, 0, 0), "yaw45": (0, 0, np.pi / 4), "tilted": (0.1, -0.2, 0.8), "inverted": (np.pi, 0.1, 0)}

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.error_model import corrected_mounting
-from dvl_calib_ros.calibration.frames import rpy_from_rotation
-from dvl_calib_ros.calibration.kalman import GaussianState
 from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.mounting_pose import mounting_pose, rpy_std, scale_and_delay
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
+from dvl_calib_ros.calibration.numerics.frames import rpy_from_rotation
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 
 PARAMETERS = Parameters(
     mounting_rpy=(0.3, -0.2, 2.1), lever_arm=(0.5, 0.0, 0.2), dvl_time_offset=0.25, dvl_position="from_reference"

@@ -10,13 +10,13 @@ from runs import START_NS, calibrate, feed_columns, shifted
 from test_delay import LEVER_ARM, NOISE, PHI, late
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.rows import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.delay.rows import OF_DAY
 from dvl_calib_ros.calibration.folds import with_states_of
-from dvl_calib_ros.calibration.kalman import GaussianState
+from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.new_days import NewDays
-from dvl_calib_ros.calibration.samples import ReferenceSample
-from dvl_calib_ros.calibration.time_blocks import TimeBlocks
+from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
 
 SECOND_NS = 1_000_000_000
 NIGHT_NS = 86_400 * SECOND_NS

@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 from runs import MatchedRun, calibrate, make_samples, only
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.correction_parameters import correction_from_errors, errors_from_correction
-from dvl_calib_ros.calibration.error_model import correct
-from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy, skew
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.error_model import correct, correction_from_errors, errors_from_correction
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy, skew
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.simulation.sensors import DvlErrors, equivalent_error_terms, measure_dvl
 
 SECOND = 1_000_000_000

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from dvl_calib_ros.calibration.estimator import kind_of
-from dvl_calib_ros.calibration.models import MODELS, plugged
-from dvl_calib_ros.calibration.parameters import ParameterError
+from dvl_calib_ros.calibration.models import MODELS, plugins
+from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
 
 ROOT = Path(__file__).parents[3]
 PLUGIN = ROOT / "test" / "model_plugin"
@@ -22,7 +22,7 @@ import json, sys
 sys.path[:0] = [sys.argv[1], {str(ROOT)!r}, {str(ROOT / "test")!r}]
 from runs import MatchedRun, calibrate, make_samples
 from dvl_calib_ros.calibration.models import LINEAR_MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 run = MatchedRun("box", 120.0, phi=(0.0, 0.02, -0.03), gnss_std=0.02, dvl_std=0.005)
 samples = make_samples(run)
 both = [calibrate(samples, block_size=size, verified=True) for size in (1, 400)]
@@ -45,7 +45,7 @@ def installed(folder: Path, points: dict[str, str]) -> Path:
     metadata = folder / "own_models-0.1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: own-models\nVersion: 0.1.0\n")
-    lines = [f"[{plugged.ENTRY_POINTS}]", *(f"{name} = {value}" for name, value in points.items())]
+    lines = [f"[{plugins.ENTRY_POINTS}]", *(f"{name} = {value}" for name, value in points.items())]
     (metadata / "entry_points.txt").write_text("\n".join(lines) + "\n")
     for module in PLUGIN.glob("*.py"):
         (folder / module.name).write_text(module.read_text())
@@ -61,7 +61,7 @@ def calibrated(tmp_path_factory):
     project = configparser.ConfigParser()
     project.optionxform = str
     project.read(PLUGIN / "pyproject.toml")
-    section = project[f'project.entry-points."{plugged.ENTRY_POINTS}"']
+    section = project[f'project.entry-points."{plugins.ENTRY_POINTS}"']
     points = {name: value.strip('"') for name, value in section.items()}
     done = run(CALIBRATE, installed(tmp_path_factory.mktemp("site"), points))
     assert done.returncode == 0, done.stderr
@@ -93,12 +93,12 @@ def test_an_estimator_of_another_package_is_one_class_beside_its_entry(calibrate
         ("no_such_module:W1", "No module named 'no_such_module'"),
         ("math:pi", "math:pi is no Model"),
         ("dvl_calib_ros.calibration.models.published:PUBLISHED", "is no Model"),
-        ("dvl_calib_ros.calibration.delay.model:G2", "there is a model 'G2' already"),
+        ("dvl_calib_ros.calibration.models.own:G2", "there is a model 'G2' already"),
     ],
 )
 def test_a_broken_one_is_named_in_one_line_and_the_others_are_there(monkeypatch, value, said):
-    monkeypatch.setattr(plugged, "_points", lambda: [("mine", value)])
-    models, problems = plugged.plugged_models(MODELS)
+    monkeypatch.setattr(plugins, "_points", lambda: [("mine", value)])
+    models, problems = plugins.plugged_models(MODELS)
     assert not models and len(problems) == 1
     assert "'mine'" in problems[0] and said in problems[0] and "\n" not in problems[0]
 

@@ -10,7 +10,7 @@ from runs import calibrate
 from test_delay import LEVER_ARM, NOISE, late
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.samples import ImuSample, ReferenceSample
+from dvl_calib_ros.calibration.numerics.samples import ImuSample, ReferenceSample
 from dvl_calib_ros.verdict.reasons import Reason
 
 

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.delay.rows import ImuColumns, attitude_at
-from dvl_calib_ros.calibration.frames import quaternion_from_rotation, rotation_from_rpy
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.register import registration
 from dvl_calib_ros.calibration.register.coarse import LONGEST_S, _minima, places
 from dvl_calib_ros.calibration.register.configuration import fitting_configuration
@@ -27,7 +28,6 @@ from dvl_calib_ros.calibration.register.registration import (
     register,
     turn_open,
 )
-from dvl_calib_ros.calibration.samples import VelocityFrame
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

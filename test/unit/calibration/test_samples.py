@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.samples import (
+from dvl_calib_ros.calibration.numerics.samples import (
     Covariances,
     DvlSample,
     ImuSample,

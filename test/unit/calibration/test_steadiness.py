@@ -9,7 +9,7 @@ import pytest
 from test_register import ARM, run
 
 from dvl_calib_ros.calibration.delay.rows import ImuColumns
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.register.fine import Claimed, Fitted
 from dvl_calib_ros.calibration.register.motion import make_motion
 from dvl_calib_ros.calibration.register.registration import Registration, register

@@ -9,8 +9,8 @@ from runs import MatchedRun, feed, feed_columns, make_samples
 from dvl_calib_ros.calibration import stream_clocks
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.workers import AtOnce
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import ReferenceSample
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
 from dvl_calib_ros.calibration.stream_clocks import MOST, _Spread
 from dvl_calib_ros.verdict.kinds import Severity
 

@@ -12,9 +12,9 @@ from dvl_calib_ros.calibration.delay.clocks import MOST, MOST_OF_A_BLOCK, KeptCl
 from dvl_calib_ros.calibration.delay.filter import DelayFilter
 from dvl_calib_ros.calibration.delay.hold_out import KEPT_EVERY_S, ThinnedBlock
 from dvl_calib_ros.calibration.delay.rows import DvlColumns, ImuColumns, ReferenceColumns
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
-from dvl_calib_ros.calibration.tables import RowTable
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
+from dvl_calib_ros.calibration.numerics.tables import RowTable
 
 
 class Numbers(RowTable):

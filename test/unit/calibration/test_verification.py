@@ -10,16 +10,16 @@ from filter_problems import random_problem
 from runs import ONE_HERTZ, MatchedRun, calibrate, make_samples
 from scipy.stats import chi2
 
-from dvl_calib_ros.calibration import kalman
-from dvl_calib_ros.calibration.error_model import correct, correction_jacobian
 from dvl_calib_ros.calibration.folds import FOLDS, FoldInformation, Moments, folds_of
-from dvl_calib_ros.calibration.frames import rotation_from_rpy
-from dvl_calib_ros.calibration.kalman import GaussianState, Measurements
 from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models.base import Observations
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics import kalman
+from dvl_calib_ros.calibration.numerics.error_model import correct, correction_jacobian
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.kalman import GaussianState, Measurements
+from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
 from dvl_calib_ros.calibration.observability import Convergence
-from dvl_calib_ros.calibration.observations import Observations
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import ReferenceSample
 from dvl_calib_ros.calibration.verification import HeldOutError, held_out_error, verify
 from dvl_calib_ros.verdict.kinds import Severity
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from runs import ONE_HERTZ, MatchedRun, calibrate, make_samples
 
-from dvl_calib_ros.calibration.frames import rotation_from_rpy, skew
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy, skew
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.worth import (
     KM,
     RecentMotion,

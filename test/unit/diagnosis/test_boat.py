@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.diagnosis.composed import no_effect
 from dvl_calib_ros.diagnosis.criteria import blocks_of
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings

@@ -13,8 +13,9 @@ import pytest
 from command_line import fail, succeed
 from scipy.signal import lfilter
 
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.tests import holm
 from dvl_calib_ros.diagnosis import fitting, intervals, proposing, shown, standing, twice
 from dvl_calib_ros.diagnosis.called_for import (
     _is_late_before_a_leap,
@@ -30,7 +31,6 @@ from dvl_calib_ros.diagnosis.criteria import finer_steps
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
-from dvl_calib_ros.diagnosis.holm import holm
 from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays, gaps, in_gaps, time_by_stamps, told_by_stamps
 from dvl_calib_ros.diagnosis.leaps import _found as _delays
 from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares

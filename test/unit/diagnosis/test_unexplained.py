@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_diagnosis import LEVER, fitted, recording_of, scenario, with_added
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.diagnosis import standing
 from dvl_calib_ros.diagnosis import unexplained as looking
 from dvl_calib_ros.diagnosis.beside import FittedBeside

@@ -14,8 +14,8 @@ import pytest
 from conftest import ROOT
 from documentation import section
 
-from dvl_calib_ros.calibration.frames import rotation_from_rpy
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.effects import registry
 from dvl_calib_ros.effects.base import ActsOn, Effect, EffectInput, EffectNeeds
 from dvl_calib_ros.effects.registry import EFFECTS, NOISE_EFFECTS, OWN, effect_table

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.frames import Array
+from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, make_problem
 from dvl_calib_ros.diagnosis.recordings import make_recording
 from dvl_calib_ros.effects.composition import Injection

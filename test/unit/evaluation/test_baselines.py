@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.extrinsics import rotation_of
-from dvl_calib_ros.calibration.frames import nearest_rotation
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import nearest_rotation, rotation_of
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.convergence import TIMES_S, curve_keys, curves, squared_errors
 from dvl_calib_ros.evaluation.metrics import BASELINES

@@ -13,8 +13,8 @@ from runs import feed
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import SampleUse
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import SampleUse
 from dvl_calib_ros.evaluation.estimation import SensorData, aligned, estimate, streams_of, true_prior
 from dvl_calib_ros.evaluation.procedure import sensor_data
 from dvl_calib_ros.evaluation.trajectories import own_trajectories

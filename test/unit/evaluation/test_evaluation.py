@@ -16,9 +16,9 @@ import pytest
 from dvl_calib_ros import parallel
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.frames import ENU_FROM_NED, FLU_FROM_FRD, rpy_from_rotation
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, rpy_from_rotation
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import metrics, protocol, validation_study

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from report_fixtures import drawn
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.evaluation import estimation, procedure, validation_study
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate

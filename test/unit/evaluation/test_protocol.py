@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.procedure import Procedure, run_seed
 from dvl_calib_ros.evaluation.results import UNCALIBRATED

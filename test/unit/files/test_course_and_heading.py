@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.frames import rotation_from_quaternion
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.logs.course_and_heading import names_columns, read_course, read_heading

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import load_parameters, new_file, with_parameters
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from yaml_text import parsed
 
-from dvl_calib_ros.calibration.parameters import SCHEMA, Parameters
+from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import (
     given_parameters,

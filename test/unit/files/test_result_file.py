@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from yaml_text import parsed, written
 
 from dvl_calib_ros.calibration.comparison import Difference
-from dvl_calib_ros.calibration.error_model import corrected_mounting
-from dvl_calib_ros.calibration.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.results import Result
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError

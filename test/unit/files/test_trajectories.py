@@ -14,7 +14,7 @@ from io_fixtures import estimates, raw
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.logs.trajectories import (
     ImportOptions,

@@ -14,7 +14,7 @@ from command_line import fail, succeed
 from log_fixtures import START_S, dataflash, general_nmea, nortek, pd0, rmc, sentence, telemetry
 
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.calibration.frames import rotation_from_quaternion
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion
 from dvl_calib_ros.logs.dvl_logs import is_dvl_log, read_dvl_log
 from dvl_calib_ros.logs.nmea import read_rmc
 

@@ -31,9 +31,9 @@ from rosbags.rosbag2 import StoragePlugin
 
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.frames import rotation_from_quaternion, rotation_from_rpy
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.recordings import load_recordings
 from dvl_calib_ros.disk.yaml_files import load_yaml

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import ReferenceSample, VelocityFrame
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.positions import FixDifference
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.messages.decode import LinearCovariance, stamp_ns
 from dvl_calib_ros.messages.live_feed import MessageFeed
 

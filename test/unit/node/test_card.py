@@ -9,8 +9,8 @@ import pytest
 from runs import MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.worth import PredictedDrift, predicted_drift
 from dvl_calib_ros.node.operator_card import LEAST_LOOKS, SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, RecentWorth
 

@@ -14,8 +14,8 @@ from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.judging import Judge
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from dvl_calib_ros.messages import live_feed
 from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.node.live_checks import LateClocks

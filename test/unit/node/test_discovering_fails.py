@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.drivers import TWIST_TYPE
 from dvl_calib_ros.node.live_discovery import Discovering

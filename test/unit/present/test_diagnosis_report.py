@@ -10,7 +10,7 @@ from command_line import fail, succeed
 from io_fixtures import run, write_bag
 from report_fixtures import OWN_EFFECT, Page, assert_described, diagnosis, drawn
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.closure import Gap
 from dvl_calib_ros.diagnosis.diagnose import diagnose

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from runs import MatchedRun, calibrate, make_samples
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.quantities import not_shown, quantities
 from dvl_calib_ros.calibration.results import Result
 

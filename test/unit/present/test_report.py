@@ -20,9 +20,9 @@ from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bag_replay.run_history import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.quantities import quantities
-from dvl_calib_ros.calibration.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.present.figure_data import MapTrack, explorable
 from dvl_calib_ros.present.figure_style import MODEL_STYLES, new_figure
 from dvl_calib_ros.present.page import write_replay_report, write_report

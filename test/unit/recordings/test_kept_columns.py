@@ -14,8 +14,8 @@ from io_fixtures import IMU_TYPE, JAZZY, TWIST_TYPE, mcap_bytes, raw, run, write
 
 from dvl_calib_ros.bags import columns as bag_columns
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import Stream
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import Stream
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS
 from dvl_calib_ros.recordings import columns

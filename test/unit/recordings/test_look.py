@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import run, write_bag
 
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.recordings import topic_preview as looking
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.requirements import hold_the_same

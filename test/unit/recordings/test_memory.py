@@ -154,7 +154,7 @@ def long_recording(path: Path, seconds: int, camera_chunks: int = 0) -> Path:
 MEASURED = """
 import re, sys
 from pathlib import Path
-from dvl_calib_ros.calibration.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.examination.examine import examine
 from dvl_calib_ros.recordings.recording import open_recording

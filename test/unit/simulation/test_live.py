@@ -11,8 +11,8 @@ import pytest
 from command_line import fail, succeed
 from driver_fixtures import Maker
 
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import DvlSample
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.effects.base import NoiseEffect
 from dvl_calib_ros.effects.registry import EFFECTS, NOISE_EFFECTS
 from dvl_calib_ros.errors import InputError

@@ -14,10 +14,10 @@ from mcap.reader import make_reader
 
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.calibration.error_model import distort
-from dvl_calib_ros.calibration.frames import ENU_FROM_NED, rotation_from_quaternion, rotation_from_rpy
-from dvl_calib_ros.calibration.parameters import Parameters
-from dvl_calib_ros.calibration.samples import ImuSample, VelocityFrame
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.error_model import distort
+from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, rotation_from_quaternion, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import ImuSample, VelocityFrame
 from dvl_calib_ros.effects.base import ActsOn, ClockEffect, Effect, EffectInput
 from dvl_calib_ros.effects.composition import Injection
 from dvl_calib_ros.effects.registry import EFFECTS, OWN

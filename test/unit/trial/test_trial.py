@@ -14,8 +14,8 @@ import pytest
 from conftest import ROOT
 
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.calibration.frames import attitude_enu_flu_from_ned_frd, rotation_from_rpy
-from dvl_calib_ros.calibration.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.frames import attitude_enu_flu_from_ned_frd, rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError

@@ -195,3 +195,17 @@ def nearest_rotation(products: Array) -> Array:
     proper[..., 2] = np.linalg.det(u @ vt)
     found: Array = u * proper[..., None, :] @ vt
     return found
+
+
+def turn_between(before: Array, after: Array) -> Array:
+    """Axis times angle (3,) rad of the turn from one mounting (3, 3) to another, about the body's axes."""
+    return rotation_vector(quaternion_from_rotation(after @ before.T))
+
+
+def rotation_of(vector: Array) -> Array:
+    """Inverse of `turn_between` from no turn at all: (3,) rad -> (3, 3) (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle == 0.0:
+        return np.eye(3)
+    k = skew(np.asarray(vector) / angle)
+    return np.asarray(np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * k @ k)

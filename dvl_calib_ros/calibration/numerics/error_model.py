@@ -1,4 +1,9 @@
-"""From the parameters of a correction to those of the errors, and back.
+"""The nonlinear DVL error model, its exact inverse, and what follows from it (models.md, "Error model").
+
+``v_d = (I + diag(δk)) (I + [φ×]) T v_b`` with ``T = rotation_dvl_from_body``: the nominal mounting, φ (3,) rad the
+residual misalignment and δk (3,) the scale-factor errors, both in the DVL frame.
+
+From the parameters of a correction to those of the errors, and back.
 
 `T v_b = (I - [ψ×] - diag(κ)) v` is linear in what corrects (ψ, κ), `v = (I + diag(δk)) (I + [φ×]) T v_b` is how the
 errors are defined (models.md). With B = (I - [ψ×] - diag(κ))⁻¹: δk_i = B_ii - 1, and φ is the skew part of
@@ -14,6 +19,7 @@ B makes of n.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from functools import cache
@@ -25,12 +31,67 @@ from .frames import Array, product, skew
 from .kalman import GaussianState
 from .samples import Index
 
+_IDENTITY: Array = np.eye(3)
+
+
+def distort(velocity_body: Array, misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
+    """What a DVL with these errors measures of a body velocity: (..., 3) m/s -> (..., 3) m/s in the DVL frame."""
+    matrix = np.diag(1.0 + np.asarray(scale)) @ (np.eye(3) + skew(misalignment)) @ rotation_dvl_from_body
+    return velocity_body @ matrix.T
+
+
+def correction_matrix(misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
+    """Matrix that takes the measured DVL velocity to the corrected body velocity: the inverse of `distort`.
+
+    (..., 3) rad, (..., 3) -> (..., 3, 3).
+    """
+    phi = np.asarray(misalignment, dtype=float)
+    # (I + [φ×])⁻¹ = (I - [φ×] + φφᵀ) / (1 + ‖φ‖²)
+    inverse = _IDENTITY - skew(phi) + phi[..., :, None] * phi[..., None, :]
+    inverse /= 1.0 + (phi * phi).sum(axis=-1)[..., None, None]
+    matrix: Array = rotation_dvl_from_body.T @ inverse / (1.0 + np.asarray(scale))[..., None, :]
+    return matrix
+
+
+def correct(velocity_dvl: Array, misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
+    """Corrected body velocity of measured DVL velocities: (..., 3) m/s -> (..., 3) m/s."""
+    return velocity_dvl @ correction_matrix(misalignment, scale, rotation_dvl_from_body).T
+
+
+# [v×] and -diag(v) side by side (3, 6) are linear in v: their elements, row by row, are v @ CORRECTION_JACOBIAN.
+CORRECTION_JACOBIAN: Array = np.concatenate([skew(np.eye(3)), [-np.diag(axis) for axis in np.eye(3)]], axis=2).reshape(
+    3, 18
+)
+
+
+def correction_jacobian(velocity_dvl: Array, rotation_dvl_from_body: Array) -> Array:
+    """d(corrected body velocity)/d(φ, δk) at small errors: (3,) m/s -> (3, 6).
+
+    From the first-order inverse ``v_b = Tᵀ (v - φ×v - δk∘v)``: columns ``Tᵀ[v×]`` and ``-Tᵀ diag(v)``.
+    """
+    return rotation_dvl_from_body.T @ (velocity_dvl @ CORRECTION_JACOBIAN).reshape(3, 6)
+
+
+def corrected_mounting(misalignment: Array, rotation_dvl_from_body: Array) -> Array:
+    """Corrected mounting as ``rotation_body_from_dvl`` (3, 3).
+
+    ``I + [φ×]`` is not a rotation. The nearest one (its polar factor) turns about φ by atan‖φ‖, because in the plane
+    across φ the matrix is ``[[1, -‖φ‖], [‖φ‖, 1]]``, a rotation by that angle times a length.
+    """
+    norm = float(np.linalg.norm(misalignment))
+    if norm == 0.0:
+        return np.array(rotation_dvl_from_body.T)
+    axis = skew(np.asarray(misalignment) / norm)
+    angle = math.atan(norm)
+    rotation = np.eye(3) + math.sin(angle) * axis + (1.0 - math.cos(angle)) * axis @ axis
+    return rotation_dvl_from_body.T @ rotation.T
+
+
 _N = 5  # three angles, two scales
 # Motion ahead moves along an axis of which this share of it is. What is less askew than that is so by rounding.
 ALONG_FROM, _NOT_ASKEW = 0.4, 1e-9
 # d([ψ×] + diag(κ)) / d(ψ, κ): (5, 3, 3)
 _GENERATORS: Array = np.concatenate([skew(np.eye(3)), [np.diag(axis) for axis in np.eye(3)]])[:_N]
-_IDENTITY: Array = np.eye(3)
 _NEWTON_STEPS = 20
 # After a step as small as this what is left is smaller by orders of magnitude, below what anybody reads.
 _LAST_STEP = 1e-10

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..calibration.frames import Array
+from .frames import Array
 
 
 def holm(p_values: Sequence[float]) -> Array:
