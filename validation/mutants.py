@@ -58,7 +58,7 @@ MUTANTS = (
     ),
     Mutant(
         "pairing by stamps",
-        "dvl_calib_ros/calibration/partners.py",
+        "dvl_calib_ros/calibration/streams/pairing.py",
         "earlier + (later - earlier) * fraction[:, None]",
         "earlier + (later - earlier) * (1.0 - fraction[:, None])",
         (UNIT + "calibration/test_alignment.py",),

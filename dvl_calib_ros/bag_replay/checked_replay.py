@@ -19,13 +19,13 @@ import numpy as np
 
 from ..calibration.comparison import Comparison, compare, contradicts
 from ..calibration.comparison_words import between, moved_in_words, scale_changed, suspicious
-from ..calibration.dropouts import DROPOUT_NS
 from ..calibration.extrinsics import Extrinsics
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.error_model import corrected_mounting
 from ..calibration.numerics.frames import whole_degrees
 from ..calibration.results import Result
+from ..calibration.streams.dropouts import DROPOUT_NS
 from ..calibration.verification import shown_misalignment
 from ..errors import InputError
 from ..files.mounting import load_extrinsics

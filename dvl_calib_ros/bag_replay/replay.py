@@ -24,11 +24,11 @@ from ..calibration.extrinsics import Extrinsics, dvl_in_words, extrinsics_of
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.navigation import Navigation, navigation_document, objections
-from ..calibration.new_days import SHORTEST_PAUSE_NS
 from ..calibration.numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.numerics.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.results import Day, Result
-from ..calibration.screening import are_valid_velocities, unit_quaternions
+from ..calibration.streams.screening import are_valid_velocities, unit_quaternions
+from ..calibration.streams.stream_order import SHORTEST_PAUSE_NS
 from ..calibration.verification import verification_document
 from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_document
 from ..calibration.worth import drift_left_open

@@ -16,9 +16,9 @@ from itertools import product as all_of
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .imu_alignment import quaternion_product
 from .numerics.frames import ENU_FROM_NED, Array, product, rotation_from_quaternion, rotation_vector
 from .numerics.samples import Index
+from .streams.imu_frame import quaternion_product
 
 # The attitude is differentiated over so long, s: 0.05° of its noise are then 0.1 °/s. Longer gaps are passed over.
 SPAN_S, LONGEST_S = 0.5, 1.6

@@ -20,7 +20,6 @@ import numpy as np
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
-from .alignment import Aligner
 from .bank import Group, groups_of
 from .delay.hold_out import Terms, ThinnedRecording
 from .delay.workers import Worker
@@ -30,7 +29,6 @@ from .further import FurtherEstimators
 from .headings import EVERY_NS, Headings
 from .history import Counts, Numbers, StateTrace
 from .judging import Judge
-from .message_counts import counted
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
 from .models.base import Observations
 from .models.parameter_spec import ParameterError
@@ -53,11 +51,12 @@ from .numerics.samples import (
     VelocityFrame,
 )
 from .observe import Observer
-from .positions import are_positions, check_model
 from .register.registration import Registration
 from .results import Day, Estimate, Result
 from .selection import Selection
 from .stream_clocks import StreamClocks
+from .streams.aligner import Aligner, counted
+from .streams.position_velocities import are_positions, check_model
 from .verification import Verification
 from .worth import RecentMotion
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..verdict.reasons import Reason
-from .alignment import Aligner
 from .bank import Group, ModelCounts
 from .delay.clocks import Rest
 from .delay.hold_out import Terms, ThinnedRecording
@@ -33,6 +32,7 @@ from .numerics.samples import Index, Stamps
 from .register.registration import Registration
 from .results import Day
 from .selection import NO_EVIDENCE, Evidence
+from .streams.aligner import Aligner
 from .verification import HeldOutError, held_out_error
 
 NEVER = 2**63 - 1

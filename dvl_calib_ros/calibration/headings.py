@@ -18,7 +18,7 @@ from .models.own import UPRIGHT
 from .models.parameters import Parameters
 from .numerics.frames import Array
 from .numerics.samples import Mask, Stamps
-from .streams import LONG_AGO_NS
+from .streams.stream_order import LONG_AGO_NS
 
 # Judged once in so long, by stamps: whoever feeds samples in blocks comes to the same answer.
 EVERY_NS = 10_000_000_000

@@ -15,7 +15,7 @@ from scipy.interpolate import make_interp_spline
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import robust_std
-from ..calibration.spikes import beside, off_neighbours, without_spikes
+from ..calibration.streams.outliers import beside, off_neighbours, without_spikes
 from .claims import loudness
 from .settings import SETTINGS
 

@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.clocks import Clocks
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
 from ..calibration.numerics.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
-from ..calibration.positions import NOISY_MPS
 from ..calibration.register.fine import white_noise
 from ..calibration.register.registration import Registration
-from ..calibration.screening import SMALLEST_VARIANCE
+from ..calibration.streams.clock_correction import Clocks
+from ..calibration.streams.position_velocities import NOISY_MPS
+from ..calibration.streams.screening import SMALLEST_VARIANCE
 from ..effects.base import EffectNeeds
 from ..errors import InputError
 from ..messages.decode import MessageDecoder

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..calibration.delay.rows import ImuColumns
 from ..calibration.numerics.frames import Array, turn_between
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.register.far import far_clocks
 from ..calibration.register.motion import MotionStreams, make_motion
 from ..calibration.register.registration import Registration, register
+from ..calibration.streams.interpolation import ImuColumns
 from ..effects.base import ActsOn, EffectNeeds
 from ..effects.composition import Injection, late
 from ..errors import InputError

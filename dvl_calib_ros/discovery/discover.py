@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.delay.rows import ImuColumns
 from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
@@ -32,7 +31,8 @@ from ..calibration.register.readings import (
     nominal_rpy,
     turns_right,
 )
-from ..calibration.screening import unit_quaternions
+from ..calibration.streams.interpolation import ImuColumns
+from ..calibration.streams.screening import unit_quaternions
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..calibration.numerics.frames import Array, rotation_from_quaternion
-from ..calibration.screening import unit_quaternions
+from ..calibration.streams.screening import unit_quaternions
 from ..verdict.reasons import Reason, finding
 
 # Fewer samples, and an acceleration below this (m/s²), tell nothing.

@@ -15,7 +15,6 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.alignment import align
 from ..calibration.assembly import Assembler
 from ..calibration.heave import HeaveRows, HeaveSums, with_heave
 from ..calibration.height import HeightOfLate
@@ -27,6 +26,7 @@ from ..calibration.numerics.frames import Array
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import AlignedBlock, Mask, Stamps, Stream, Streams, no_samples, sample_block
 from ..calibration.observe import Observer
+from ..calibration.streams.aligner import align
 from .results import Failure
 from .trajectories import Trajectory
 

@@ -13,8 +13,8 @@ import numpy as np
 from ..calibration.models.parameters import FRD, FROM_MESSAGE, Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.positions import NOISY_MPS
 from ..calibration.register.readings import FITS
+from ..calibration.streams.position_velocities import NOISY_MPS
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S

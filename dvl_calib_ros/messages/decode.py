@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.imu_alignment import ImuAlignment
 from ..calibration.models.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
 from ..calibration.numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, Vector
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
+from ..calibration.streams.imu_frame import ImuAlignment
 from ..verdict.reasons import Reason, finding
 from .drivers import NOT_MEASURED, VelocityType, velocity_type
 from .positions import FixDifference, Place, PositionType, matrix_of

@@ -35,7 +35,7 @@ from ..calibration.mounting_pose import mounting_pose
 from ..calibration.numerics import kalman
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import DvlSample, VelocityFrame
-from ..calibration.positions import check_model
+from ..calibration.streams.position_velocities import check_model
 from ..calibration.water import Water
 from ..discovery.gravity import believed_heading
 from ..discovery.transforms import Frames, not_default, placement

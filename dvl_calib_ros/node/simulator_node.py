@@ -24,7 +24,7 @@ from sensor_msgs.msg import Imu
 
 from ..calibration.numerics.frames import rotation_from_quaternion
 from ..calibration.numerics.samples import DvlSample, ReferenceSample
-from ..calibration.screening import unit_quaternion
+from ..calibration.streams.screening import unit_quaternion
 from ..errors import InputError
 from ..messages.decode import stamp_ns
 from ..messages.drivers import TWIST_TYPE, TYPES_OF, VELOCITY_TYPES

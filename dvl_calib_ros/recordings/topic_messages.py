@@ -12,7 +12,7 @@ import numpy as np
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import Codes, Stamps
-from ..calibration.screening import NOT_MEASURED_VARIANCE, screen_columns
+from ..calibration.streams.screening import NOT_MEASURED_VARIANCE, screen_columns
 from ..messages.decode import NO_DATA, UNREADABLE, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.positions import SELDOM_S, FixDifference, PositionType

@@ -24,7 +24,7 @@ from ..calibration.numerics.samples import (
     VelocityFrame,
     no_samples,
 )
-from ..calibration.screening import are_valid_velocities, unit_quaternions
+from ..calibration.streams.screening import are_valid_velocities, unit_quaternions
 from ..errors import InputError
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, REFERENCE_TYPES

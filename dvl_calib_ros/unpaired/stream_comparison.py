@@ -8,7 +8,7 @@ import numpy as np
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import robust_std
-from ..calibration.spikes import beside, off_neighbours
+from ..calibration.streams.outliers import beside, off_neighbours
 from ..diagnosis.curve import FAST_ENOUGH_S
 from .both_sides import DITHER_MPS, Log
 from .results import Triple

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from ..numerics.frames import Array
 from ..numerics.samples import Codes, Index, Stamps
-from .rows import MARGIN_S
+from ..streams.interpolation import MARGIN_S
 
 MARGIN_NS = round(MARGIN_S * 1e9)
 

@@ -21,6 +21,7 @@ from ..numerics.tables import RowTable
 from ..register.configuration import fitting_configuration
 from ..register.motion import MotionStreams, make_motion
 from ..register.registration import Registration, register
+from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 from ..verification import HeldOutError
 from .bank import DelayBank
 from .hold_out import (
@@ -33,7 +34,6 @@ from .hold_out import (
     typical_error,
 )
 from .known import Posterior
-from .rows import DvlColumns, ImuColumns, ReferenceColumns
 
 # Live, what was found stands until so much more is there.
 AGAIN_FROM = 1.5

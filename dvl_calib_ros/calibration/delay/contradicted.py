@@ -14,8 +14,9 @@ import numpy as np
 from ..numerics.frames import Array
 from ..numerics.robust import robust_std
 from ..numerics.samples import Index, Mask
-from ..spikes import beside, off_neighbours
-from .rows import DelayedRows, DvlColumns
+from ..streams.interpolation import DvlColumns
+from ..streams.outliers import beside, off_neighbours
+from .rows import DelayedRows
 
 # Scatter about what neighbours tell, from which on a sample is suspicious; less than so much is noise, m/s.
 SUSPICIOUS, LEAST_SCATTER_MPS = 6.0, 0.03

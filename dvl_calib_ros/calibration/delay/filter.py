@@ -32,13 +32,13 @@ from ..numerics.tables import RowTable
 from ..register.registration import Registration
 from ..results import Day
 from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
-from ..streams import LONG_AGO_NS, LONGEST_NS
+from ..streams.interpolation import LONGEST_DELAY_S
+from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
 from ..verification import HeldOutError
 from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .clocks import Rest
 from .hold_out import Terms, ThinnedBlock, ThinnedRecording, held_out_error
 from .known import DayState, Posterior
-from .rows import LONGEST_DELAY_S
 from .solver import BlockSolver, Outcome
 from .workers import AtOnce, Solved
 

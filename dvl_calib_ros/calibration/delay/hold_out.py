@@ -16,8 +16,8 @@ from ..numerics.frames import Array, cross, skew
 from ..numerics.kalman import GaussianState
 from ..numerics.robust import median, steps
 from ..numerics.samples import Index, Mask, Stamps
+from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns, attitude_at
 from ..verification import HeldOutError, held_out_from_sums
-from .rows import DvlColumns, ImuColumns, ReferenceColumns, attitude_at
 
 # What is kept comes no faster than this, s: a velocity error is judged as well by five a second.
 KEPT_EVERY_S = 0.19

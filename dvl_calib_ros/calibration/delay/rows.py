@@ -8,109 +8,42 @@ at s + τ, where it is 20 times less noisy than GNSS. So hypotheses of τ are to
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from ..models.own import DELAY, G2, LEVER_ARM, N_STATE, g1_errors, g1_heave_errors
-from ..numerics.frames import Array, Vector, cross, rotation_from_quaternion, skew, slerps, squared
+from ..numerics.frames import Array, Vector, cross, skew, squared
 from ..numerics.kalman import whitening
-from ..numerics.robust import median, steps
 from ..numerics.samples import Index, Mask
-from .local_motion import local_fit, reach_at, spacing_at
-from .parts import Near, Parts, places
+from ..streams.interpolation import (
+    LEAST_REACH_S,
+    LEAST_SLOPE_REACH_S,
+    MOST_REACH_S,
+    DvlColumns,
+    InBody,
+    Parts,
+    ReferenceColumns,
+    TurnRates,
+    angular_velocity_at,
+    local_fit,
+    places,
+    reach_at,
+    spacing_at,
+)
 
 # Delays are tried this far apart: a vehicle's velocity is straight enough over half of it for the rest to be a state
 # (0.1 m/s² changing by 0.3 m/s³ bends by 1.5 mm/s).
 STEP_S = 0.2
 STEPS: Index = np.arange(-16, 17)
 DELAYS_S: Array = STEPS * STEP_S
-LONGEST_DELAY_S = 3.2
-# Samples at least as dense as this tell their noise apart from the vehicle's motion, s.
-NOISE_FROM_S = 0.15
-# Samples faster than this are averaged over bins of so long: none the worse for it, and the work stays the same.
-BIN_S = 0.1
-FASTER_THAN_S = 0.07
-# A quadratic that averages the DVL's noise reaches at least so far; the slope further, for its noise pulls the delay
-# that it shows: 0.01 m/s at 5 Hz is 0.006 m/s² over 1 s, an eighth of what a turning vehicle has.
-LEAST_REACH_S, LEAST_SLOPE_REACH_S = 0.6, 1.0
-# ... and at most: DVL samples more than 1.3 s apart do not tell a turning vehicle's velocity between them.
-MOST_REACH_S = 3.4
-# How far beyond a block of references the other streams have to be known.
-MARGIN_S = 7.0
 # What rows say of the DVL's errors and of the delay is another thing for every delay; of the reference's constant error
 # and of the lever arm it is the same; of a constant heave they say nothing.
 OF_DELAY: Index = np.array([0, 1, 2, 3, 4, DELAY])
 OF_NONE: Index = np.array([6, 7, 8, 9, 10])
 # What belongs to the day, not to the vehicle: the constant error of the reference, and the delay.
 OF_DAY: Index = G2.of_day
-
-
-class DvlColumns(NamedTuple):
-    """times (N,) s, velocity (N, 3) m/s in the DVL's frame."""
-
-    times: Array
-    velocity: Array
-
-
-class ReferenceColumns(NamedTuple):
-    """times (J,) s, velocity (J, 3) m/s and noise (J, 3, 3) (m/s)²; ENU, or body where in_body (J,).
-
-    claimed: (J,) where the noise is the message's, to which the DVL's is added; else it is that of both.
-    """
-
-    times: Array
-    velocity: Array
-    noise: Array
-    in_body: Mask
-    claimed: Mask
-
-    def part(self, at: Index) -> ReferenceColumns:
-        """Some of them."""
-        return ReferenceColumns(self.times[at], self.velocity[at], self.noise[at], self.in_body[at], self.claimed[at])
-
-
-class ImuColumns(NamedTuple):
-    """times (M,) s, orientation (M, 4) quaternion (x, y, z, w) enu from body, angular_velocity (M, 3) rad/s, body."""
-
-    times: Array
-    orientation: Array
-    angular_velocity: Array
-
-
-C = TypeVar("C", DvlColumns, ImuColumns, ReferenceColumns)
-
-
-def joined(columns: Sequence[C]) -> C:
-    """Columns of several blocks, one after the other."""
-    return columns[0] if len(columns) == 1 else type(columns[0])(*map(np.concatenate, zip(*columns, strict=True)))
-
-
-class TurnRates(NamedTuple):
-    """Angular velocity where it is known, averaged over bins: times (M,) s, rates (M, 3) rad/s, body; variance (B, 3)
-    of its noise in each of the parts that they are of."""
-
-    times: Array
-    rates: Array
-    variance: Array
-    parts: Parts
-
-    @staticmethod
-    def of(imu: ImuColumns) -> TurnRates:
-        """Those of an IMU, all of one part."""
-        known = ~np.isnan(imu.angular_velocity).any(axis=1)
-        times, rates = binned(imu.times[known], imu.angular_velocity[known])
-        return TurnRates(times, rates, _noise_of(times, rates)[None], Parts.of([times]))
-
-    @staticmethod
-    def joined(each: Sequence[TurnRates]) -> TurnRates:
-        """Of several blocks."""
-        if len(each) == 1:
-            return each[0]
-        times, rates, variance, _ = zip(*each, strict=True)
-        return TurnRates(np.concatenate(times), np.concatenate(rates), np.concatenate(variance), Parts.of(times))
 
 
 @dataclass(frozen=True)
@@ -361,115 +294,3 @@ def _moving(motion: MotionAtReferences, white: Array, body_from_dvl: Array) -> A
             row += np.multiply(white[:, i, j], plain[j], out=part)
         moving[:, :, i] = row.swapaxes(0, 1)
     return moving
-
-
-def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
-    """Means of times (N,) s and columns (N, ...) over bins of BIN_S, of those bins that hold any;
-    as they are if they come no faster than FASTER_THAN_S."""
-    if len(times) < 2 or median(steps(times)) >= FASTER_THAN_S:
-        return times, *columns
-    bins = np.floor(times / BIN_S)
-    starts = np.append(0, np.flatnonzero(steps(bins)) + 1)
-    count = steps(np.append(starts, len(times)))
-    return tuple(
-        np.add.reduceat(column, starts, axis=0) / count.reshape(-1, *[1] * (column.ndim - 1))
-        for column in (times, *columns)
-    )
-
-
-def angular_velocity_at(
-    turns: TurnRates, times: Array, gap_s: float, parts: Parts | None = None
-) -> tuple[Array, Array]:
-    """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known. And its variance (B, 3).
-
-    parts: by which block's rates each is to be known; None where all are of one.
-    """
-    stamps, rates, variance, turn_parts = turns
-    if len(stamps) < 2:
-        return np.full((len(times), 3), np.nan), np.zeros_like(variance)
-    parts = Parts.of([times]) if parts is None else parts
-    place = places(stamps, times, turn_parts, parts)
-    reach = reach_at(spacing_at(stamps, times, place), LEAST_REACH_S, MOST_REACH_S)
-    smooth = local_fit(stamps, rates, times, reach, place)
-    after, before, outside = _beside(stamps, times, place)
-    outside |= stamps[after] - stamps[before] > gap_s
-    value = smooth.value
-    if not smooth.found.all():
-        gap = np.maximum(stamps[after] - stamps[before], 1e-12)
-        share = np.clip((times - stamps[before]) / gap, 0.0, 1.0)[:, None]
-        value = np.where(smooth.found[:, None], value, rates[before] + (rates[after] - rates[before]) * share)
-    value[outside] = np.nan
-    noise = [
-        own * gain[found].mean() if found.any() else np.zeros(3)
-        for own, gain, found in (
-            (own, smooth.value_gain[at], smooth.found[at]) for own, at in zip(variance, parts, strict=True)
-        )
-    ]
-    return value, np.array(noise)
-
-
-def _beside(stamps: Array, times: Array, place: Near) -> tuple[Index, Index, Mask]:
-    """Places of the samples after and before each of J times, and where there are none (J,). stamps: (N > 1,) s."""
-    after, first, end = place
-    after = np.minimum(np.maximum(np.minimum(np.maximum(after, first + 1), end - 1), 1), len(stamps) - 1)
-    last = np.maximum(end - 1, 0)
-    outside = (end - first < 2) | (times < stamps[np.minimum(first, len(stamps) - 1)]) | (times > stamps[last])
-    return after, after - 1, outside
-
-
-def _noise_of(times: Array, values: Array) -> Array:
-    """Variance (c,) of white noise on samples at times (N,) s, by their second differences; zero for slow ones.
-
-    A vehicle that rolls in waves has second differences of its own if it is looked at once a second.
-    """
-    if len(times) < 8 or median(steps(times)) > NOISE_FROM_S:
-        return np.zeros(values.shape[1])
-    bent = values[2:] - 2.0 * values[1:-1] + values[:-2]
-    return median(bent**2) / (6.0 * 0.455)  # 0.455: median of chi-square
-
-
-class InBody(NamedTuple):
-    """Velocity (J, 3), noise (J, 3, 3) in the body frame, where that is known (J,), `Observations.earth_in_body`."""
-
-    velocity: Array
-    noise: Array
-    known: Mask
-    earth_in_body: Array
-
-    def part(self, at: Index | slice) -> InBody:
-        """Some of them."""
-        return InBody(self.velocity[at], self.noise[at], self.known[at], self.earth_in_body[at])
-
-
-def in_body(reference: ReferenceColumns, rotation: Array, known: Mask) -> InBody:
-    """References as in the body, by attitudes ``rotation_enu_from_body`` (J, 3, 3) where they are known (J,)."""
-    in_body = reference.in_body
-    if in_body.all():
-        n = len(in_body)
-        return InBody(reference.velocity, reference.noise, np.ones(n, dtype=bool), np.zeros((n, 3, 2)))
-    body_from_enu = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
-    velocity = np.matmul(body_from_enu, reference.velocity[..., None])[..., 0]
-    noise = body_from_enu @ reference.noise @ body_from_enu.swapaxes(1, 2)
-    earth = body_from_enu[:, :, :2] * ~in_body[:, None, None]
-    return InBody(velocity, noise, known | in_body, earth)
-
-
-def attitude_at(
-    imu: ImuColumns, times: Array, gap_s: float, imu_parts: Parts | None = None, parts: Parts | None = None
-) -> tuple[Array, Mask]:
-    """``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and where that is possible (J,).
-
-    gap_s: longest gap that is interpolated across. imu_parts, parts: of which block samples and times are.
-    """
-    given = ~np.isnan(imu.orientation[:, 0])
-    stamps, quaternions = imu.times, imu.orientation
-    if not given.all():
-        stamps, quaternions = stamps[given], quaternions[given]
-        imu_parts = None if imu_parts is None else imu_parts.where(given)
-    if len(stamps) < 2:
-        return np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros(len(times), dtype=bool)
-    after, before, outside = _beside(stamps, times, places(stamps, times, imu_parts, parts))
-    gap = np.maximum(stamps[after] - stamps[before], 1e-12)
-    fraction = np.minimum(np.maximum((times - stamps[before]) / gap, 0.0), 1.0)
-    between = slerps(quaternions.take(before, axis=0), quaternions.take(after, axis=0), fraction)
-    return rotation_from_quaternion(between), ~outside & (gap <= gap_s)

@@ -24,6 +24,7 @@ from ..numerics.kalman import GaussianState
 from ..numerics.samples import Stamps
 from ..register.registration import Registration
 from ..shared_noise import SharedNoise
+from ..streams.interpolation import DvlColumns, ImuColumns, InBody, Parts, TurnRates, attitude_at, in_body, joined
 from .bank import DelayBank
 from .blocks import MARGIN_NS, Block
 from .cleaned import Cleaned, cleaned, is_slow, seconds
@@ -31,19 +32,7 @@ from .clocks import KeptClocks, Looked, Rest, ToldSoFar
 from .contradicted import without_contradicted
 from .hold_out import MEASURED_BELOW, ThinnedBlock
 from .known import After, BlockRows, Known, Likely, Posterior
-from .parts import Parts
-from .rows import (
-    DelayedRows,
-    DvlColumns,
-    ImuColumns,
-    InBody,
-    Matched,
-    TurnRates,
-    attitude_at,
-    in_body,
-    joined,
-    matched,
-)
+from .rows import DelayedRows, Matched, matched
 
 # After every so many blocks of a day, hypotheses of the delay that have lost are left out.
 NARROWED = 16

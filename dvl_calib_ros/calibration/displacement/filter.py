@@ -25,8 +25,8 @@ from ..navigation import Navigation
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
-from ..positions import NOISY_MPS, are_positions
 from ..selection import NO_EVIDENCE, Evidence
+from ..streams.position_velocities import NOISY_MPS, are_positions
 from ..verification import HeldOutError
 from .judge import held_out, leg_length_s
 from .legs import DeadReckoning, Fixes, Legs

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from ..delay.rows import LONGEST_DELAY_S
 from ..models.parameters import Parameters
 from ..numerics.samples import Stream
+from ..streams.interpolation import LONGEST_DELAY_S
 
 
 class Apart(NamedTuple):

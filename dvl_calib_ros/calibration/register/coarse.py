@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..delay.rows import attitude_at
 from ..numerics.frames import Array
 from ..numerics.robust import median
+from ..streams.interpolation import attitude_at
 from .motion import MotionStreams
 
 # Clocks further apart than this are looked for nowhere, s.

@@ -14,10 +14,10 @@ from dataclasses import replace
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..delay.rows import attitude_at
 from ..directions import Directions
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
+from ..streams.interpolation import attitude_at
 from .curves import GAP_S, MIRRORED, Curves
 from .fine import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion import MotionStreams

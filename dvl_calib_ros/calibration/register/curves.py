@@ -6,11 +6,18 @@ from copy import copy
 
 import numpy as np
 
-from ..delay.local_motion import REACH_INTERVALS, local_fit, reach_at, spacing_at
-from ..delay.rows import LEAST_SLOPE_REACH_S, MOST_REACH_S, angular_velocity_at
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..numerics.samples import Index, Mask
+from ..streams.interpolation import (
+    LEAST_SLOPE_REACH_S,
+    MOST_REACH_S,
+    REACH_INTERVALS,
+    angular_velocity_at,
+    local_fit,
+    reach_at,
+    spacing_at,
+)
 from .motion import MotionStreams
 
 # Curves are smoothed on a grid of this step, s, and of a long recording of so many times; of so many at once.

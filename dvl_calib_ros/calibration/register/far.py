@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...verdict.reasons import Reason, finding
-from ..delay.rows import attitude_at
 from ..numerics.frames import Array
 from ..numerics.robust import median
+from ..streams.interpolation import attitude_at
 from .coarse import HOLE_S, LONGEST_S
 from .motion import MotionStreams
 

@@ -17,11 +17,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..delay.rows import attitude_at
 from ..numerics.block_covariance import TimeBlocks
 from ..numerics.frames import Array, cross, nearest_rotation, rotation_of, skew, squared, turn_between
 from ..numerics.robust import median
 from ..numerics.samples import Index, Mask
+from ..streams.interpolation import attitude_at
 from .curves import GAP_S, Curves
 from .motion import MotionStreams
 

@@ -7,15 +7,15 @@ from functools import cached_property
 
 import numpy as np
 
-from ..clocks import Clocks
-from ..delay.rows import DvlColumns, ImuColumns, TurnRates, binned
-from ..imu_alignment import ImuAlignment
 from ..models.parameters import Parameters
 from ..numerics.frames import ENU_FROM_NED, Array
 from ..numerics.samples import FRAME_CODES, Index, SampleBlock, Streams, VelocityFrame
-from ..positions import are_positions, of_moments
-from ..screening import measured_axes, screen_columns, unit_quaternions
-from ..spikes import without_spikes
+from ..streams.clock_correction import Clocks
+from ..streams.imu_frame import ImuAlignment
+from ..streams.interpolation import DvlColumns, ImuColumns, TurnRates, binned
+from ..streams.outliers import without_spikes
+from ..streams.position_velocities import are_positions, of_moments
+from ..streams.screening import measured_axes, screen_columns, unit_quaternions
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..delay.rows import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..directions import Directions
-from ..imu_alignment import quaternion_product
 from ..numerics.frames import (
     ENU_FROM_NED,
     FLU_FROM_FRD,
@@ -30,6 +28,8 @@ from ..numerics.frames import (
     whole_degrees,
 )
 from ..numerics.samples import VelocityFrame
+from ..streams.imu_frame import quaternion_product
+from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from .configuration import DRAWN, angle_between, misfit, nearest
 from .curves import GAP_S, Curves
 from .far import covered, velocity_at

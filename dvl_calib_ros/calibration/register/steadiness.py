@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..delay.rows import DvlColumns, ImuColumns, TurnRates
 from ..numerics.frames import Array
 from ..numerics.samples import Index, Mask
+from ..streams.interpolation import DvlColumns, ImuColumns, TurnRates
 from .fine import APART, ARM, LATE, Fitted, MotionFit, N
 from .motion import MotionStreams
 

@@ -11,13 +11,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import few
+from dvl_calib_ros.calibration.streams.stream_order.interpolation import local_fit, reach_at, spacing_at
 from runs import START_NS, calibrate, feed, feed_columns, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.correction import lever_arm
 from dvl_calib_ros.calibration.delay import contradicted
 from dvl_calib_ros.calibration.delay import solver as delay_solver
-from dvl_calib_ros.calibration.delay.local_motion import local_fit, reach_at, spacing_at
 from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.own import BEYOND

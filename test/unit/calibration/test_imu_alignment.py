@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.streams.stream_order.imu_frame import ImuAlignment
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.imu_alignment import ImuAlignment
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import (
     ENU_FROM_NED,

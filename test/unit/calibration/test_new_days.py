@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.streams.stream_order.stream_order import NewDays
 from runs import START_NS, calibrate, feed_columns, shifted
 from test_delay import LEVER_ARM, NOISE, PHI, late
 
@@ -13,7 +14,6 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.rows import OF_DAY
 from dvl_calib_ros.calibration.folds import with_states_of
 from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
-from dvl_calib_ros.calibration.new_days import NewDays
 from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample

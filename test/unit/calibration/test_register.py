@@ -8,8 +8,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.streams.stream_order.interpolation import ImuColumns, attitude_at
 
-from dvl_calib_ros.calibration.delay.rows import ImuColumns, attitude_at
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame

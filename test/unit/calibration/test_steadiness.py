@@ -6,9 +6,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.streams.stream_order.interpolation import ImuColumns
 from test_register import ARM, run
 
-from dvl_calib_ros.calibration.delay.rows import ImuColumns
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.register.fine import Claimed, Fitted
 from dvl_calib_ros.calibration.register.motion import make_motion

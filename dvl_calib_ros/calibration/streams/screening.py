@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .numerics.frames import Array, Quaternion, Vector
-from .numerics.samples import Codes, Covariances, Mask
+from ..numerics.frames import Array, Quaternion, Vector
+from ..numerics.samples import Codes, Covariances, Mask
 
 # A variance below (1 µm/s)² is no claim that a velocity sensor can make; it is taken as not given, like zero.
 SMALLEST_VARIANCE = 1e-12

@@ -7,8 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from .models.parameters import Parameters
-from .numerics.samples import Stamps
+from ..models.parameters import Parameters
+from ..numerics.samples import Stamps
 
 SECOND_NS = 1_000_000_000
 # A clock is wrong by up to `dvl_clock_drift` over as long as a run may last, for which pairing has to wait and remember

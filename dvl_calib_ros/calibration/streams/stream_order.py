@@ -3,18 +3,25 @@
 Nothing here looks at a clock, nor at the order in which *different* topics arrive, as long as one topic does not lag
 another by more than a bounded time in stamps. So a live run and a replay of its recording decide alike. What stands
 here twice, for one sample and for columns of them, is the same rule (test_alignment.py).
+
+Where a new day begins: what belongs to the day (`Nuisance.of_the_day`, the delay of the DVL) is then found anew.
+
+Clocks are set, and an inertial navigation aligned, between one dive and the next. Live, a pause says so; of recordings
+that are replayed together it is known.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
+from collections.abc import Sequence
 from enum import Enum
 from typing import ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
-from .numerics.frames import Array
-from .numerics.samples import Codes, Index, Mask, Stamps
-from .numerics.tables import RowTable
+from ..numerics.frames import Array
+from ..numerics.samples import Codes, Index, Mask, Stamps
+from ..numerics.tables import RowTable
 
 # Earlier than any stamp, and so far from the ends of 64 bits that a timeout can be added.
 LONG_AGO_NS = -(2**62)
@@ -282,3 +289,27 @@ class Track(RowTable):
         fraction = np.where(exact, 1.0, (stamps_ns - (after_ns - gap_ns)) / gap_ns)
         after = at + self.begin
         return Brackets(np.where(near, after - 1, -1), after, fraction, found)
+
+
+# What follows sooner is another part of the same recording. Longer than a block of G2's samples and the longest delay,
+# so that none holds those of two days.
+SHORTEST_PAUSE_NS = 15_000_000_000
+
+
+class NewDays:
+    """Says of a DVL sample whether it is the first of a day, by stamps alone."""
+
+    def __init__(self, pause_ns: int, recordings_ns: Sequence[int] = ()) -> None:
+        """pause_ns: of the DVL, after which it is another day. recordings_ns: stamps between one recording and the next
+        of those that are taken together, each of a day of its own."""
+        self._pause_ns = pause_ns
+        self._recordings_ns = sorted(recordings_ns)
+
+    def begins(self, stamp_ns: int, interval_ns: int) -> bool:
+        """Whether a day begins with this stamp, which came so long after the one before."""
+        if interval_ns <= SHORTEST_PAUSE_NS:
+            return False
+        if interval_ns > self._pause_ns:
+            return True
+        before = bisect_right(self._recordings_ns, stamp_ns - interval_ns)
+        return bisect_right(self._recordings_ns, stamp_ns) > before

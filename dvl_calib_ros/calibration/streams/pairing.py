@@ -2,6 +2,10 @@
 
 By columns only: live, of the one or two rows that a message decides. Who calls says how many rows are decided, in
 order, and how far each track had come by then.
+
+The table that an alignment makes.
+
+Which DVL samples in order are used: not too slow, not frozen, not in too sharp a turn. And the prior's window.
 """
 
 from __future__ import annotations
@@ -9,16 +13,17 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import fields
+from typing import ClassVar
 
 import numpy as np
 
-from .gates import Gates, PriorWindow
-from .models import Needs
-from .models.parameters import Parameters
-from .numerics.frames import slerps
-from .numerics.samples import FRAME_CODES, Mask, Pairing, SampleUse, Stamps, VelocityFrame
-from .rows import Rows
-from .streams import LONG_AGO_NS, Track
+from ..models import Needs
+from ..models.parameters import Parameters
+from ..numerics.frames import Array, Vector, slerps
+from ..numerics.samples import FRAME_CODES, AlignedBlock, Codes, Mask, Pairing, SampleUse, Stamps, VelocityFrame
+from ..numerics.tables import RowTable
+from .stream_order import LONG_AGO_NS, Track
 
 BODY = FRAME_CODES[VelocityFrame.BODY]
 
@@ -149,3 +154,139 @@ class Partners:
         add_count(tally, "unpaired", n - paired)
         add_count(tally, "without_attitude", int(np.count_nonzero(pairing == Pairing.WITHOUT_ATTITUDE)))
         self.given[Needs.REFERENCE] += int(np.count_nonzero(is_paired & (rows.verdict[at] == SampleUse.USED)))
+
+
+class Rows(RowTable):
+    """The columns of `AlignedBlock` as they come to be known."""
+
+    LAYOUT: ClassVar = {
+        "stamps_ns": (np.int64, ()),
+        "row": (np.int64, ()),
+        "velocity_dvl": (np.float64, (3,)),
+        "covariance": (np.float64, (3, 3)),
+        "interval_ns": (np.int64, ()),
+        "verdict": (np.uint8, ()),
+        "prior_known": (np.bool_, ()),
+        "attitude": (np.float64, (7,)),
+        "pairing": (np.uint8, ()),
+        "reference": (np.float64, (12,)),
+        "frames": (np.uint8, ()),
+        "unmeasured": (np.uint8, ()),
+        "weight": (np.float64, ()),
+        "late": (np.bool_, ()),
+    }
+    stamps_ns: Stamps
+    row: Stamps
+    velocity_dvl: Array
+    covariance: Array
+    interval_ns: Stamps
+    verdict: Codes
+    prior_known: Mask
+    attitude: Array
+    pairing: Codes
+    reference: Array
+    frames: Codes
+    unmeasured: Codes
+    weight: Array
+    late: Mask
+
+    def await_partners(self, at: int | slice) -> None:
+        """Fill in what is not known yet."""
+        self.verdict[at] = SampleUse.AWAITING
+        self.prior_known[at] = False
+        self.attitude[at] = math.nan
+        self.pairing[at] = Pairing.AWAITING
+        self.reference[at] = math.nan
+        self.frames[at] = self.unmeasured[at] = 0
+        self.weight[at] = 1.0
+
+    def block(self, first: int, end: int) -> AlignedBlock:
+        """The rows with these numbers, as long as nothing is added."""
+        at = slice(first - self.base, end - self.base)
+        return AlignedBlock(*[getattr(self, name)[at] for name in _COLUMNS])
+
+
+_COLUMNS = [each.name for each in fields(AlignedBlock)]
+
+
+class Gates:
+    """Judges the samples of a DVL, in order. repeated: how many had exactly the velocity of the one before."""
+
+    def __init__(self) -> None:
+        self.repeated = 0
+        self._velocity_before: Vector | None = None
+        self._repeats = 0
+
+    def judge(self, velocity: Array, angular_velocity: Array, p: Parameters) -> Codes:
+        """Verdicts (N,). velocity: (N, 3) m/s. angular_velocity: (N, 3) rad/s, nan where not known."""
+        verdict = np.zeros(len(velocity), dtype=np.uint8)
+        slow = _squared(velocity) < p.min_speed * p.min_speed
+        if slow.any():
+            verdict[slow] = SampleUse.SLOW
+            moving = np.flatnonzero(~slow)
+            verdict[moving[self._frozen(velocity[moving], p)]] = SampleUse.FROZEN
+        else:
+            verdict[self._frozen(velocity, p)] = SampleUse.FROZEN
+        if p.max_turn_rate > 0.0:
+            square = _squared(angular_velocity)
+            open_ = verdict == SampleUse.USED
+            verdict[open_ & np.isnan(square)] = SampleUse.NO_TURN_RATE
+            verdict[open_ & (square > p.max_turn_rate * p.max_turn_rate)] = SampleUse.TURNING
+        return verdict
+
+    def _frozen(self, velocity: Array, p: Parameters) -> Mask:
+        """(N,) of samples that are not slow: which repeat themselves too often."""
+        n = len(velocity)
+        if not n:
+            return np.zeros(0, dtype=bool)
+        same = np.empty(n, dtype=bool)
+        same[0] = self._velocity_before is not None and tuple(velocity[0].tolist()) == self._velocity_before
+        if n > 1:
+            same[1:] = (velocity[1:] == velocity[:-1]).all(axis=1)
+        if not same.any():  # as nearly always
+            x, y, z = velocity[-1].tolist()
+            self._velocity_before, self._repeats = (x, y, z), 0
+            return same
+        at = np.arange(n)
+        other = np.maximum.accumulate(np.where(same, -1, at))  # the last one that was not the same; -1: before these
+        repeats = np.where(other < 0, self._repeats + at + 1, at - other)
+        self.repeated += int(np.count_nonzero(same))
+        x, y, z = velocity[-1].tolist()
+        self._velocity_before, self._repeats = (x, y, z), int(repeats[-1])
+        return (repeats > p.max_repeats) if p.max_repeats > 0 else np.zeros(n, dtype=bool)
+
+
+def _squared(vectors: Array) -> Array:
+    x, y, z = vectors.T
+    square: Array = x * x + y * y + z * z
+    return square
+
+
+class PriorWindow:
+    """Prior sway and heave (m/s, body frame) of the models that need them."""
+
+    def __init__(self, parameters: Parameters, given: tuple[float, float] | None) -> None:
+        self._rotation_body_from_dvl = parameters.rotation_dvl_from_body.T
+        self._window_ns = round(parameters.prior_window * 1e9)
+        self._start_ns: int | None = None
+        self._sum = np.zeros(2)
+        self._count = 0
+        self.sway_heave: Array = np.array(parameters.prior_sway_heave if given is None else given)
+        self._collecting = parameters.prior_source == "initial_window"
+
+    def known_at(self, stamps_ns: Stamps, velocity_dvl: Array) -> Mask:
+        """Whether the prior is known at usable samples (N,), in order; until then, take them into the mean."""
+        known = np.ones(len(stamps_ns), dtype=bool)
+        if not self._collecting or not len(stamps_ns):
+            return known
+        if self._start_ns is None:
+            self._start_ns = int(stamps_ns[0])
+        known = stamps_ns - self._start_ns >= self._window_ns
+        first = int(np.argmax(known)) if known.any() else len(known)
+        for velocity in velocity_dvl[:first]:
+            self._sum += (self._rotation_body_from_dvl @ velocity)[1:]
+        self._count += first
+        if first < len(known):
+            self._collecting = False
+            self.sway_heave = self._sum / self._count
+        return known

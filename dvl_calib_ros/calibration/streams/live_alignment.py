@@ -2,6 +2,8 @@
 
 Live, and where a clock leaps, whether a message is valid and in order is asked of one by itself; what is done when a
 clock leaps is here. (Long, because that is one thing.)
+
+The recent past of the reference: its velocities less a constant error, and which axes it does not measure.
 """
 
 from __future__ import annotations
@@ -13,17 +15,26 @@ from typing import Any
 
 import numpy as np
 
-from .clocks import SECOND_NS, Clocks
+from ..models.parameters import XY, XYZ, Parameters
+from ..numerics.frames import Array, Vector
+from ..numerics.samples import (
+    FRAME_CODES,
+    FRAMES,
+    Codes,
+    DvlSample,
+    ImuSample,
+    Index,
+    Mask,
+    ReferenceSample,
+    Stamps,
+    Stream,
+    VelocityFrame,
+)
+from .clock_correction import SECOND_NS, Clocks
 from .dropouts import DROPOUT_NS, Dropouts
-from .models.parameters import Parameters
-from .new_days import SHORTEST_PAUSE_NS, NewDays
-from .numerics.frames import Array, Vector
-from .numerics.samples import FRAME_CODES, DvlSample, ImuSample, Index, Mask, ReferenceSample, Stamps, Stream
-from .partners import Partners, add_count
-from .reference_track import ReferenceTrack
-from .rows import Rows
-from .screening import ALL_AXES, CovarianceScreen, is_valid_rate, is_valid_velocity, unit_quaternion
-from .streams import LONG_AGO_NS, Order, Sequencer, Track
+from .pairing import Partners, Rows, add_count
+from .screening import ALL_AXES, VERTICAL, CovarianceScreen, is_valid_rate, is_valid_velocity, unit_quaternion
+from .stream_order import LONG_AGO_NS, SHORTEST_PAUSE_NS, NewDays, Order, Sequencer, Track
 
 # How far a DVL may lag GNSS and IMU and still find its partners, beyond what pairing waits for.
 RETENTION_NS = 10 * SECOND_NS
@@ -359,3 +370,40 @@ class OneByOne:
 def _newest(track: Track, n: int) -> Stamps:
     """(N,) the newest stamp of a track, for rows that are decided now."""
     return np.full(n, LONG_AGO_NS if track.newest_ns is None else track.newest_ns, dtype=np.int64)
+
+
+class ReferenceTrack(Track):
+    """A `Track` of reference samples. vertical_seen: whether one of them had a vertical velocity."""
+
+    def __init__(self, parameters: Parameters, max_gap_ns: int, max_latency_ns: int, retention_ns: int) -> None:
+        """As `Track`."""
+        super().__init__(max_gap_ns, max_latency_ns, retention_ns)
+        self.vertical_seen = False
+        east, north = parameters.reference_velocity_offset
+        offsets = {VelocityFrame.ENU: (east, north, 0.0), VelocityFrame.NED: (north, east, 0.0)}
+        self._velocity_offset = np.array([offsets.get(frame, (0.0, 0.0, 0.0)) for frame in FRAMES])
+
+    def append(
+        self,
+        stamps_ns: Stamps | int,
+        values: Array,
+        frames: Codes,
+        unmeasured: Codes | int,
+        late: Mask | bool,
+        gnss_axes: str,
+    ) -> int:
+        """Put samples (N,) on the track, values (N, 12); the slot of the first. gnss_axes: as the parameter."""
+        slots = self.extend(len(frames))
+        self.stamps_ns[slots], self.late[slots], self.frames[slots] = stamps_ns, late, frames
+        vertical = np.logical_or.accumulate(values[:, 2] != 0.0) | self.vertical_seen
+        self.vertical_seen = bool(vertical[-1])
+        self.values[slots] = values
+        self.values[slots, :3] -= self._velocity_offset[frames]
+        never = np.where(vertical, _never_measured(gnss_axes, True), _never_measured(gnss_axes, False))
+        self.unmeasured[slots] = unmeasured | never.astype(np.uint8)
+        return slots.start
+
+
+def _never_measured(gnss_axes: str, vertical_seen: bool) -> int:
+    """The axes, as bits, that are not measured whatever the covariances say."""
+    return 0 if gnss_axes == XYZ or (vertical_seen and gnss_axes != XY) else VERTICAL

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from .numerics.frames import Array
-from .numerics.robust import median, robust_std
-from .numerics.samples import Mask
+from ..numerics.frames import Array
+from ..numerics.robust import median, robust_std
+from ..numerics.samples import Mask
 
 # Scatter about what neighbours tell, beyond which a sample is a spike; passes in which those beside others come out.
 SPIKE, PASSES = 12.0, 6

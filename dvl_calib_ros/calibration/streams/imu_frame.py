@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from .models.parameters import IMU_NED, Parameters
-from .numerics.frames import ENU_FROM_NED, Array, Quaternion, Vector, quaternion_from_rotation, rotation_from_rpy
-from .numerics.samples import ImuSample, SampleBlock
+from ..models.parameters import IMU_NED, Parameters
+from ..numerics.frames import ENU_FROM_NED, Array, Quaternion, Vector, quaternion_from_rotation, rotation_from_rpy
+from ..numerics.samples import ImuSample, SampleBlock
 
 # What is not finite stays so, and is counted further on.
 _QUIET = np.errstate(invalid="ignore", over="ignore")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .clocks import SECOND_NS
-from .numerics.samples import Stamps
+from ..numerics.samples import Stamps
+from .clock_correction import SECOND_NS
 
 # A DVL that sends nothing for so long, and for so many times its shortest interval, has dropped out.
 DROPOUT_NS = SECOND_NS

@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .clocks import Clocks
-from .numerics.frames import Array
-from .numerics.samples import Codes, Index, Mask, Stamps, Stream, Streams
-from .partners import BODY, Partners
-from .rows import Rows
+from ..numerics.frames import Array
+from ..numerics.samples import Codes, Index, Mask, Stamps, Stream, Streams
+from .clock_correction import Clocks
+from .pairing import BODY, Partners, Rows
 from .screening import ALL_AXES, are_valid_velocities, screen_columns, unit_quaternions, valid_rates
-from .streams import LONG_AGO_NS, Admitted, Sequencer, Track
+from .stream_order import LONG_AGO_NS, Admitted, Sequencer, Track
 
 
 class ScreenedStreams(NamedTuple):

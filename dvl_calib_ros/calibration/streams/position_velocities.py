@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from .models import WITH_POSITIONS
-from .models.parameter_spec import ParameterError
-from .models.parameters import Parameters
-from .numerics.frames import Array
+from ..models import WITH_POSITIONS
+from ..models.parameter_spec import ParameterError
+from ..models.parameters import Parameters
+from ..numerics.frames import Array
 
 # Velocities made of positions are of no use from this noise on, m/s.
 NOISY_MPS = 0.3
