@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 
 from dvl_calib_ros.bag_replay.replay import BLOCK_SIZE
-from dvl_calib_ros.calibration.assembly import Assembler
-from dvl_calib_ros.calibration.bank import Group, groups_of
+from dvl_calib_ros.calibration.filters.filter_bank import Group, groups_of
+from dvl_calib_ros.calibration.filters.filter_setup import Assembler
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, Needs
 from dvl_calib_ros.calibration.models.base import Observations
 from dvl_calib_ros.calibration.models.parameters import Parameters

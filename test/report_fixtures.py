@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from dvl_calib_ros.calibration.comparison.mounting_change.mounting_change import Comparison, compare
+from dvl_calib_ros.calibration.results.results.extrinsics import Extrinsics
 from io_fixtures import run, write_bag
 from matplotlib.category import StrCategoryLocator
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
 from dvl_calib_ros.bag_replay.replay import Replayed, replay
-from dvl_calib_ros.calibration.comparison import Comparison, compare
-from dvl_calib_ros.calibration.extrinsics import Extrinsics
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.navigation import Drift, Navigation

@@ -86,7 +86,7 @@ MUTANTS = (
     ),
     Mutant(
         "limit of the verdict",
-        "dvl_calib_ros/calibration/verification.py",
+        "dvl_calib_ros/calibration/results/held_out_verification.py",
         "if corrected > predicted * parameters.max_error_ratio * by_chance:",
         "if corrected > predicted * parameters.max_error_ratio * by_chance * 1.1:",
         (UNIT + "calibration/test_verification.py",),

@@ -34,7 +34,7 @@ from .output import framed, printed
 if TYPE_CHECKING:
     from ..bags.recover import Recovered
     from ..bags.writer import Compression, Storage
-    from ..calibration.comparison import Comparison
+    from ..calibration.comparison.mounting_change import Comparison
     from ..evaluation.cross_check import CrossCheck
     from ..evaluation.results import Evaluation
     from ..files.apply import Applied
@@ -163,8 +163,8 @@ def compare(
     from ..bag_replay.checked_replay import calibrated
     from ..bag_replay.replay import extrinsics_of_replay
     from ..bags.files import is_bag
-    from ..calibration.comparison import check_distinct
-    from ..calibration.comparison import compare as run
+    from ..calibration.comparison.mounting_change import check_distinct
+    from ..calibration.comparison.mounting_change import compare as run
     from ..files.mounting import load_extrinsics
 
     found = []

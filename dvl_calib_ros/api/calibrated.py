@@ -14,7 +14,7 @@ from ..bag_replay.replay import Replayed
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
-from ..calibration.quantities import Quantity, quantities
+from ..calibration.results.mounting_quantities import Quantity, quantities
 from ..discovery.discover import Discovery
 from ..errors import InputError
 from ..verdict.reasons import Reason

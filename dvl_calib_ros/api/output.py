@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..calibration.comparison import Comparison
+from ..calibration.comparison.mounting_change import Comparison
 from ..diagnosis.results import Diagnosis
 from ..disk.text_files import write_json
 from ..errors import InputError
@@ -89,7 +89,7 @@ def _plain(result: Any) -> Callable[[], Any]:
     if isinstance(result, Examination):
         return result.document
     if isinstance(result, Comparison):
-        from ..calibration.comparison_words import comparison_document
+        from ..calibration.comparison.mounting_change_reasons import comparison_document
 
         return lambda: comparison_document(result)
     if isinstance(result, Diagnosis):

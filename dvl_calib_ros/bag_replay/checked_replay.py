@@ -17,16 +17,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison import Comparison, compare, contradicts
-from ..calibration.comparison_words import between, moved_in_words, scale_changed, suspicious
-from ..calibration.extrinsics import Extrinsics
+from ..calibration.comparison.mounting_change import Comparison, compare, contradicts
+from ..calibration.comparison.mounting_change_reasons import between, moved_in_words, scale_changed, suspicious
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.error_model import corrected_mounting
 from ..calibration.numerics.frames import whole_degrees
-from ..calibration.results import Result
+from ..calibration.results.extrinsics import Extrinsics
+from ..calibration.results.held_out_verification import shown_misalignment
+from ..calibration.results.results import Result
 from ..calibration.streams.dropouts import DROPOUT_NS
-from ..calibration.verification import shown_misalignment
 from ..errors import InputError
 from ..files.mounting import load_extrinsics
 from ..recordings.recording import Recording, open_recording, together

@@ -17,19 +17,19 @@ import numpy as np
 
 from ..calibration.advice import data_advice, gate_advice, message_advice, reference_advice
 from ..calibration.calibrator import Calibrator
-from ..calibration.comparison import Comparison
-from ..calibration.comparison_words import comparison_document
+from ..calibration.comparison.mounting_change import Comparison
+from ..calibration.comparison.mounting_change_reasons import comparison_document
 from ..calibration.doubts import doubts
-from ..calibration.extrinsics import Extrinsics, dvl_in_words, extrinsics_of
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.navigation import Navigation, navigation_document, objections
 from ..calibration.numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.numerics.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
-from ..calibration.results import Day, Result
+from ..calibration.results.extrinsics import Extrinsics, dvl_in_words, extrinsics_of
+from ..calibration.results.held_out_verification import verification_document
+from ..calibration.results.results import Day, Result
 from ..calibration.streams.screening import are_valid_velocities, unit_quaternions
 from ..calibration.streams.stream_order import SHORTEST_PAUSE_NS
-from ..calibration.verification import verification_document
 from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_document
 from ..calibration.worth import drift_left_open
 from ..errors import InputError

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.history import StateTrace
+from ..calibration.filters.build_observations import Observer
+from ..calibration.filters.state_history import StateTrace
 from ..calibration.models import MODELS, Needs
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import AlignedBlock, Codes, Pairing, Stamps
-from ..calibration.observe import Observer
-from ..calibration.results import Estimate
+from ..calibration.results.results import Estimate
 
 # Rows kept of each series at most: a figure shows no more.
 KEPT_STATES, KEPT_VELOCITIES = 300, 800

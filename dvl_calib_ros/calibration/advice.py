@@ -8,11 +8,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..verdict.reasons import Reason, finding
-from .comparison_words import date
-from .days import OFFSETS, OFTEN_OFF
+from .filters.day_to_day_covariance import OFFSETS, OFTEN_OFF
 from .models.parameters import Parameters
-from .results import Day, Estimate
-from .told_arm import ARM
+from .results.mounting_quantities import date
+from .results.results import ARM, Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2

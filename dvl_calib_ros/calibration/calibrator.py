@@ -20,14 +20,14 @@ import numpy as np
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
-from .bank import Group, groups_of
-from .delay.hold_out import Terms, ThinnedRecording
 from .delay.workers import Worker
 from .estimates import Estimates
 from .estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
+from .filters.build_observations import Observer
+from .filters.filter_bank import Group, groups_of
+from .filters.heading_diversity import EVERY_NS, Headings
+from .filters.state_history import Counts, Numbers, StateTrace
 from .further import FurtherEstimators
-from .headings import EVERY_NS, Headings
-from .history import Counts, Numbers, StateTrace
 from .judging import Judge
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
 from .models.base import Observations
@@ -50,14 +50,13 @@ from .numerics.samples import (
     Streams,
     VelocityFrame,
 )
-from .observe import Observer
-from .register.registration import Registration
-from .results import Day, Estimate, Result
+from .registration.clock_domains import StreamClocks
+from .registration.registration import Registration
+from .results.results import Day, Estimate, Result, Verification
+from .results.thinned_recording import Terms, ThinnedRecording
 from .selection import Selection
-from .stream_clocks import StreamClocks
 from .streams.aligner import Aligner, counted
 from .streams.position_velocities import are_positions, check_model
-from .verification import Verification
 from .worth import RecentMotion
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.

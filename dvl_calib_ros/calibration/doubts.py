@@ -11,7 +11,7 @@ from .heading_deviation import heading_advice, how_bad
 from .left_over import finds_nothing, lag_of, left_over_advice, std_along
 from .models.parameters import Parameters
 from .navigation import Navigation
-from .results import Estimate
+from .results.results import Estimate
 from .streams.position_velocities import are_positions
 from .told_arm import told_arm_advice
 

@@ -7,17 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from . import told_arm
-from .assembly import nis_bounds
-from .days import day_covariance, offset_covariance
 from .estimator import Estimator
+from .filters.day_to_day_covariance import day_covariance, offset_covariance
+from .filters.filter_setup import nis_bounds
+from .filters.observability import MEASURES_VERTICAL, convergence, observability
 from .further import FurtherEstimators
 from .models import EXTENDED_BY, MODELS, Model
 from .models.parameters import Parameters
 from .numerics.frames import Array
 from .numerics.kalman import GaussianState
-from .observability import MEASURES_VERTICAL, convergence, observability
-from .results import Estimate
+from .results import results
+from .results.results import Estimate
 
 # Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.
 OPEN_FROM = 4.0
@@ -117,7 +117,7 @@ class Estimates:
     @property
     def arm_finders(self) -> Iterator[Model]:
         """Wanted models that find the lever arm, the best first."""
-        return (MODELS[name] for name in self._models if told_arm.finds_arm(MODELS[name]))
+        return (MODELS[name] for name in self._models if results.finds_arm(MODELS[name]))
 
     def without_tilt(self, estimate: Estimate) -> Estimate:
         """An estimate that claims no roll and pitch where those of the vehicle are not known, or no reference measures
@@ -135,7 +135,7 @@ class Estimates:
         level = p.rotation_dvl_from_body[:, :unknown_axes]
         unknown = np.zeros((model.n_state, model.n_state))
         unknown[:3, :3] = p.initial_std_misalignment**2 * (level @ level.T)
-        if needs == MEASURES_VERTICAL and told_arm.finds_arm(model):  # nor does anything show its height
+        if needs == MEASURES_VERTICAL and results.finds_arm(model):  # nor does anything show its height
             height = model.state_names.index("lever_arm_z")
             unknown[height, height] = p.initial_std_lever_arm**2
         own = estimate.velocity_covariance + unknown
@@ -156,4 +156,4 @@ class Estimates:
         estimator = self.estimators[model.name]
         x, p = estimator.of_recording()
         shown = GaussianState(x, p - estimator.left_open)
-        return bool(told_arm.contradicted(model, shown, self.parameters).any())
+        return bool(results.contradicted(model, shown, self.parameters).any())

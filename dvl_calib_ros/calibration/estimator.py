@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..verdict.reasons import Reason
-from .bank import Group, ModelCounts
 from .delay.clocks import Rest
-from .delay.hold_out import Terms, ThinnedRecording
 from .delay.workers import Worker
-from .dvl_bias import OfBias
-from .folds import Moments
-from .history import Counts, Numbers, StateTrace
+from .filters.cross_validation import HeldOutError, Moments, held_out_error
+from .filters.filter_bank import Group, ModelCounts
+from .filters.heading_bias import OfBias
+from .filters.state_history import Counts, Numbers, StateTrace
 from .models import Model
 from .models.parameter_spec import ParameterError
 from .models.parameters import Parameters
@@ -29,11 +28,11 @@ from .navigation import Navigation
 from .numerics.frames import Array
 from .numerics.kalman import GaussianState
 from .numerics.samples import Index, Stamps
-from .register.registration import Registration
-from .results import Day
+from .registration.registration import Registration
+from .results.results import Day
+from .results.thinned_recording import Terms, ThinnedRecording
 from .selection import NO_EVIDENCE, Evidence
 from .streams.aligner import Aligner
-from .verification import HeldOutError, held_out_error
 
 NEVER = 2**63 - 1
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from ..verdict.reasons import Reason
 from .delay.clocks import Rest
-from .delay.hold_out import ThinnedRecording
 from .estimator import NEVER, Estimator
 from .numerics.samples import Index, Stamps
-from .register.registration import Registration
+from .registration.registration import Registration
+from .results.thinned_recording import ThinnedRecording
 
 _Answer = TypeVar("_Answer")
 

@@ -1,7 +1,7 @@
 """Whether the heading is off by an amount that changes with the heading, or with time, as no mounting does.
 
 Yaw is found against the IMU's heading, of which a constant error is harmless: the same IMU navigates. How it deviates
-beside that is estimated with the mounting (calibration/heading_states.py); here it is judged on the headings driven.
+beside that is estimated with the mounting (calibration/filters/heading_bias.py); here it is judged on the headings driven.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..verdict.reasons import Reason, finding
 from .numerics.chi_square import chi2_isf
 from .numerics.frames import Array
 from .numerics.kalman import GaussianState
-from .results import Estimate
+from .results.results import Estimate
 
 # Its rms (rad) is worth a word from here on, where as much is found by chance so seldom where there is none.
 SAID_FROM, CHANCE = math.radians(0.3), 1e-3

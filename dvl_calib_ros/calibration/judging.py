@@ -7,18 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..verdict.reasons import Reason
-from .delay.hold_out import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
 from .doubts import doubts
 from .estimates import Estimates
-from .folds import Moments, folds_of
+from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
 from .models import MODELS, Model
 from .navigation import Navigation, dead_reckoned, objections
 from .numerics.error_model import correction_matrix
 from .numerics.frames import Array
 from .numerics.kalman import GaussianState
-from .results import Estimate
-from .told_arm import finds_arm
-from .verification import SEVERAL, HeldOutError, Verification, calibration_error, verify
+from .results.held_out_verification import SEVERAL, verify
+from .results.results import Estimate, Verification, finds_arm
+from .results.thinned_recording import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
 from .worth import drift_left_open
 
 # What is said of a running calibration on the way: of the rest its diagnostics say more than a verdict does.

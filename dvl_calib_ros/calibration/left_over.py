@@ -30,8 +30,7 @@ from .numerics.block_covariance import alike_of, of_few
 from .numerics.frames import Array, cross, skew
 from .numerics.robust import median, robust_std
 from .numerics.samples import Index
-from .results import Estimate
-from .told_arm import ARM
+from .results.results import ARM, Estimate
 
 # Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.
 TILT_S = 1.0, 15.0

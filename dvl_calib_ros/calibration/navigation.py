@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
-from .delay.hold_out import NO_TERMS, Terms, ThinnedRecording
 from .heading_deviation import HeadingDeviation, heading_deviation
 from .left_over import LeftOver, left_over
 from .models.parameters import Parameters
@@ -24,6 +23,7 @@ from .numerics.frames import Array
 from .numerics.kalman import GaussianState
 from .numerics.robust import median
 from .numerics.samples import Index
+from .results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
 
 # Lengths that drift is told over, m: the longest of which there are ENOUGH, else all there is as one.
 STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)

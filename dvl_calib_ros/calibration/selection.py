@@ -13,17 +13,11 @@ from ..verdict.reasons import Reason, finding
 from .models import EXTENDED_BY, WITH_HEADINGS, WITH_POSITIONS
 from .models.parameters import AUTO, IAC, Parameters
 from .numerics.samples import Mask, Stamps
+from .results.results import Segment
 
 # The published selection; the first and the last are what the paper recommends
 IAC_G = ("M3", "M4")
 IAC_GF = ("M5", "M6", "M7")
-
-
-class Segment(NamedTuple):
-    """From this stamp on (until the next segment's) this model was selected."""
-
-    from_ns: int
-    model: str
 
 
 class GnssAvailability:

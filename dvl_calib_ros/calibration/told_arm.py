@@ -10,44 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ..verdict.reasons import Reason, finding
-from .models import MODELS, Model
+from .models import MODELS
 from .models.parameters import Parameters
 from .numerics.kalman import GaussianState
-from .numerics.samples import Mask
+from .results.results import ARM, contradicted, finds_arm
 
 if TYPE_CHECKING:
-    from .results import Estimate
-
-ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
-# So many σ are no chance, and so many metres no tape measure's error.
-SIGMAS, MEASURED_TO = 10.0, 0.05
-# Data that know an arm so many times worse than a tape measure do not improve on it.
-WORSE_THAN_TOLD = 2.0
-
-
-def finds_arm(model: Model) -> bool:
-    """Whether its states have the lever arm."""
-    return set(ARM) <= set(model.state_names)
-
-
-def stands(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
-    """(3,) whether it is where it was told to be, by axis: contradicted, or known less well than by a tape measure."""
-    if not any(parameters.lever_arm) or not finds_arm(model):
-        return np.zeros(3, dtype=bool)
-    std = np.sqrt(np.diag(state.p)[[model.state_names.index(name) for name in ARM]])
-    return contradicted(model, state, parameters) | np.asarray(std > WORSE_THAN_TOLD * MEASURED_TO)
-
-
-def contradicted(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
-    """(3,) whether the data show the DVL elsewhere than it was told to be, by axis of the body."""
-    if not any(parameters.lever_arm) or not finds_arm(model):
-        return np.zeros(3, dtype=bool)
-    at = [model.state_names.index(name) for name in ARM]
-    away, std = np.abs(state.x[at]), np.sqrt(np.diag(state.p)[at])
-    return np.asarray(away > np.maximum(SIGMAS * std, MEASURED_TO))
+    from .results.results import Estimate
 
 
 def told_arm_advice(estimates: Iterable[Estimate], parameters: Parameters) -> list[Reason]:

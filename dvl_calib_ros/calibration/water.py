@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple
 
+from .filters.observability import observability
 from .models import Model
 from .models.parameters import Parameters
-from .mounting_pose import scale_and_delay
 from .numerics.kalman import GaussianState
-from .observability import observability
+from .results.results import scale_and_delay
 
 # Where the equation holds: °C, with the sea's coldest water; m.
 TEMPERATURES, DEEPEST = (-2.0, 35.0), 1000.0

@@ -17,7 +17,7 @@ from .models import MODELS, Model
 from .models.base import Assumptions, Observations
 from .models.parameters import Parameters
 from .numerics.frames import Array, skew
-from .results import Estimate
+from .results.results import Estimate
 
 KM = 1000.0
 # A manoeuvre is tried for so long, s, by samples of so many s; after so many of them nobody drives on.

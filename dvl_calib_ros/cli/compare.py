@@ -21,7 +21,7 @@ from . import common
 from .common import add_report_option, report_writer
 
 if TYPE_CHECKING:
-    from ..calibration.extrinsics import Extrinsics
+    from ..calibration.results.extrinsics import Extrinsics
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,8 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Load or calibrate, compare, save, print."""
-    from ..calibration.comparison import check_distinct, compare
-    from ..calibration.comparison_words import comparison_document
+    from ..calibration.comparison.mounting_change import check_distinct, compare
+    from ..calibration.comparison.mounting_change_reasons import comparison_document
     from ..errors import InputError
     from ..present import comparison as present
 

@@ -24,7 +24,7 @@ from .watch import node_command
 
 if TYPE_CHECKING:
     from ..bag_replay.replay import Replayed
-    from ..calibration.results import Result
+    from ..calibration.results.results import Result
 
 BAG = "harbour_box"
 # What the bag was simulated with, see bags/README.md

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
 from ..calibration.numerics.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
-from ..calibration.register.fine import white_noise
-from ..calibration.register.registration import Registration
+from ..calibration.registration.gauss_newton import white_noise
+from ..calibration.registration.registration import Registration
 from ..calibration.streams.clock_correction import Clocks
 from ..calibration.streams.position_velocities import NOISY_MPS
 from ..calibration.streams.screening import SMALLEST_VARIANCE

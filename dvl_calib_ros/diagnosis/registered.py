@@ -9,9 +9,9 @@ import numpy as np
 
 from ..calibration.numerics.frames import Array, turn_between
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.register.far import far_clocks
-from ..calibration.register.motion import MotionStreams, make_motion
-from ..calibration.register.registration import Registration, register
+from ..calibration.registration.motion_streams import MotionStreams, make_motion
+from ..calibration.registration.registration import Registration, register
+from ..calibration.registration.unregistrable_clocks import far_clocks
 from ..calibration.streams.interpolation import ImuColumns
 from ..effects.base import ActsOn, EffectNeeds
 from ..effects.composition import Injection, late

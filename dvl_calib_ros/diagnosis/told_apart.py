@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..calibration.register.registration import IN_TIME_STD_S
+from ..calibration.registration.registration import IN_TIME_STD_S
 from ..effects.base import Effect
 from .clock_or_arm import (
     ARM,

@@ -15,10 +15,10 @@ import numpy as np
 
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.samples import SampleBlock, Stream, Streams
-from ..calibration.register.far import Far, far_clocks
-from ..calibration.register.fine import white_noise
-from ..calibration.register.motion import MotionStreams, motion_of
-from ..calibration.register.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
+from ..calibration.registration.gauss_newton import white_noise
+from ..calibration.registration.motion_streams import MotionStreams, motion_of
+from ..calibration.registration.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
+from ..calibration.registration.unregistrable_clocks import Far, far_clocks
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
 from ..recordings.topic_preview import Look, Survey

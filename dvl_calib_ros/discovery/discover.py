@@ -17,10 +17,8 @@ import numpy as np
 from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.register.arrival import limit_s
-from ..calibration.register.fine import white_noise
-from ..calibration.register.motion import MotionStreams, in_order, make_motion
-from ..calibration.register.readings import (
+from ..calibration.registration.clock_domains import limit_s
+from ..calibration.registration.frame_hypotheses import (
     CLEARLY,
     FITS,
     Agreement,
@@ -31,6 +29,8 @@ from ..calibration.register.readings import (
     nominal_rpy,
     turns_right,
 )
+from ..calibration.registration.gauss_newton import white_noise
+from ..calibration.registration.motion_streams import MotionStreams, in_order, make_motion
 from ..calibration.streams.interpolation import ImuColumns
 from ..calibration.streams.screening import unit_quaternions
 from ..errors import InputError

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.register.coarse import LONGEST_S
+from ..calibration.registration.delay_search import LONGEST_S
 from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory
 from .recursion import recursion, slopes
 

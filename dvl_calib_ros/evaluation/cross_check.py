@@ -13,15 +13,15 @@ import numpy as np
 
 from ..bag_replay.replay import replay
 from ..calibration.calibrator import Calibrator
-from ..calibration.delay.hold_out import Terms, ThinnedRecording
+from ..calibration.filters.build_observations import Observer
 from ..calibration.models import MODELS, Needs
 from ..calibration.models.parameters import Parameters
 from ..calibration.navigation import Navigation, dead_reckoned, navigation_document
 from ..calibration.numerics.error_model import correction_matrix
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import AlignedBlock
-from ..calibration.observe import Observer
-from ..calibration.results import Estimate
+from ..calibration.results.results import Estimate
+from ..calibration.results.thinned_recording import Terms, ThinnedRecording
 from ..errors import InputError
 from ..parallel import Workers, run_all
 from ..recordings.recording import open_recording

@@ -15,9 +15,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..calibration.assembly import Assembler
-from ..calibration.heave import HeaveRows, HeaveSums, with_heave
-from ..calibration.height import HeightOfLate
+from ..calibration.filters.build_observations import Observer
+from ..calibration.filters.filter_setup import Assembler
+from ..calibration.filters.vertical_motion import HeaveRows, HeaveSums, HeightOfLate, with_heave
 from ..calibration.models import MODELS, Model, Needs
 from ..calibration.models.base import Observations
 from ..calibration.models.parameters import Parameters
@@ -25,7 +25,6 @@ from ..calibration.numerics import kalman
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import AlignedBlock, Mask, Stamps, Stream, Streams, no_samples, sample_block
-from ..calibration.observe import Observer
 from ..calibration.streams.aligner import align
 from .results import Failure
 from .trajectories import Trajectory

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..calibration.filters.observability import OBSERVED_SHARE
 from ..calibration.models import MODELS, Model
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.error_model import correction_matrix
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.kalman import GaussianState
-from ..calibration.observability import OBSERVED_SHARE
 from . import protocol
 from .convergence import REFERENCE_STD, TIMES_S, curve_keys, squared_errors
 from .estimation import SensorData, estimate

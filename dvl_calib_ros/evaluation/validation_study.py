@@ -19,8 +19,7 @@ from ..calibration.models import LINEAR_MODELS, MODELS
 from ..calibration.models.base import Observations
 from ..calibration.models.parameters import SCHEMA, Parameters
 from ..calibration.numerics.frames import Array
-from ..calibration.results import Result
-from ..calibration.verification import Verification
+from ..calibration.results.results import Result, Verification
 from ..errors import InputError
 from ..parallel import Workers, run_all
 from ..version import __version__

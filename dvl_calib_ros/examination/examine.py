@@ -13,7 +13,7 @@ import numpy as np
 from ..calibration.models.parameters import FRD, FROM_MESSAGE, Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.register.readings import FITS
+from ..calibration.registration.frame_hypotheses import FITS
 from ..calibration.streams.position_velocities import NOISY_MPS
 from ..discovery.discover import Discovery, Given, discover
 from ..messages.drivers import VELOCITY_TYPES

@@ -6,14 +6,13 @@ import math
 from dataclasses import dataclass
 
 from ..calibration.calibrator import Calibrator
+from ..calibration.filters.observability import OBSERVED_SHARE, scale_std_ahead
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
-from ..calibration.mounting_pose import rpy_std
 from ..calibration.numerics.samples import Stream
-from ..calibration.observability import OBSERVED_SHARE, scale_std_ahead
-from ..calibration.quantities import Quantity, quantities
-from ..calibration.register.registration import Registration
-from ..calibration.results import Estimate
+from ..calibration.registration.registration import Registration
+from ..calibration.results.mounting_quantities import Quantity, quantities
+from ..calibration.results.results import Estimate, rpy_std
 from ..calibration.selection import eligible
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording

@@ -9,7 +9,7 @@ import numpy as np
 from ..calibration.models.parameters import SCHEMA, Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import Stream
-from ..calibration.register.arrival import apart
+from ..calibration.registration.clock_domains import apart
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Recorded
 from ..verdict.reasons import Reason, finding

@@ -17,12 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.correction import lever_arm
-from ..calibration.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of
+from ..calibration.filters.observability import Convergence, observability
 from ..calibration.models import MODELS, Model
 from ..calibration.models.parameter_spec import ParameterError
 from ..calibration.models.parameters import FRD, Parameters
-from ..calibration.mounting_pose import position_in_body, scale_and_delay
 from ..calibration.numerics.error_model import corrected_mounting
 from ..calibration.numerics.frames import (
     FLU_FROM_FRD,
@@ -32,7 +30,9 @@ from ..calibration.numerics.frames import (
     rpy_from_rotation,
 )
 from ..calibration.numerics.kalman import GaussianState
-from ..calibration.observability import Convergence, observability
+from ..calibration.results.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of
+from ..calibration.results.results import position_in_body, scale_and_delay
+from ..calibration.results.velocity_correction import lever_arm
 from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity

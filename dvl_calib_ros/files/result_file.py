@@ -18,11 +18,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from ..calibration.assembly import prior
-from ..calibration.folds import with_states_of
+from ..calibration.filters.cross_validation import with_states_of
+from ..calibration.filters.filter_setup import prior
+from ..calibration.filters.observability import Convergence
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import FLU, FRD, Parameters
-from ..calibration.mounting_pose import mounting_pose, position_in_body, scale_and_delay
 from ..calibration.numerics.frames import (
     FLU_FROM_FRD,
     Array,
@@ -31,9 +31,8 @@ from ..calibration.numerics.frames import (
     rpy_from_rotation,
 )
 from ..calibration.numerics.kalman import GaussianState
-from ..calibration.observability import Convergence
-from ..calibration.results import Estimate, Result
-from ..calibration.verification import verification_document
+from ..calibration.results.held_out_verification import verification_document
+from ..calibration.results.results import Estimate, Result, mounting_pose, position_in_body, scale_and_delay
 from ..calibration.water import Water, water_document
 from ..disk.atomic import own_stream, save_bytes
 from ..disk.yaml_files import load_yaml

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison import Comparison, compare, fused
-from ..calibration.extrinsics import Extrinsics
+from ..calibration.comparison.mounting_change import Comparison, compare, fused
 from ..calibration.models import MODELS
 from ..calibration.numerics.frames import Array
+from ..calibration.results.extrinsics import Extrinsics
 from ..errors import InputError
 from .recording_entry import HEADING_ERRORS, Row
 

@@ -19,11 +19,10 @@ from ..calibration.advice import (
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
-from ..calibration.mounting_pose import scale_and_delay
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
-from ..calibration.register.arrival import apart
-from ..calibration.results import Estimate
+from ..calibration.registration.clock_domains import apart
+from ..calibration.results.results import Estimate, scale_and_delay
 from ..calibration.water import CauseOfScale, Water, cause_of_scale
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity

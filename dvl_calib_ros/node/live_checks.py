@@ -15,7 +15,7 @@ import numpy as np
 
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import rotation_from_rpy
-from ..calibration.register.registration import ALIKE_S, OFFSETS, Registration
+from ..calibration.registration.registration import ALIKE_S, OFFSETS, Registration
 from ..discovery.gravity import Gravity
 from ..verdict.reasons import Reason, finding
 

@@ -13,10 +13,9 @@ import numpy as np
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
-from ..calibration.mounting_pose import rpy_std, scale_and_delay
 from ..calibration.numerics.frames import rpy_from_rotation
 from ..calibration.numerics.kalman import GaussianState
-from ..calibration.results import Estimate
+from ..calibration.results.results import Estimate, rpy_std, scale_and_delay
 from ..calibration.worth import (
     KM,
     Outlook,

@@ -16,8 +16,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from ..calibration.mounting_pose import MountingPose
 from ..calibration.numerics.frames import quaternion_from_rotation
+from ..calibration.results.results import MountingPose
 from ..discovery.transforms import FrameTree
 from ..verdict.reasons import Reason, finding
 

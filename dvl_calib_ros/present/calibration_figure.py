@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 
 from ..bag_replay.replay import Replayed
 from ..calibration.models.parameters import Parameters
-from ..calibration.mounting_pose import rpy_std
 from ..calibration.numerics.error_model import corrected_mounting
 from ..calibration.numerics.frames import Array, rpy_from_rotation
-from ..calibration.quantities import quantities
+from ..calibration.results.mounting_quantities import quantities
+from ..calibration.results.results import rpy_std
 
 _COLOURS = ("#1f6fb2", "#2a7f62", "#c0392b")
 # Share of the run at its beginning that does not set the limits: the prior's width would

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison import ChiSquare, Comparison, Difference
-from ..calibration.comparison_words import date, reasons, remarks
-from ..calibration.extrinsics import MOUNTING, Extrinsics
+from ..calibration.comparison.mounting_change import ChiSquare, Comparison, Difference
+from ..calibration.comparison.mounting_change_reasons import reasons, remarks
 from ..calibration.numerics.frames import Array, rpy_from_rotation
+from ..calibration.results.extrinsics import MOUNTING, Extrinsics
+from ..calibration.results.mounting_quantities import date
 from .document import Answer, Columns, Document, Section, Sentence, Table, Where, columns_for, figures, table_by
 from .numbers import with_std
 

@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure
 
-from ..calibration.comparison import Change, Comparison
-from ..calibration.extrinsics import N_COMPONENTS, Extrinsics
+from ..calibration.comparison.mounting_change import Change, Comparison
+from ..calibration.results.extrinsics import N_COMPONENTS, Extrinsics
 from ..fleet_catalogue.vehicle_history import CompassDeviation
 from .comparison import ComparedQuantity, shown_quantities, values_of
 from .figure_style import INK, Picture, drawing, legend_above, new_figure, picture

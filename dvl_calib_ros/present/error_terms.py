@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..calibration.models import MODELS, Model
 from ..calibration.numerics.frames import Array
-from ..calibration.results import Estimate, Result
+from ..calibration.results.results import Estimate, Result
 from .document import Table
 from .numbers import with_std
 

@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison import ANSWERS, fused
-from ..calibration.comparison_words import date, moved, reasons, suspicious
-from ..calibration.extrinsics import SCALE, Extrinsics
+from ..calibration.comparison.mounting_change import ANSWERS, fused
+from ..calibration.comparison.mounting_change_reasons import moved, reasons, suspicious
+from ..calibration.results.extrinsics import SCALE, Extrinsics
+from ..calibration.results.mounting_quantities import date
 from ..fleet_catalogue.update import WORDS, Fleet
 from ..fleet_catalogue.vehicle_history import CompassDeviation, NeedsPerson, VehicleHistory
 from ..verdict.kinds import Severity

@@ -23,7 +23,7 @@ import jinja2
 from markupsafe import Markup, escape
 
 from ..bag_replay.replay import Replayed
-from ..calibration.comparison import Comparison
+from ..calibration.comparison.mounting_change import Comparison
 from ..disk.atomic import save_bytes, save_text
 from ..version import __version__
 from .comparison_figures import trend_png

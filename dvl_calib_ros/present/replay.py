@@ -19,9 +19,8 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.navigation import in_words, metres
 from ..calibration.numerics.frames import FLU_FROM_FRD, rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.quantities import not_shown, quantities
-from ..calibration.results import Result
-from ..calibration.verification import Verification
+from ..calibration.results.mounting_quantities import not_shown, quantities
+from ..calibration.results.results import Result, Verification
 from ..files.result_file import result_document
 from ..files.urdf import origin_tag
 from ..verdict.kinds import Severity

@@ -21,7 +21,7 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from ..calibration.models.parameters import Parameters
 from ..calibration.navigation import Navigation
 from ..calibration.numerics.frames import Array, rotation_from_rpy, rotation_of, turn_between
-from ..calibration.results import Result
+from ..calibration.results.results import Result
 from .figure_data import MapTrack
 from .figure_style import (
     FAINT,

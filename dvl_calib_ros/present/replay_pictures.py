@@ -8,7 +8,7 @@ from ..bag_replay.replay import Replayed
 from ..bag_replay.run_history import ModelHistory, RunHistory
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
-from ..calibration.results import Result
+from ..calibration.results.results import Result
 from . import replay_figures as figures
 from .error_terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
 from .figure_style import Picture, picture

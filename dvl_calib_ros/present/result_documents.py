@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from ..calibration.comparison import Comparison
+from ..calibration.comparison.mounting_change import Comparison
 from ..diagnosis.results import Diagnosis
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.results import Evaluation

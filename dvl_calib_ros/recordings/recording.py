@@ -21,7 +21,7 @@ from ..bags.columns import windows
 from ..bags.reader import BagReader
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.samples import Stamps, Stream, Streams, no_samples
-from ..calibration.register.registration import Registration
+from ..calibration.registration.registration import Registration
 from ..calibration.water import Water
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES

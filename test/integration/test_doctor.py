@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from command_line import fail, succeed
 from conftest import ROOT
+from dvl_calib_ros.calibration.results.results.mounting_quantities import quantities
 from io_fixtures import TOPICS, mcap_bytes, write_bag
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.calibration.filters.observability import MEASURES_VERTICAL
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
-from dvl_calib_ros.calibration.observability import MEASURES_VERTICAL
-from dvl_calib_ros.calibration.quantities import quantities
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, examine
 from dvl_calib_ros.examination.expected_result import EXPECTED_FROM_S

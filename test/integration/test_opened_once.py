@@ -11,7 +11,7 @@ from io_fixtures import run, storage_file, write_bag
 
 from dvl_calib_ros.bags import sources
 from dvl_calib_ros.bags.sources import Source
-from dvl_calib_ros.calibration.register import registration
+from dvl_calib_ros.calibration.registration import registration
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from stacks import A50, LEVER_ARM, STACKS, TWIST, YAW_45, Stack, Told, true_mounting
 
 from dvl_calib_ros.bag_replay.replay import Replayed, replay
+from dvl_calib_ros.calibration.filters.observability import body_angle_std
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rotation_from_rpy
-from dvl_calib_ros.calibration.observability import body_angle_std
 from dvl_calib_ros.discovery.discover import Discovery, Given, discover
 from dvl_calib_ros.errors import InputError
 

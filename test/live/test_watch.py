@@ -20,9 +20,9 @@ from conftest import ROOT
 from rich.console import Console
 from runs import MatchedRun, calibrate, make_samples
 
+from dvl_calib_ros.calibration.filters.observability import observability
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.observability import observability
 from dvl_calib_ros.cli.watch import LINE_S, SILENCE_S, SURE_S, Keys, line, rendered, show
 from dvl_calib_ros.node.status import Status
 

@@ -18,11 +18,18 @@ from functools import reduce
 
 import numpy as np
 
-from ..block_terms import all_told, block_terms, turns_of, with_terms
-from ..dvl_bias import OfBias
-from ..folds import FOLDS, FoldInformation, folds_of, with_states_of
-from ..heading_states import HeadingEvidence, heading_states, prior_std
-from ..heave import HeaveRows, HeaveSums, with_heave
+from ..filters.cross_validation import FOLDS, FoldInformation, folds_of, with_states_of
+from ..filters.heading_bias import (
+    HeadingEvidence,
+    OfBias,
+    all_told,
+    block_terms,
+    heading_states,
+    prior_std,
+    turns_of,
+    with_terms,
+)
+from ..filters.vertical_motion import HeaveRows, HeaveSums, with_heave
 from ..models.own import BEYOND, DELAY, LEVER_ARM, N_ERRORS, N_STATE
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import TimeBlocks

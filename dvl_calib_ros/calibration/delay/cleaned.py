@@ -13,11 +13,11 @@ from ..models.parameters import Parameters
 from ..numerics.frames import ENU_FROM_NED, Array
 from ..numerics.robust import median, steps
 from ..numerics.samples import FRAME_CODES, Index, Mask, Stamps, VelocityFrame
+from ..results.thinned_recording import NOT_MEASURED, thinned
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns, binned
 from ..streams.outliers import without_spikes
 from ..streams.position_velocities import are_positions, of_moments
 from .blocks import Block, ImuSamples, ReferenceSamples
-from .hold_out import NOT_MEASURED, thinned
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 # No vehicle with a DVL turns faster, rad/s.

@@ -12,19 +12,16 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from ...verdict.reasons import Reason
-from ..folds import folds_of
+from ..filters.cross_validation import HeldOutError, folds_of
 from ..models.parameters import Parameters
 from ..navigation import Navigation, dead_reckoned
 from ..numerics.frames import Array
 from ..numerics.samples import FRAMES, Codes, Mask
 from ..numerics.tables import RowTable
-from ..register.configuration import fitting_configuration
-from ..register.motion import MotionStreams, make_motion
-from ..register.registration import Registration, register
-from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
-from ..verification import HeldOutError
-from .bank import DelayBank
-from .hold_out import (
+from ..registration.configuration_check import fitting_configuration
+from ..registration.motion_streams import MotionStreams, make_motion
+from ..registration.registration import Registration, register
+from ..results.thinned_recording import (
     KEPT_EVERY_S,
     MEASURED_BELOW,
     Terms,
@@ -33,6 +30,8 @@ from .hold_out import (
     held_out_error,
     typical_error,
 )
+from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
+from .bank import DelayBank
 from .known import Posterior
 
 # Live, what was found stands until so much more is there.

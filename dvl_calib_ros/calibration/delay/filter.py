@@ -18,26 +18,25 @@ from typing import ClassVar
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..assembly import gate_of, prior
-from ..bank import ModelCounts
-from ..dvl_bias import OfBias
 from ..estimator import Estimator, EstimatorSetup
-from ..folds import Moments
-from ..history import Counts, Numbers, StateTrace
+from ..filters.cross_validation import HeldOutError, Moments
+from ..filters.filter_bank import ModelCounts
+from ..filters.filter_setup import gate_of, prior
+from ..filters.heading_bias import OfBias
+from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models.own import BEYOND, DELAY, LEVER_ARM, N_G1, N_STATE
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
 from ..numerics.tables import RowTable
-from ..register.registration import Registration
-from ..results import Day
+from ..registration.registration import Registration
+from ..results.results import Day
+from ..results.thinned_recording import Terms, ThinnedBlock, ThinnedRecording, held_out_error
 from ..selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
-from ..verification import HeldOutError
 from .blocks import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .clocks import Rest
-from .hold_out import Terms, ThinnedBlock, ThinnedRecording, held_out_error
 from .known import DayState, Posterior
 from .solver import BlockSolver, Outcome
 from .workers import AtOnce, Solved

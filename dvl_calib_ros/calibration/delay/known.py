@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..dvl_bias import OfBias
-from ..heading_states import HeadingEvidence
+from ..filters.heading_bias import HeadingEvidence, OfBias
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, Mask, Stamps

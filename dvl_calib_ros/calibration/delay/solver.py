@@ -16,13 +16,14 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..attitude_rates import AttitudeRates
-from ..bank import ModelCounts
 from ..dvl_stream import DvlStream
+from ..filters.filter_bank import ModelCounts
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Stamps
-from ..register.registration import Registration
+from ..registration.registration import Registration
+from ..results.thinned_recording import MEASURED_BELOW, ThinnedBlock
 from ..shared_noise import SharedNoise
 from ..streams.interpolation import DvlColumns, ImuColumns, InBody, Parts, TurnRates, attitude_at, in_body, joined
 from .bank import DelayBank
@@ -30,7 +31,6 @@ from .blocks import MARGIN_NS, Block
 from .cleaned import Cleaned, cleaned, is_slow, seconds
 from .clocks import KeptClocks, Looked, Rest, ToldSoFar
 from .contradicted import without_contradicted
-from .hold_out import MEASURED_BELOW, ThinnedBlock
 from .known import After, BlockRows, Known, Likely, Posterior
 from .rows import DelayedRows, Matched, matched
 

@@ -14,20 +14,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..assembly import prior
-from ..bank import ModelCounts
-from ..delay.hold_out import Terms
 from ..delay.workers import AtOnce, Solved
 from ..estimator import NEVER, Estimator, EstimatorSetup
-from ..folds import FOLDS, Moments
-from ..history import Counts, Numbers, StateTrace
+from ..filters.cross_validation import FOLDS, HeldOutError, Moments
+from ..filters.filter_bank import ModelCounts
+from ..filters.filter_setup import prior
+from ..filters.state_history import Counts, Numbers, StateTrace
 from ..navigation import Navigation
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
+from ..results.thinned_recording import Terms
 from ..selection import NO_EVIDENCE, Evidence
 from ..streams.position_velocities import NOISY_MPS, are_positions
-from ..verification import HeldOutError
 from .judge import held_out, leg_length_s
 from .legs import DeadReckoning, Fixes, Legs
 from .solve import N_ERRORS, DisplacementFit, solve, white_noise

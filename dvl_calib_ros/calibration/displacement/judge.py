@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..filters.cross_validation import HeldOutError, held_out_from_sums
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index
-from ..verification import HeldOutError, held_out_from_sums
 from .legs import Legs
 from .solve import N_ERRORS, DisplacementFit, linear_about
 

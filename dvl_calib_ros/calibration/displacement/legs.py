@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..heading_states import N_HEADING
+from ..filters.heading_bias import N_HEADING
 from ..numerics.frames import Array, rotation_from_quaternion
 from ..numerics.samples import Index, Stamps
 

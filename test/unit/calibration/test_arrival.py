@@ -6,7 +6,7 @@ import pytest
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import Stream
-from dvl_calib_ros.calibration.register.arrival import apart, limit_s
+from dvl_calib_ros.calibration.registration.clock_domains import apart, limit_s
 
 DVL, REFERENCE, IMU = Stream.DVL, Stream.REFERENCE, Stream.IMU
 P = Parameters()

@@ -10,7 +10,7 @@ from runs import ONE_HERTZ, START_NS, MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.advice import one_heading_advice, reference_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.days import day_covariance
+from dvl_calib_ros.calibration.filters.day_to_day_covariance import day_covariance
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks

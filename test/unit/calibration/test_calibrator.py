@@ -12,9 +12,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from runs import ONE_HERTZ, SECOND, START_NS, STRETCH, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
-from dvl_calib_ros.calibration import bank
 from dvl_calib_ros.calibration.advice import data_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.filters import filter_bank
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
 from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
 from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
@@ -797,14 +797,14 @@ def test_a_state_that_no_solver_objects_to_and_is_none_is_not_gone_on_from(poiso
     samples = make_samples(NOISY)
     calibrator = calibrate(samples[:900])
     before = {name: calibrator.state(name).x for name in ("M1", "G1")}
-    filtered = bank._filtered
+    filtered = filter_bank._filtered
 
     def poisoned(*given):
         after = filtered(*given)
         x, p = poison(after.x, after.p)
         return replace(after, x=x, p=p)
 
-    monkeypatch.setattr(bank, "_filtered", poisoned)
+    monkeypatch.setattr(filter_bank, "_filtered", poisoned)
     feed(calibrator, samples[900:1000])
     for name, x in before.items():
         np.testing.assert_array_equal(calibrator.state(name).x, x)

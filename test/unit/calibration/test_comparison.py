@@ -6,15 +6,14 @@ import math
 
 import numpy as np
 import pytest
-
-from dvl_calib_ros.calibration.comparison import (
-    MOUNTING,
-    Difference,
-    compare,
-    fused,
+from dvl_calib_ros.calibration.comparison.mounting_change.mounting_change import Difference, compare, fused
+from dvl_calib_ros.calibration.comparison.mounting_change.mounting_change_reasons import (
+    comparison_document,
+    reasons,
+    remarks,
 )
-from dvl_calib_ros.calibration.comparison_words import comparison_document, reasons, remarks
-from dvl_calib_ros.calibration.extrinsics import COMPONENTS, Extrinsics, extrinsics_of
+from dvl_calib_ros.calibration.results.results.extrinsics import COMPONENTS, MOUNTING, Extrinsics, extrinsics_of
+
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting

@@ -7,8 +7,11 @@ from functools import cache
 import numpy as np
 import pytest
 from conftest import few
+from dvl_calib_ros.calibration.results.results.held_out_verification import verify
 from runs import START_NS, calibrate
 
+from dvl_calib_ros.calibration.filters.cross_validation import HeldOutError
+from dvl_calib_ros.calibration.filters.observability import Convergence
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import (
@@ -19,8 +22,6 @@ from dvl_calib_ros.calibration.numerics.frames import (
 )
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.calibration.observability import Convergence
-from dvl_calib_ros.calibration.verification import HeldOutError, verify
 from dvl_calib_ros.verdict.kinds import Severity
 
 PARAMETERS = Parameters(gnss_aided_std=0.03)

@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import few
+from dvl_calib_ros.calibration.results.results.velocity_correction import lever_arm
 from dvl_calib_ros.calibration.streams.stream_order.interpolation import local_fit, reach_at, spacing_at
 from runs import START_NS, calibrate, feed, feed_columns, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.correction import lever_arm
 from dvl_calib_ros.calibration.delay import contradicted
 from dvl_calib_ros.calibration.delay import solver as delay_solver
 from dvl_calib_ros.calibration.delay.workers import AtOnce

@@ -8,10 +8,19 @@ import math
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration import heading_states as module
-from dvl_calib_ros.calibration.block_terms import N_BIAS, BlockTerms, TermsOfBlock, block_terms, with_terms
-from dvl_calib_ros.calibration.heading_states import N_BEFORE, HeadingEvidence, heading_states, prior_std
-from dvl_calib_ros.calibration.heave import HeaveSums
+from dvl_calib_ros.calibration.filters import heading_bias as module
+from dvl_calib_ros.calibration.filters.heading_bias import (
+    N_BEFORE,
+    N_BIAS,
+    BlockTerms,
+    HeadingEvidence,
+    TermsOfBlock,
+    block_terms,
+    heading_states,
+    prior_std,
+    with_terms,
+)
+from dvl_calib_ros.calibration.filters.vertical_motion import HeaveSums
 from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
 from dvl_calib_ros.calibration.numerics.frames import skew
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState

@@ -7,7 +7,7 @@ import pytest
 from runs import feed
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.heave import HeaveRows, with_heave
+from dvl_calib_ros.calibration.filters.vertical_motion import HeaveRows, with_heave
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.evaluation import protocol

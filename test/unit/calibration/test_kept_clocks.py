@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.results.results.thinned_recording import ThinnedRecording
 from runs import MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.delay import clocks
-from dvl_calib_ros.calibration.delay.hold_out import ThinnedRecording
 from dvl_calib_ros.calibration.models.parameters import Parameters
 
 

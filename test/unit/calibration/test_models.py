@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from dvl_calib_ros.calibration.assembly import Assembler
-from dvl_calib_ros.calibration.bank import groups_of
-from dvl_calib_ros.calibration.heave import HeaveRows, with_heave
-from dvl_calib_ros.calibration.height import HeightOfLate
+from dvl_calib_ros.calibration.filters.filter_bank import groups_of
+from dvl_calib_ros.calibration.filters.filter_setup import Assembler
+from dvl_calib_ros.calibration.filters.vertical_motion import HeaveRows, HeightOfLate, with_heave
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
 from dvl_calib_ros.calibration.models.base import Observations
 from dvl_calib_ros.calibration.models.parameters import Parameters

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.results.results.results import mounting_pose, rpy_std, scale_and_delay
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.mounting_pose import mounting_pose, rpy_std, scale_and_delay
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
 from dvl_calib_ros.calibration.numerics.frames import rpy_from_rotation
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState

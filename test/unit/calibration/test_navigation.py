@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.results.results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
 from dvl_calib_ros.calibration.streams.stream_order.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
-from dvl_calib_ros.calibration.delay.hold_out import NO_TERMS, Terms, ThinnedRecording
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.navigation import Navigation, dead_reckoned, in_words, objections
 from dvl_calib_ros.calibration.numerics.error_model import distort

@@ -13,13 +13,21 @@ from dvl_calib_ros.calibration.streams.stream_order.interpolation import ImuColu
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
-from dvl_calib_ros.calibration.register import registration
-from dvl_calib_ros.calibration.register.coarse import LONGEST_S, _minima, places
-from dvl_calib_ros.calibration.register.configuration import fitting_configuration
-from dvl_calib_ros.calibration.register.curves import Curves
-from dvl_calib_ros.calibration.register.fine import APART, DVL, LATE, REFERENCE, Claimed, Fitted, MotionFit, N
-from dvl_calib_ros.calibration.register.motion import MotionStreams, make_motion
-from dvl_calib_ros.calibration.register.registration import (
+from dvl_calib_ros.calibration.registration import registration
+from dvl_calib_ros.calibration.registration.configuration_check import fitting_configuration
+from dvl_calib_ros.calibration.registration.delay_search import LONGEST_S, _minima, places
+from dvl_calib_ros.calibration.registration.gauss_newton import (
+    APART,
+    DVL,
+    LATE,
+    REFERENCE,
+    Claimed,
+    Fitted,
+    MotionFit,
+    N,
+)
+from dvl_calib_ros.calibration.registration.motion_streams import Curves, MotionStreams, make_motion
+from dvl_calib_ros.calibration.registration.registration import (
     IN_TIME_STD_S,
     Clock,
     Registration,

@@ -10,10 +10,10 @@ from dvl_calib_ros.calibration.streams.stream_order.interpolation import ImuColu
 from test_register import ARM, run
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.register.fine import Claimed, Fitted
-from dvl_calib_ros.calibration.register.motion import make_motion
-from dvl_calib_ros.calibration.register.registration import Registration, register
-from dvl_calib_ros.calibration.register.steadiness import unsteady
+from dvl_calib_ros.calibration.registration.clock_drift_and_jumps import unsteady
+from dvl_calib_ros.calibration.registration.gauss_newton import Claimed, Fitted
+from dvl_calib_ros.calibration.registration.motion_streams import make_motion
+from dvl_calib_ros.calibration.registration.registration import Registration, register
 
 AT_S = 250.0
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from runs import MatchedRun, feed, feed_columns, make_samples
 
-from dvl_calib_ros.calibration import stream_clocks
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.workers import AtOnce
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
-from dvl_calib_ros.calibration.stream_clocks import MOST, _Spread
+from dvl_calib_ros.calibration.registration import clock_domains
+from dvl_calib_ros.calibration.registration.clock_domains import MOST, _Spread
 from dvl_calib_ros.verdict.kinds import Severity
 
 
@@ -47,7 +47,7 @@ def test_live_clocks_that_are_apart_are_named_as_by_a_replay(seconds, given):
 def test_live_clocks_are_compared_again_only_where_something_came(monkeypatch):
     """Diagnostics ask twice a second, also of a vehicle whose instruments are off."""
     asked = []
-    monkeypatch.setattr(stream_clocks, "median", lambda ahead: asked.append(len(ahead)) or float(np.median(ahead)))
+    monkeypatch.setattr(clock_domains, "median", lambda ahead: asked.append(len(ahead)) or float(np.median(ahead)))
     samples = make_samples(MatchedRun("straight", 60.0, imu_every=50))
     late = [
         each._replace(stamp_ns=each.stamp_ns + 18 * 10**9) if isinstance(each, ReferenceSample) else each

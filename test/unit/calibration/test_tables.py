@@ -6,12 +6,12 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.results.results.thinned_recording import KEPT_EVERY_S, ThinnedBlock
 from dvl_calib_ros.calibration.streams.stream_order.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.delay.clocks import MOST, MOST_OF_A_BLOCK, KeptClocks
 from dvl_calib_ros.calibration.delay.filter import DelayFilter
-from dvl_calib_ros.calibration.delay.hold_out import KEPT_EVERY_S, ThinnedBlock
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.numerics.tables import RowTable

@@ -6,11 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from dvl_calib_ros.calibration.results.results.held_out_verification import verify
 from filter_problems import random_problem
 from runs import ONE_HERTZ, MatchedRun, calibrate, make_samples
 from scipy.stats import chi2
 
-from dvl_calib_ros.calibration.folds import FOLDS, FoldInformation, Moments, folds_of
+from dvl_calib_ros.calibration.filters.cross_validation import (
+    FOLDS,
+    FoldInformation,
+    HeldOutError,
+    Moments,
+    folds_of,
+    held_out_error,
+)
+from dvl_calib_ros.calibration.filters.observability import Convergence
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.base import Observations
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -19,8 +28,6 @@ from dvl_calib_ros.calibration.numerics.error_model import correct, correction_j
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState, Measurements
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
-from dvl_calib_ros.calibration.observability import Convergence
-from dvl_calib_ros.calibration.verification import HeldOutError, held_out_error, verify
 from dvl_calib_ros.verdict.kinds import Severity
 
 GOOD = HeldOutError(samples=1000, uncorrected=0.10, corrected=0.05, predicted=0.05, calibration=0.002)

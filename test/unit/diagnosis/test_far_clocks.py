@@ -9,7 +9,7 @@ import pytest
 from conftest import ROOT
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.register.far import STEP_S, lag
+from dvl_calib_ros.calibration.registration.unregistrable_clocks import STEP_S, lag
 from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
-from dvl_calib_ros.calibration.register.far import lag
+from dvl_calib_ros.calibration.registration.unregistrable_clocks import lag
 from dvl_calib_ros.diagnosis import levels
 from dvl_calib_ros.diagnosis.claims import claims_of, exponents, followed
 from dvl_calib_ros.diagnosis.composed import Offsets, Problem, make_problem, no_effect

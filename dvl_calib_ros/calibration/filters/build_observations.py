@@ -1,0 +1,94 @@
+"""From aligned samples to what models see of them: rotations, lever arm, noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..models import Needs
+from ..models.base import Assumptions, Observations, Unmeasured
+from ..models.parameters import Parameters
+from ..numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion, skew
+from ..numerics.samples import FRAME_CODES, AlignedBlock, Codes, VelocityFrame
+
+_BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
+_BITS = np.array([1, 2, 4], dtype=np.uint8)
+
+
+class Observer:
+    """Makes `Observations`, with the constants that the parameters say."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._parameters = parameters
+        self._assumptions = Assumptions(*(getattr(parameters, name) for name in Assumptions._fields))
+        self._lever_arm = skew(parameters.lever_arm) if any(parameters.lever_arm) else None
+        self._aided_noise: Array = np.eye(3)[None] * parameters.gnss_aided_std**2
+        self._unaided_noise: Array = np.eye(3)[None] * parameters.gnss_free_std**2
+
+    def observe(self, block: AlignedBlock, needs: Needs, sway_heave: Array) -> Observations:
+        """What models with these needs see of rows that have them. sway_heave: (2,) m/s, prior of M5 and M6."""
+        lever = None
+        if self._lever_arm is not None:
+            lever = np.nan_to_num(block.attitude[:, 4:]) @ self._lever_arm  # ω×l; zero where ω is not known
+        rotation_dvl_from_body = self._parameters.rotation_dvl_from_body
+        common = (rotation_dvl_from_body, sway_heave)
+        interval = 1e-9 * block.interval_ns
+        if needs is not Needs.REFERENCE:
+            oriented = needs is Needs.ATTITUDE
+            return Observations(
+                block.velocity_dvl,
+                None,
+                lever,
+                *common,
+                self._unaided_noise,
+                rotation_from_quaternion(block.attitude[:, :4]) if oriented else None,
+                block.attitude[:, 4:] if oriented else None,
+                interval,
+                assumptions=self._assumptions,
+            )
+        rotation, earth = _reference_in_body(block)
+        reference = block.reference[:, :3]
+        unmeasured = None
+        if block.unmeasured.any():
+            axes = (block.unmeasured[:, None] & _BITS) != 0
+            turned = np.broadcast_to(np.eye(3), (len(block), 3, 3)) if rotation is None else rotation.swapaxes(1, 2)
+            unmeasured = Unmeasured(axes, turned)
+            expected = block.velocity_dvl @ rotation_dvl_from_body
+            expected = expected if lever is None else expected - lever
+            reference = np.where(axes, np.einsum("nij,nj->ni", turned, expected), reference)
+        return Observations(
+            block.velocity_dvl,
+            reference if rotation is None else np.einsum("nij,nj->ni", rotation, reference),
+            lever,
+            *common,
+            self._paired_noise(block, rotation),
+            interval=interval,
+            assumptions=self._assumptions,
+            unmeasured=unmeasured,
+            earth_in_body=earth,
+        )
+
+    def _paired_noise(self, block: AlignedBlock, rotation_body_from_reference: Array | None) -> Array:
+        """R of the aided models (N or 1, 3, 3): T R_gnss Tᵀ + R_dvl where the messages give them."""
+        reference = block.reference[:, 3:].reshape(-1, 3, 3)
+        given = ~np.isnan(reference[:, 0, 0])
+        if not self._parameters.use_message_covariance or not given.any():
+            return self._aided_noise
+        rotation = self._parameters.rotation_dvl_from_body
+        rotation = rotation if rotation_body_from_reference is None else rotation @ rotation_body_from_reference
+        own = np.where(np.isnan(block.covariance), self._unaided_noise, block.covariance)
+        noise: Array = rotation @ reference @ np.swapaxes(rotation, -1, -2) + own
+        return noise if given.all() else np.where(given[:, None, None], noise, self._aided_noise)
+
+
+def _reference_in_body(block: AlignedBlock) -> tuple[Array | None, Array | None]:
+    """Rotations (N, 3, 3) that take each reference velocity to the body frame, and `Observations.earth_in_body`;
+    None, None if all are in it."""
+    frames: Codes = block.frames
+    if not frames.any():
+        return None, None
+    # attitude is enu from body, so its transpose turns ENU into the body
+    attitude = np.where((frames == _BODY)[:, None], (0.0, 0.0, 0.0, 1.0), block.attitude[:, :4])
+    rotation = rotation_from_quaternion(attitude * (-1.0, -1.0, -1.0, 1.0))
+    earth = rotation[:, :, :2] * (frames != _BODY)[:, None, None]
+    is_ned = frames == _NED
+    return np.where(is_ned[:, None, None], rotation @ ENU_FROM_NED, rotation) if is_ned.any() else rotation, earth

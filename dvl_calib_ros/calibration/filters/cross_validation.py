@@ -1,0 +1,271 @@
+"""Cutting a run into folds, and what is kept of each to solve without it and to judge on it.
+
+A run is cut into blocks of `verification_block`, dealt out in turn to `FOLDS` folds: neighbouring blocks go to
+different ones, so all folds see every part of a run. With Φ = I the information that samples bring is a sum
+(kalman.py), so what a fold brought is kept as one matrix per model, and solving without it leaves that matrix out. No
+second pass, constant memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models import Model
+from ..models.base import Observations
+from ..models.parameters import Parameters
+from ..numerics.error_model import CORRECTION_JACOBIAN, correction_matrix
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState, Measurements
+from ..numerics.samples import Stamps
+
+FOLDS = 5
+
+
+def folds_of(stamps_ns: Stamps, parameters: Parameters) -> NDArray[np.int64]:
+    """Fold (N,) of each sample, by its stamp alone."""
+    return stamps_ns // round(parameters.verification_block * 1e9) % FOLDS
+
+
+class FoldSums:
+    """Sums over samples, of each fold by itself: arrays of some shapes, as Λ (K, n, n) and Λx (K, n)."""
+
+    def __init__(self, *shapes: tuple[int, ...]) -> None:
+        self._each = [np.zeros((FOLDS, *shape)) for shape in shapes]
+        self._total: tuple[Array, ...] | None = None
+
+    def copy(self) -> FoldSums:
+        """The same, which goes its own way."""
+        made = copy(self)
+        made._each = [sums.copy() for sums in self._each]
+        return made
+
+    def add(self, fold: int | slice, *more: Array | float) -> None:
+        """Add to one fold, or to several (F, ...)."""
+        self._total = None
+        for sums, own in zip(self._each, more, strict=True):
+            sums[fold] += own
+
+    def of(self, fold: int) -> tuple[Array, ...]:
+        """Those of one fold; not to be written to."""
+        return tuple(sums[fold] for sums in self._each)
+
+    @property
+    def total(self) -> tuple[Array, ...]:
+        """Over all folds; not to be written to."""
+        if self._total is None:
+            self._total = tuple(sums.sum(axis=0) for sums in self._each)
+        return self._total
+
+    def without(self, fold: int) -> tuple[Array, ...]:
+        """Over all folds but one."""
+        others = np.arange(FOLDS) != fold
+        return tuple(sums[others].sum(axis=0) for sums in self._each)
+
+    def taken(self, number: int) -> Array:
+        """Give the caller one kind of sums (FOLDS, ...), who has them from now on: here they are none."""
+        self._total = None
+        sums = self._each[number]
+        self._each[number] = np.zeros_like(sums)
+        return sums
+
+    def chosen(self, source: NDArray[np.intp]) -> None:
+        """Let each of K have its sums (FOLDS, K, ...) from others. source: (K,) from which of those there are."""
+        self._total = None
+        self._each = [each[:, source].copy() if each.ndim > 2 else each for each in self._each]
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._total = None
+        for sums in self._each:
+            sums[:] = 0.0
+
+
+class FoldInformation:
+    """What is known of K models, or hypotheses of one, had they not seen a fold: prior, and what each fold told.
+
+    The random walk is taken as none.
+    """
+
+    def __init__(self, start: GaussianState) -> None:
+        """start: x (K, n), P (K, n, n) of the filter."""
+        self.begin([start.information] * FOLDS)
+
+    def begin(self, known: Sequence[tuple[Array, Array]]) -> None:
+        """Go on from Λ (K, n, n) and Λx (K, n) that are known without each fold."""
+        self._begin = known
+        self._told = FoldSums(known[0][0].shape, known[0][1].shape)
+
+    def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
+        """Add N samples, as far as models used them (K, N)."""
+        h, z = data.whitened
+        rows = np.concatenate([h, z[:, None]], axis=1).transpose(2, 1, 0, 3)  # (K, n + 1, m, N)
+        weight = data.weight * used
+        for fold in set(folds.tolist()):
+            at = np.flatnonzero(folds == fold)
+            some = rows.take(at, axis=3)
+            weighted = some * weight[:, None, None, at]
+            flat = (*some.shape[:2], -1)
+            self.add_told(fold, weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2))
+
+    def narrow(self, kept: NDArray[np.intp]) -> None:
+        """Forget all of the K but some."""
+        self._told.chosen(kept)
+        self._begin = [(information[kept], vector[kept]) for information, vector in self._begin]
+
+    def add_told(self, fold: int | slice, told: Array) -> None:
+        """Add what rows (H, z) of one fold told (K, n+1, n+1), or of several (F, ...)."""
+        self._told.add(fold, told[..., :-1, :-1], told[..., :-1, -1])
+
+    def without(self, fold: int) -> tuple[Array, Array]:
+        """Λ (K, n, n) and Λx (K, n) had they not seen a fold."""
+        information, vector = (
+            more + known for more, known in zip(self._told.without(fold), self._begin[fold], strict=True)
+        )
+        return information, vector
+
+    def state(self, fold: int, index: int) -> GaussianState:
+        """The filter's x (n,) and P (n, n) of one of the K, had it not seen a fold."""
+        information, vector = (of_all[index] for of_all in self.without(fold))
+        p = np.linalg.inv(information)
+        return GaussianState(p @ vector, p)
+
+    def end_day(self, start: GaussianState, of_day: NDArray[np.intp]) -> None:
+        """Go on from what is known, but of the states of the day (u,) from `start`, x (K, n), P (K, n, n)."""
+        known = []
+        for fold in range(FOLDS):
+            states = zip(*(self.state(fold, index) for index in range(len(start.x))), strict=True)
+            known.append(with_states_of(GaussianState(*map(np.stack, states)), start, of_day).information)
+        self.begin(known)
+
+
+def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np.intp]) -> GaussianState:
+    """A state x (..., n), P (..., n, n) of which some (u,) are as in another of one shape with it: of another day."""
+    x, p = state.x.copy(), state.p.copy()
+    x[..., which] = other.x[..., which]
+    p[..., which, :] = 0.0
+    p[..., :, which] = 0.0
+    p[..., which[:, None], which] = other.p[..., which[:, None], which]
+    return GaussianState(x, p)
+
+
+class Moments(FoldSums):
+    """All that is kept of samples with a reference to judge any correction by.
+
+    For each fold the number of samples, and for each axis of the body, over the samples whose reference measures it,
+    the sums of v vᵀ (3, 3, 3) and g vᵀ (3, 3), and over the axes of g² and of the variance that R says; with v (3,) m/s
+    measured, DVL frame, at the reference point, and g m/s the reference velocity along the axis.
+    """
+
+    def __init__(self) -> None:
+        super().__init__((), (3, 3, 3), (3, 3), (), ())
+
+    def take(self, folds: NDArray[np.int64], seen: Observations) -> None:
+        """Add N samples."""
+        assert seen.reference_body is not None
+        v, g = seen.velocity_at_reference, seen.reference_body
+        measured = np.broadcast_to(seen.measured_in_body, v.shape)
+        rotation = seen.rotation_dvl_from_body
+        variance = np.broadcast_to(np.einsum("di,ndk,ki->ni", rotation, seen.noise, rotation), v.shape)
+        for fold in set(folds.tolist()):
+            at = folds == fold
+            own, known = v[at], measured[at]
+            along = known.T[:, :, None] * own  # (3, N, 3)
+            squares, noise = np.sum(g[at] ** 2 * known), np.sum(variance[at] * known)
+            self.add(
+                fold,
+                int(np.count_nonzero(at)),
+                along.swapaxes(1, 2) @ own,
+                (g[at].T[:, None] @ along)[:, 0],
+                squares,
+                noise,
+            )
+
+    def squared_error(self, fold: int, body_from_measured: Array) -> float:
+        """Sum over a fold of |g - C v|² (m/s)² along the measured axes, C (3, 3)."""
+        c = body_from_measured
+        _, vv, gv, gg, _ = self.of(fold)
+        return float(gg - 2.0 * np.sum(c * gv) + np.einsum("ai,aij,aj->", c, vv, c))
+
+
+# Fewer samples with a reference prove nothing.
+ENOUGH_SAMPLES = 20
+
+
+@dataclass(frozen=True)
+class HeldOutError:
+    """Velocity error against the reference on held-out samples, m/s rms over the vector.
+
+    uncorrected: with the nominal mounting. corrected: with the estimate. predicted: what R of the reference and the
+    covariance of the estimate lead one to expect of corrected. Each holds the noise of the reference. calibration: the
+    part of predicted that is the estimate's. interpolated: so much more of a white reference's noise corrected may hold
+    than in uncorrected: between its samples it is quieter than at them, and a delay changes where it is asked.
+    """
+
+    samples: int
+    uncorrected: float
+    corrected: float
+    predicted: float
+    calibration: float
+    interpolated: float = 0.0
+
+
+def held_out_error(
+    model: Model, without: Sequence[GaussianState], moments: Moments, rotation_dvl_from_body: Array
+) -> HeldOutError | None:
+    """Error of a model on every fold, with the state that has not seen it; None if there is too little to judge by.
+
+    without: one state for each fold.
+    """
+    samples = int(moments.total[0])
+    if samples < ENOUGH_SAMPLES or max(moments.of(fold)[0] for fold in range(FOLDS)) == samples:
+        return None
+    nominal = rotation_dvl_from_body.T
+    uncorrected = corrected = noise = calibration = 0.0
+    for fold, state in enumerate(without):
+        errors = model.error_terms_from_state @ state.x
+        covariance = model.error_terms_from_state @ state.p @ model.error_terms_from_state.T
+        uncorrected += moments.squared_error(fold, nominal)
+        corrected += moments.squared_error(fold, correction_matrix(errors[:3], errors[3:], rotation_dvl_from_body))
+        _, vv, _, _, own_noise = moments.of(fold)
+        noise += float(own_noise)
+        calibration += _calibration_variance(covariance, vv, nominal)
+    return held_out_from_sums(samples, (uncorrected, corrected, noise + calibration, calibration))
+
+
+def calibration_error(
+    model: Model, covariance: Array, judged: tuple[float, Array], rotation_dvl_from_body: Array
+) -> float:
+    """Velocity error, m/s rms, that a covariance (n, n) of a model's state makes on the samples judged; 0 for none.
+
+    judged: the first two of the sums of `Moments`.
+    """
+    samples, vv = judged
+    of_errors = model.error_terms_from_state @ covariance @ model.error_terms_from_state.T
+    total = _calibration_variance(of_errors, vv, rotation_dvl_from_body.T)
+    return math.sqrt(max(total, 0.0) / float(samples)) if samples else 0.0
+
+
+def held_out_from_sums(samples: int, sums: Sequence[float] | Array) -> HeldOutError | None:
+    """From sums of squares (m/s)² in the order of `HeldOutError`'s fields; None if there is too little to judge by."""
+    if samples < ENOUGH_SAMPLES:
+        return None
+    return HeldOutError(samples, *(math.sqrt(max(float(total), 0.0) / samples) for total in sums))
+
+
+def _calibration_variance(covariance: Array, vv: Array, rotation_body_from_dvl: Array) -> float:
+    """Sum of trace(J P Jᵀ) (m/s)² over samples of which only Σ v vᵀ is known: J is linear in v.
+
+    vv: (3, 3, 3) Σ v vᵀ of the samples that are judged along each axis of the body.
+    """
+    in_body = np.einsum("ij,kaj->kai", rotation_body_from_dvl, _JACOBIAN_BY_ERROR)
+    return float(np.einsum("kai,lbi,ab,ikl->", in_body, in_body, covariance, vv))
+
+
+# d(velocity)/d(error a) for a velocity along k, axis i: [k, a, i]
+_JACOBIAN_BY_ERROR: Array = CORRECTION_JACOBIAN.reshape(3, 3, 6).swapaxes(1, 2)

@@ -1,0 +1,185 @@
+"""Between models and the Kalman filter: what it starts from, what its rows are, and what its states mean."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..models import Model
+from ..models.base import Observations, Unmeasured
+from ..models.parameters import Parameters
+from ..numerics import kalman
+from ..numerics.chi_square import chi2_cdf, chi2_isf
+from ..numerics.error_model import PriorOnErrors, of_unseen_roll, to_correction, to_errors
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from ..numerics.samples import Mask
+
+
+class Assembler:
+    """Between the Kalman filter and K models that differ in z and H only: they are of one size, with one noise.
+
+    start: what the filter starts from, x (K, n), P (K, n, n): the prior, or `initial` for the models named there
+    (shapes as the models' states). prior: that, of all (of states of the day the same in the filter). process_rate: Q
+    per second (K, n, n): a random walk of misalignment and scale, not of nuisance states; None for none.
+    """
+
+    def __init__(
+        self, models: Sequence[Model], parameters: Parameters, initial: Mapping[str, GaussianState] | None = None
+    ) -> None:
+        self.models = tuple(models)
+        first = self.models[0]
+        self._n, self._m, self._model_noise = first.n_state, first.n_measurement, first.noise
+        self._motion_is_noise = first.motion_is_noise
+        priors = [prior(model, parameters) for model in self.models]
+        self.prior = GaussianState(np.array([each.x for each in priors]), np.array([each.p for each in priors]))
+        begun = initial or {}
+        self._starts = [begun.get(model.name) or known for model, known in zip(self.models, priors, strict=True)]
+        self._floors = [_floor(model, parameters) for model in self.models]
+        self._roll = of_unseen_roll(parameters.rotation_dvl_from_body)
+        held = [
+            to_correction(state, self._roll) if model.in_correction_parameters else _without(floor, state)
+            for model, floor, state in zip(self.models, self._floors, self._starts, strict=True)
+        ]
+        self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
+        self._prior_on_errors = {
+            index: PriorOnErrors(held[index], self._starts[index], self._roll)
+            for index, model in enumerate(self.models)
+            if model.in_correction_parameters
+        }
+        # by how many of its rows are left where axes of the reference are not measured
+        self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m + 1)])
+        self._gate = np.full((len(self.models), 1), self._gates[0])
+        self._needs_prior = np.array([model.needs_prior for model in self.models])
+        rate = np.zeros(self.start.p.shape)
+        for index, model in enumerate(self.models):
+            std = [parameters.process_std_misalignment] * 3 + [parameters.process_std_scale] * (model.n_errors - 3)
+            rate[index, : model.n_errors, : model.n_errors] = np.diag(np.square(std))
+        self.process_rate = rate if rate.any() else None
+
+    def start_of(self, index: int) -> GaussianState:
+        """State and covariance that one model starts from."""
+        return self._starts[index]
+
+    def state(self, index: int, x: Array, p: Array) -> GaussianState:
+        """One model's state and covariance out of the filter's x (..., n) and P (..., n, n)."""
+        held = GaussianState(x.copy(), p.copy())
+        if not self.models[index].in_correction_parameters:
+            floor = self._floors[index]
+            return held if floor is None else GaussianState(held.x, held.p + floor)
+        if self.process_rate is not None:  # what the prior still weighs is then not known
+            return to_errors(held, self._roll)
+        return self._prior_on_errors[index].to_errors(held)
+
+    def measurements(self, seen: Observations, weight: Array, prior_known: Mask) -> kalman.Measurements:
+        """A block of N samples. weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool, whether prior sway and
+        heave were known at the sample; models that need them skip it where not."""
+        k, n_samples = len(self.models), len(seen.velocity_dvl)
+        # in memory each element's samples follow each other, as the batch works on them
+        z = np.empty((self._m, k, n_samples)).transpose(1, 2, 0)
+        h = np.zeros((self._m, self._n, k, n_samples)).transpose(2, 3, 0, 1)
+        for index, model in enumerate(self.models):
+            # a model that extends another has columns for what that has; the rest is not shown sample by sample
+            z[index], own = model.linearise(seen)
+            h[index, :, :, : own.shape[2]] = own
+        usable = ~self._needs_prior[:, None] | prior_known
+        noise = (seen.noise if self._model_noise is None else self._model_noise(seen))[None, :, : self._m, : self._m]
+        own_weight = (seen.motion_weight if self._motion_is_noise else weight)[None]
+        if seen.unmeasured is None:
+            return kalman.Measurements(z, h, noise, own_weight, usable, self._gate)
+        noise, gate = self._drop_unmeasured(z, h, noise, seen, seen.unmeasured)
+        return kalman.Measurements(z, h, noise, own_weight, usable, gate)
+
+    def heave_rows(self, seen: Observations) -> Array:
+        """(H, z) (N, K, n+1) of models that have `Model.heave`."""
+        rows = np.zeros((len(seen.velocity_dvl), len(self.models), self._n + 1))
+        for index, model in enumerate(self.models):
+            assert model.heave is not None
+            own = model.heave(seen)  # as in `measurements`
+            rows[:, index, : own.shape[1] - 1], rows[:, index, -1] = own[:, :-1], own[:, -1]
+        return rows
+
+    def rows_left(self, unmeasured: Unmeasured) -> Array:
+        """Rows that each model is told by each sample (K, N)."""
+        dropped = [_dropped_axes(model, unmeasured).sum(axis=1) for model in self.models]
+        return self._m - np.array(dropped, dtype=float)
+
+    def _drop_unmeasured(
+        self, z: Array, h: Array, noise: Array, seen: Observations, unmeasured: Unmeasured
+    ) -> tuple[Array, Array]:
+        """R (K, N, 3, 3) and gate (K, N), with z and H turned into the reference's frame, unmeasured rows taken out."""
+        k, n_samples = z.shape[:2]
+        noise = np.broadcast_to(noise, (k, n_samples, 3, 3)).copy()
+        gate = np.repeat(self._gate, n_samples, axis=1)
+        for index, model in enumerate(self.models):
+            axes = _dropped_axes(model, unmeasured)
+            at = np.flatnonzero(axes.any(axis=1))
+            if not len(at):
+                continue
+            turned = unmeasured.rotation_reference_from_body[at]
+            if not model.rows_in_body:
+                turned = turned @ seen.rotation_dvl_from_body.T
+            kept = ~axes[at]
+            z[index, at] = np.einsum("nij,nj->ni", turned, z[index, at]) * kept
+            h[index, at] = turned @ h[index, at] * kept[:, :, None]
+            r = turned @ noise[index, at] @ turned.swapaxes(1, 2) * (kept[:, :, None] & kept[:, None, :])
+            noise[index, at] = r + np.eye(3) * axes[at, None, :]
+            gate[index, at] = self._gates[axes[at].sum(axis=1)]
+        return noise, gate
+
+
+def _floor(model: Model, parameters: Parameters) -> Array | None:
+    """Covariance (n, n) that no data take away: of `Model.sideslip_std`, about the body's z; None for none."""
+    if not model.sideslip_std:
+        return None
+    along = np.zeros(model.n_state)
+    along[:3] = parameters.rotation_dvl_from_body[:, 2]
+    return np.outer(along, along) * model.sideslip_std**2
+
+
+def _without(floor: Array | None, state: GaussianState) -> GaussianState:
+    """What a filter starts from: what its data can never take away is added to what comes out of it."""
+    if floor is None:
+        return state
+    p = state.p - floor
+    # a state that is not of this model may claim to be better
+    return GaussianState(state.x, p) if np.linalg.eigvalsh(p)[0] > 0.0 else state
+
+
+def _dropped_axes(model: Model, unmeasured: Unmeasured) -> Mask:
+    """(N, 3) axes of the reference's frame that a model would need, and that are not measured."""
+    needed = (model.aided, model.aided, model.vertical_from_reference)
+    dropped: Mask = unmeasured.axes & needed
+    return dropped
+
+
+def prior(model: Model, parameters: Parameters) -> GaussianState:
+    """Zero errors with the prior standard deviations of the parameters."""
+    std = [parameters.initial_std_misalignment] * 3 + [parameters.initial_std_scale] * (model.n_errors - 3)
+    std += [getattr(parameters, each.std) if isinstance(each.std, str) else each.std for each in model.nuisance]
+    return GaussianState(np.zeros(model.n_state), np.diag(np.square(std)))
+
+
+def gate_of(rows: float, parameters: Parameters) -> float:
+    """Largest νᵀS⁻¹ν of so many rows that is used: the chi-square quantile, inf for no gate."""
+    gated = 1.0 - parameters.gate_probability
+    return chi2_isf(gated, rows) if 0.0 < gated < 1.0 else float("inf")  # after rounding
+
+
+def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float = 0.99) -> tuple[float, float]:
+    """Two-sided bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter. rows: of a sample, on average.
+
+    Gated samples are not in the mean, so it is that of a chi-square variable cut off at the gate:
+    E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal. Zero where references
+    measured no axis.
+    """
+    if rows <= 0.0:
+        return 0.0, 0.0
+    m, gate = rows, gate_of(rows, parameters)
+    inside = chi2_cdf(gate, m)
+    mean = m * chi2_cdf(gate, m + 2) / inside
+    variance = m * (m + 2) * chi2_cdf(gate, m + 4) / inside - mean**2
+    half = math.sqrt(chi2_isf(1.0 - confidence, 1.0) * variance / max(used, 1))  # as many σ as a normal one's
+    return mean - half, mean + half

@@ -1,0 +1,215 @@
+"""What is registered: the three streams as columns, each by stamps of its own, in s since a common epoch.
+
+Velocity and slope of the DVL, and turn rates, at any time: smoothed once, for all places of the clocks.
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..models.parameters import Parameters
+from ..numerics.frames import ENU_FROM_NED, Array
+from ..numerics.robust import median
+from ..numerics.samples import FRAME_CODES, Index, Mask, SampleBlock, Streams, VelocityFrame
+from ..streams.clock_correction import Clocks
+from ..streams.imu_frame import ImuAlignment
+from ..streams.interpolation import (
+    LEAST_SLOPE_REACH_S,
+    MOST_REACH_S,
+    REACH_INTERVALS,
+    DvlColumns,
+    ImuColumns,
+    TurnRates,
+    angular_velocity_at,
+    binned,
+    local_fit,
+    reach_at,
+    spacing_at,
+)
+from ..streams.outliers import without_spikes
+from ..streams.position_velocities import are_positions, of_moments
+from ..streams.screening import measured_axes, screen_columns, unit_quaternions
+
+
+@dataclass(frozen=True)
+class MotionStreams:
+    """Streams of one vehicle. Stamps that go back are left out.
+
+    dvl: velocity in the DVL's frame. reference_times (M,) s, reference (M, 3) m/s: in the earth (ENU) if in_earth, else
+    in the body. measured: (3,) which of its axes are measured. imu: attitudes; without any none is known. turns: rates.
+    epoch_ns: stamp of time 0, but for what was taken off.
+    """
+
+    dvl: DvlColumns
+    reference_times: Array
+    reference: Array
+    in_earth: bool
+    measured: tuple[bool, bool, bool]
+    imu: ImuColumns
+    turns: TurnRates
+    epoch_ns: int = 0
+
+    @cached_property
+    def has_attitude(self) -> bool:
+        """Whether there are attitudes to interpolate between."""
+        return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
+
+    def part(self, at: Index, margin_s: float) -> MotionStreams:
+        """Some of the references, one after the other, and of the others what is so near to them."""
+        times = self.reference_times[at]
+        near = (self.dvl.times >= times[0] - margin_s) & (self.dvl.times <= times[-1] + margin_s)
+        dvl = DvlColumns(self.dvl.times[near], self.dvl.velocity[near])
+        first, end = np.searchsorted(self.imu.times, (times[0] - margin_s, times[-1] + margin_s)).tolist()
+        imu = ImuColumns(*(column[first:end] for column in self.imu))
+        return replace(self, reference_times=times, reference=self.reference[at], dvl=dvl, imu=imu)
+
+    def in_the_body(self) -> MotionStreams:
+        """The same as if the reference were in the body."""
+        return replace(self, in_earth=False)
+
+
+def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
+    """What samples say, each stream's clock corrected as the parameters have it; None where two have too little."""
+    dvl, reference = (_valid(block, parameters) for block in (streams.dvl, streams.reference))
+    imu = ImuAlignment(parameters).block(streams.imu.part(streams.imu.refused == 0))
+    if len(dvl) < 2 or len(reference) < 2:
+        return None
+    clocks = Clocks.of(parameters)
+    first_ns = int(dvl.stamps_ns[0])
+    code = int(np.bincount(reference.frames).argmax())
+    reference = reference.part(reference.frames == code)
+    times = 1e-9 * (clocks.dvl(dvl.stamps_ns, first_ns) - first_ns)
+    dvl_times, velocity = in_order(times, dvl.values)
+    reference_times, seen = in_order(1e-9 * (reference.stamps_ns - clocks.reference_ns - first_ns), reference.values)
+    if are_positions(parameters):
+        seen = of_moments(reference_times, seen, parameters.position_window)
+    imu_times, numbers = in_order(
+        1e-9 * (imu.stamps_ns - clocks.imu_ns - first_ns),
+        np.hstack([unit_quaternions(imu.orientation), imu.angular_velocity]),
+    )
+    if code == FRAME_CODES[VelocityFrame.NED]:
+        seen = seen @ ENU_FROM_NED.T
+    measured = measured_axes(reference.values, screen_columns(reference.covariances).unmeasured, parameters.gnss_axes)
+    if code == FRAME_CODES[VelocityFrame.NED]:
+        measured = measured[1], measured[0], measured[2]
+    made = make_motion(
+        (dvl_times, velocity),
+        (reference_times, seen),
+        code != FRAME_CODES[VelocityFrame.BODY],
+        measured,
+        # what is taken from columns of wider rows costs a copy of all of them each time
+        ImuColumns(imu_times, *map(np.ascontiguousarray, np.split(numbers, [4], axis=1))),
+    )
+    return None if made is None else replace(made, epoch_ns=first_ns)
+
+
+def make_motion(
+    dvl: tuple[Array, Array],
+    reference: tuple[Array, Array],
+    in_earth: bool,
+    measured: tuple[bool, bool, bool],
+    imu: ImuColumns,
+) -> MotionStreams | None:
+    """A motion without the spikes of its velocities; None where too little is left. Times increase.
+
+    dvl, reference: times (N,) s and velocities (N, 3) m/s.
+    """
+    times, velocity = _cleaned(*dvl)
+    reference_times, seen = _cleaned(*reference)
+    if min(len(times), len(reference_times)) < 2:
+        return None
+    return MotionStreams(DvlColumns(times, velocity), reference_times, seen, in_earth, measured, imu, TurnRates.of(imu))
+
+
+def _cleaned(times: Array, velocity: Array) -> tuple[Array, Array]:
+    """Without spikes, and no faster than needed."""
+    finite = np.isfinite(velocity).all(axis=1)
+    times, velocity = times[finite], velocity[finite]
+    good = without_spikes(velocity, smallest=0.1, also_at_ends=True)
+    times, velocity = binned(times[good], velocity[good])
+    return times, velocity
+
+
+def in_order(times: Array, values: Array) -> tuple[Array, Array]:
+    """Without samples (N, k) whose times (N,) go back."""
+    later = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0
+    return times[later], values[later]
+
+
+def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
+    speed = np.sqrt((block.values[:, :3] ** 2).sum(axis=1))
+    return block.part((block.refused == 0) & (speed <= parameters.max_speed) & (speed > 0.0))
+
+
+# Curves are smoothed on a grid of this step, s, and of a long recording of so many times; of so many at once.
+GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
+# Attitudes and rates further apart than this tell nothing between, s.
+GAP_S = 2.0
+
+
+# A left-handed driver's axes.
+MIRRORED: Array = np.array([1.0, -1.0, 1.0])
+
+
+class Curves:
+    """Velocity and slope of the DVL, and turn rates, on a fine grid of time, each smoothed once for all places."""
+
+    def __init__(self, motion: MotionStreams) -> None:
+        """Of all streams of a motion."""
+        times = motion.dvl.times
+        length = float(times[-1] - times[0])
+        self._step, self._start = max(GRID_S, length / MOST_GRID), float(times[0])
+        self._grid = self._start + self._step * np.arange(int(length / self._step) + 2)
+        typical = float(median(np.diff(times)))
+        reach = reach_at(spacing_at(times, self._grid), LEAST_SLOPE_REACH_S, MOST_REACH_S)
+        reach = np.clip(reach, LEAST_SLOPE_REACH_S, None)
+        reach[np.isnan(reach)] = max(LEAST_SLOPE_REACH_S, min(REACH_INTERVALS * typical, MOST_REACH_S))
+        fits = [local_fit(times, motion.dvl.velocity, self._grid[at], reach[at]) for at in _parts(len(self._grid))]
+        self._velocity = np.concatenate([np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]]) for fit in fits])
+        self._found = np.concatenate([fit.found for fit in fits])
+        self._turns, self._turns_start = np.zeros((2, 3)), 0.0
+        if len(motion.turns.times) > 1:
+            grid = np.arange(motion.turns.times[0], motion.turns.times[-1] + self._step, self._step)
+            self._turns_start = float(grid[0])
+            rates = [angular_velocity_at(motion.turns, grid[at], GAP_S)[0] for at in _parts(len(grid))]
+            self._turns = np.nan_to_num(np.concatenate(rates))
+
+    def mirrored(self) -> Curves:
+        """The same of a DVL whose y points the other way."""
+        made = copy(self)
+        made._velocity = self._velocity * MIRRORED[[0, 1, 2, 0, 1, 2, 0]]
+        return made
+
+    def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
+        """At times (J,) s: velocity (J, 3), slope (J, 3), noise gain of the slope (J,), and whether there is one."""
+        before, share, inside = self._places(at, self._start, len(self._grid))
+        both = _between(self._velocity, before, share)
+        return both[:, :3], both[:, 3:6], both[:, 6], inside & self._found[before] & self._found[before + 1]
+
+    def rates(self, at: Array) -> Array:
+        """(J, 3) rad/s, zero where they are not known."""
+        before, share, inside = self._places(at, self._turns_start, len(self._turns))
+        return np.where(inside[:, None], _between(self._turns, before, share), 0.0)
+
+    def _places(self, at: Array, start: float, n: int) -> tuple[Index, Array, Mask]:
+        place = (at - start) / self._step
+        before = np.clip(place, 0, n - 2).astype(np.intp)
+        return before, (place - before)[:, None], (place >= 0.0) & (place <= n - 1)
+
+
+def _parts(n: int) -> list[slice]:
+    """N places in parts: windows about all of them at once would take more memory than a node should."""
+    return [slice(first, first + AT_ONCE) for first in range(0, n, AT_ONCE)]
+
+
+def _between(values: Array, before: Index, share: Array) -> Array:
+    left = values.take(before, axis=0)
+    found: Array = values.take(before + 1, axis=0)
+    found -= left
+    found *= share
+    found += left
+    return found

@@ -1,0 +1,166 @@
+"""Clocks so far apart that nothing can be compared: found by correlation over the whole run, and refused.
+
+Clocks up to `LONGEST_S` apart are registered. Beyond that a registration would settle in the best of its wrong places,
+and what it finds there would be believed.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...verdict.reasons import Reason, finding
+from ..numerics.frames import Array
+from ..numerics.robust import median
+from ..streams.interpolation import attitude_at
+from .delay_search import HOLE_S, LONGEST_S
+from .motion_streams import MotionStreams
+
+# A delay beyond what is registered is believed if it leaves no more than this share of the squares that the best of the
+# others leaves: repeated legs are alike to a half, an effect is no reason for two series to agree elsewhere
+BELIEVED = 0.25
+# Time step of the series, s; and the share of the shorter one that must overlap, and so many seconds of it
+STEP_S, OVERLAP, FEWEST_S = 0.5, 0.4, 60.0
+# Steps of the running median that takes spikes out of a speed
+SPIKE_STEPS = 9
+# Slower, a course says nothing of the heading
+MOVING_MPS = 0.2
+Series = NDArray[Any]  # of complex numbers
+
+
+class Far(NamedTuple):
+    """whose: of the clock that is off. others: beside which. late: by about so many s, more than is registered."""
+
+    whose: str
+    others: str
+    late: float
+
+    @property
+    def reason(self) -> Reason:
+        """What is said of it."""
+        way = "later" if self.late > 0.0 else "earlier"
+        return finding(
+            "CLOCK_FAR", whose=self.whose, seconds=abs(self.late), way=way, others=self.others, limit=LONGEST_S
+        )
+
+
+def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Far | None:
+    """Which stamps are too far from the others to be registered; None if that is not beyond doubt.
+
+    rotation_dvl_from_body: (3, 3), the nominal mounting.
+    """
+    dvl_times, velocity = motion.dvl
+    body = velocity @ rotation_dvl_from_body
+    reference_times, reference = motion.reference_times, motion.reference
+    own, others = _steps(dvl_times), _steps(reference_times)
+    known, is_own = (covered(t, at).astype(float) for t, at in ((reference_times, others), (dvl_times, own)))
+    late, is_far = lag(
+        _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0], known, is_own
+    )
+    if is_far:
+        return Far("the DVL's", "the reference's", late)
+    if not motion.in_earth or not motion.has_attitude:
+        return None
+    at = np.arange(max(dvl_times[0] - late, reference_times[0]), min(dvl_times[-1] - late, reference_times[-1]), STEP_S)
+    if not len(at):
+        return None
+    course: Series = (velocity_at(reference_times, reference, at)[:, :2] @ [1.0, 1j]) * np.conj(
+        velocity_at(dvl_times, body, at + late)[:, :2] @ [1.0, 1j]
+    )
+    turned = _steps(motion.imu.times)
+    rotation, _ = attitude_at(motion.imu, turned, HOLE_S)
+    ahead: Series = rotation[:, :2, 0] @ [1.0, 1j]
+    moving = ((np.abs(course) > MOVING_MPS**2) & covered(reference_times, at)).astype(float)
+    late, is_far = lag(_unit(ahead), motion.imu.times[0], _unit(course), at[0], moving)
+    return Far("the IMU's", "those of DVL and reference", late) if is_far else None
+
+
+def _unit(series: Series) -> Series:
+    found: Series = series / np.maximum(np.abs(series), 1e-9)
+    return found
+
+
+def _steps(times: Array) -> Array:
+    return np.arange(times[0], times[-1], STEP_S)
+
+
+def covered(times: Array, at: Array) -> NDArray[np.bool_]:
+    """Whether (M,) is within samples that are near each other: across an outage a velocity is anything."""
+    after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
+    is_near = times[after] - times[after - 1] <= max(HOLE_S, 3.0 * float(median(np.diff(times))))
+    return np.asarray(is_near & (at >= times[0]) & (at <= times[-1]))
+
+
+def velocity_at(times: Array, values: Array, at: Array) -> Array:
+    """(M, 3) of a stream of (N, 3) at times (M,), on straight lines."""
+    return np.column_stack([np.interp(at, times, column) for column in values.T])
+
+
+def _speed(times: Array, velocity: Array) -> Series:
+    """(N,) horizontal speed, m/s, every STEP_S from the first sample on."""
+    values = velocity_at(times, velocity, _steps(times))
+    around = np.pad(np.hypot(values[:, 0], values[:, 1]), SPIKE_STEPS // 2)
+    windows = np.lib.stride_tricks.sliding_window_view(around, SPIKE_STEPS)
+    return np.asarray(median(windows.T), dtype=complex)
+
+
+def lag(
+    one: Series,
+    one_start: float,
+    other: Series,
+    other_start: float,
+    weight: Array | None = None,
+    own: Array | None = None,
+) -> tuple[float, bool]:
+    """By how many s a series is later than another, and whether that is surely more than LONGEST_S.
+
+    That of all lags at which the squares of the difference are least; far ones only if they are so clearly.
+
+    Parameters
+    ----------
+    one, other: (N,), (M,), every STEP_S.
+    one_start, other_start: Times of their first samples, s.
+    weight, own: (M,) of samples of the other, (N,) of the one; by default all alike.
+
+    """
+    n, m = len(one), len(other)
+    weight = np.ones(m) if weight is None else weight
+    own = np.ones(n) if own is None else own
+    size = n + m
+
+    def correlated(a: Series | Array, b: Series | Array) -> Array:
+        """Σ Re(a(i + lag) conj(b(i))) for lags -(m - 1) .. n - 1."""
+        sums = np.real(np.fft.ifft(np.fft.fft(a, size) * np.conj(np.fft.fft(b, size))))
+        return np.concatenate([sums[size - (m - 1) :], sums[:n]])
+
+    def means(weight: Array) -> Array:
+        """Mean square of the difference at each lag, infinite where too little overlaps."""
+        count = correlated(own, weight)
+        squares = correlated(own * np.abs(one) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
+        squares -= 2.0 * correlated(own * one, weight * other)
+        enough = count >= max(OVERLAP * min(float(n), float(weight.sum())), FEWEST_S / STEP_S)
+        return np.where(enough, np.maximum(squares, 0.0) / np.maximum(count, 1.0), np.inf)
+
+    mean = means(weight)
+    late = one_start - other_start + STEP_S * np.arange(-(m - 1), n)
+    near = np.abs(late) <= LONGEST_S + STEP_S
+    best = int(np.argmin(mean))
+    nearest = float(mean[near].min()) if near.any() else np.inf
+    if not near[best] and mean[best] < BELIEVED * nearest:
+        # on the same samples as well: a stretch that is noisy may be out of the far one's overlap
+        index = np.arange(m) + best - (m - 1)
+        overlap = np.where((index >= 0) & (index < n), weight, 0.0)
+        nearest = min(nearest, float(means(overlap)[near].min(initial=np.inf)))
+        # motion that repeats agrees at far lags as well, by chance better than at the near ones on this grid; but then
+        # it agrees there, too, to what one step of the grid makes
+        both = weight[1:] * weight[:-1]
+        of_a_step = float((both * np.abs(np.diff(other)) ** 2).sum() / max(both.sum(), 1.0))
+        if mean[best] < BELIEVED * nearest and nearest > of_a_step:
+            # legs that repeat agree at more than one lag
+            as_good = np.where(mean <= 1.5 * mean[best], np.abs(late), np.inf)
+            return float(late[int(np.argmin(as_good))]), True
+    if not np.isfinite(mean[near].min(initial=np.inf)):
+        return 0.0, False
+    return float(late[near][np.argmin(mean[near])]), False

@@ -1,0 +1,207 @@
+"""Hold-out verification: a calibration is judged on samples that it did not use.
+
+For each fold of a run (folds.py) the models are solved again without it, and their correction is tried on it against
+the reference velocity, so that every sample with a reference is judged once, by an estimate that has not seen it. Two
+things are those of the whole run: which samples the gate lets pass, and the random walk, which is taken as none.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ...verdict.kinds import Severity
+from ...verdict.reasons import Reason, by_severity, finding
+from ..filters.cross_validation import HeldOutError
+from ..filters.observability import OBSERVED_SHARE, Convergence, body_angle_std
+from ..models import Model
+from ..models.parameters import Parameters
+from ..numerics.chi_square import chi2_isf
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from .results import Verification
+
+# A squared error that grows by more than so many times the estimate's variance is no chance (99 % of chi-square with
+# three degrees of freedom and more).
+WORSE_FROM = 4.0
+# A held-out error of so many times what is predicted is no noise that was claimed a little too small.
+SEVERAL = 3.0
+# One below this share of what the instruments claim is less than their noise: they then share it.
+IMPLAUSIBLE = 0.2
+# If more than this share of the samples is gated, the estimate is that of a minority.
+MOST_GATED = 0.5
+# An error of so many σ is one, however little the data show of it.
+SURELY = 3.0
+# Without outliers an error is as predicted up to so many times; one of so many times that without is made by them.
+AS_PREDICTED, MADE_BY_OUTLIERS = 1.25, 1.5
+# Share of runs whose held-out error may by chance exceed what a true covariance predicts.
+CHANCE = 0.01
+
+
+def verify(
+    model: Model,
+    state: GaussianState,
+    convergence: Convergence,
+    held_out: HeldOutError | None,
+    parameters: Parameters,
+    used_and_gated: tuple[int, int] | None = None,
+    suggestion: Reason | None = None,
+    reference_claims: bool = True,
+    lever_arm_turns: Reason | None = None,
+    finds_lever_arm: bool = False,
+    typical_error: float | None = None,
+    own_error: float = 0.0,
+) -> Verification:
+    """Judge an estimate of all the data by its size, by what it used, and by what it did on held-out samples.
+
+    Parameters
+    ----------
+    model: Whose estimate it is.
+    state: Its state, x (n,) and P (n, n).
+    convergence: How far it is.
+    held_out: What it did on samples that it had not seen; None for too few.
+    parameters: The thresholds.
+    used_and_gated: How many samples it used, and threw out; None where that is not known.
+    suggestion: What configuration would fit, if the one given does not.
+    reference_claims: Whether the reference's messages claim the noise that is predicted; a parameter proves nothing.
+    lever_arm_turns: How much of an angle is the lever arm's, if the motion does not tell them apart.
+    finds_lever_arm: Whether it is in σ of the angles, and not taken as known.
+    typical_error: Velocity error without outliers, m/s rms, where that on held-out samples is large.
+    own_error: Velocity error that its σ by blocks of time leads one to expect, m/s rms, as of `calibration_error`.
+
+    """
+    reasons = by_severity(
+        [
+            # the cause before what it makes of the samples
+            *([finding("CONFIGURATION_WRONG", says=suggestion).weighed(Severity.REJECT)] if suggestion else []),
+            *use_findings(used_and_gated),
+            *_lever_arm_findings(lever_arm_turns, finds_lever_arm, parameters),
+            *_size_findings(model, state, parameters),
+            *_convergence_findings(convergence),
+            _error_finding(held_out, parameters, reference_claims, typical_error, own_error),
+        ]
+    )
+    inspect = _to_inspect(model, state, parameters)
+    return Verification(model.name, held_out, reasons[0].severity, tuple(reasons), inspect)
+
+
+def use_findings(used_and_gated: tuple[int, int] | None) -> list[Reason]:
+    """What it says of an estimate how many samples it used, and threw out."""
+    if used_and_gated is None:
+        return []
+    used, gated = used_and_gated
+    if not used:
+        return [finding("NO_SAMPLE_USED")]
+    if gated > MOST_GATED * (used + gated):
+        return [finding("MOST_SAMPLES_GATED", gated=gated, given=used + gated, used=used)]
+    return []
+
+
+def _lever_arm_findings(turns: Reason | None, is_found: bool, parameters: Parameters) -> list[Reason]:
+    if turns is None:
+        return []
+    if is_found:
+        return [finding("LEVER_ARM_NOT_SHOWN", turns=turns)]
+    return [finding("LEVER_ARM_TURNS_ANGLE", std=parameters.initial_std_lever_arm, turns=turns)]
+
+
+def shown_misalignment(model: Model, state: GaussianState, parameters: Parameters) -> Array:
+    """By what the DVL is turned (3,) about the body's axes, as φ is; 0 about those that the data do not show."""
+    t = parameters.rotation_dvl_from_body
+    about = t.T @ (model.error_terms_from_state @ state.x)[:3]
+    std = body_angle_std(state.p, parameters)
+    shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > SURELY * std)
+    return np.where(shown, about, 0.0)
+
+
+def _angle_deg(model: Model, state: GaussianState, parameters: Parameters) -> float:
+    """How far the DVL is turned, degrees, about the body's axes that are known: what is not shown proves nothing."""
+    return math.degrees(math.atan(float(np.linalg.norm(shown_misalignment(model, state, parameters)))))
+
+
+def _to_inspect(model: Model, state: GaussianState, parameters: Parameters) -> Reason | None:
+    angle, from_deg = _angle_deg(model, state, parameters), math.degrees(parameters.accept_misalignment)
+    return None if angle < from_deg else finding("MOUNTING_FAR", degrees=angle, limit=from_deg)
+
+
+def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -> list[Reason]:
+    errors = model.error_terms_from_state @ state.x
+    angle, reject = _angle_deg(model, state, parameters), math.degrees(parameters.reject_misalignment)
+    findings = []
+    if angle >= reject:
+        findings.append(finding("MISALIGNMENT_LARGE", degrees=angle, limit=reject))
+    variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
+    std = np.sqrt(variance)
+    known = (variance > 0.0) & (
+        (std <= OBSERVED_SHARE * parameters.initial_std_scale) | (np.abs(errors[3:]) > SURELY * std)
+    )
+    scale = float(np.abs(errors[3:][known]).max(initial=0.0))
+    if scale > parameters.max_scale_error:
+        findings.append(finding("SCALE_LARGE", percent=100.0 * scale, limit=100.0 * parameters.max_scale_error))
+    return findings
+
+
+def _error_finding(
+    held_out: HeldOutError | None,
+    parameters: Parameters,
+    reference_claims: bool,
+    typical_error: float | None,
+    own_error: float,
+) -> Reason:
+    if held_out is None:
+        return finding("HELD_OUT_TOO_FEW")
+    uncorrected, corrected, predicted = held_out.uncorrected, held_out.corrected, held_out.predicted
+    said: dict[str, float] = {
+        "samples": held_out.samples,
+        "uncorrected": uncorrected,
+        "corrected": corrected,
+        "predicted": predicted,
+    }
+    # where there is nothing to correct, correcting adds the estimate's own variance, give or take; where noise lasts
+    # that is more than the filter says, and being worse is no contradiction
+    worse = corrected**2 - uncorrected**2
+    is_large = corrected > SEVERAL * predicted
+    is_worse = worse - held_out.interpolated**2 > WORSE_FROM * max(held_out.calibration, own_error) ** 2
+    if typical_error is not None and (is_large or is_worse):
+        # nor do they say which is the worse
+        as_usual = typical_error < (SEVERAL if is_large else AS_PREDICTED) * predicted
+        if as_usual and corrected > MADE_BY_OUTLIERS * typical_error:
+            return finding("HELD_OUT_OUTLIERS", **said, typical=typical_error)
+    if is_worse:
+        return finding("HELD_OUT_WORSE", **said)
+    if is_large:
+        return finding("HELD_OUT_SEVERAL_TIMES", **said)
+    if reference_claims and corrected < IMPLAUSIBLE * predicted:
+        return finding("HELD_OUT_IMPLAUSIBLE", **said)
+    if worse > WORSE_FROM * held_out.calibration**2:
+        return finding("HELD_OUT_NO_BETTER", **said)
+    dof = 3 * held_out.samples
+    by_chance = math.sqrt(chi2_isf(CHANCE, dof) / dof)
+    if corrected > predicted * parameters.max_error_ratio * by_chance:
+        return finding("HELD_OUT_NOISIER", **said)
+    return finding("HELD_OUT", **said)
+
+
+def _convergence_findings(convergence: Convergence) -> list[Reason]:
+    return [finding("NO_ANGLE_SHOWN")] if convergence is Convergence.COLLECTING else []
+
+
+def verification_document(verification: Verification) -> dict[str, Any]:
+    """Plain data, for JSON and YAML."""
+    held_out = verification.held_out
+    return {
+        "verdict": verification.verdict.value,
+        "reasons": [each.sentence for each in verification.reasons],
+        "findings": [each.as_dict() for each in verification.reasons],
+        "mounting": verification.mounting.sentence if verification.mounting is not None else "",
+        "held_out": None
+        if held_out is None
+        else {
+            "samples": held_out.samples,
+            "uncorrected_mps": held_out.uncorrected,
+            "corrected_mps": held_out.corrected,
+            "predicted_mps": held_out.predicted,
+        },
+    }

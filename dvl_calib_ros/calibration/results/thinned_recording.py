@@ -1,0 +1,250 @@
+"""G2 verified: the velocity error on samples that an estimate has not seen, with its lever arm and delay."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..filters.cross_validation import HeldOutError, folds_of, held_out_from_sums
+from ..models.own import DELAY, LEVER_ARM
+from ..models.parameters import Parameters
+from ..numerics.error_model import CORRECTION_JACOBIAN, correction_matrix
+from ..numerics.frames import Array, cross, skew
+from ..numerics.kalman import GaussianState
+from ..numerics.robust import median, steps
+from ..numerics.samples import Index, Mask, Stamps
+from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns, attitude_at
+
+# What is kept comes no faster than this, s: a velocity error is judged as well by five a second.
+KEPT_EVERY_S = 0.19
+# An error of so many times the usual one is that of an outlier.
+OUTLYING = 5.0
+# An axis that the reference does not measure says nothing: (m/s)²
+NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
+
+
+class ThinnedBlock(NamedTuple):
+    """Thinned columns of one block, for verification; times in s since the epoch of `DelayFilter`."""
+
+    dvl: DvlColumns
+    noise_dvl: Array
+    reference: ReferenceColumns
+    imu: ImuColumns
+
+    @staticmethod
+    def between(
+        from_s: float, to_s: float, dvl: DvlColumns, noise_dvl: Array, reference: ReferenceColumns, imu: ImuColumns
+    ) -> ThinnedBlock:
+        """A block's own columns, thinned. noise_dvl: (3, 3) (m/s)²."""
+        first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
+        at = first + _thinned_seconds(dvl.times[first:last])
+        own = DvlColumns(dvl.times[at], dvl.velocity[at].copy())
+        first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
+        at = first + _thinned_seconds(imu.times[first:last])
+        # a sample of a fast stream is noisier than what the vehicle turns by until the next one that is kept
+        reach = 0.5 * KEPT_EVERY_S
+        first, last = np.searchsorted(imu.times, (from_s - 2.0 * reach, to_s + 2.0 * reach)).tolist()
+        rates = _mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[at], reach)
+        turning = ImuColumns(imu.times[at], imu.orientation[at], rates)
+        # what is a part of larger arrays would keep these
+        return ThinnedBlock(own, noise_dvl, reference._replace(velocity=reference.velocity.copy()), turning)
+
+
+def held_out_error(
+    recording: ThinnedRecording,
+    stamps_ns: Stamps,
+    days: Index,
+    without_folds: Sequence[Sequence[GaussianState]],
+    p: Parameters,
+) -> HeldOutError | None:
+    """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by.
+
+    stamps_ns, days: (N,) of the DVL's samples. without_folds: for every fold the state of every day.
+
+    As the other models are judged, but with the DVL's samples where the state says that they were: at their stamp
+    less its delay, and the lever arm away from the reference point.
+    """
+    folds = folds_of(stamps_ns, p)
+    nominal = np.zeros(len(without_folds[0][0].x))
+    sums = np.zeros(5)
+    samples = 0
+    for fold, states in enumerate(without_folds):
+        for day, state in enumerate(states):
+            at = np.flatnonzero((folds == fold) & (days == day))
+            before = recording.errors(at, nominal, p)
+            after = recording.errors(at, state.x, p)
+            both = ~(np.isnan(before.error[:, 0]) | np.isnan(after.error[:, 0]))
+            jacobian = after.jacobian[both]
+            calibration = np.einsum("nij,jk,nik->", jacobian, state.p, jacobian)
+            noise = after.noise[both].sum()
+            squares = [(each.error[both] ** 2).sum() for each in (before, after)]
+            interpolated = (after.interpolated - before.interpolated)[both].sum()
+            sums += [*squares, noise + calibration, calibration, interpolated]
+            samples += int(np.count_nonzero(both))
+    return held_out_from_sums(samples, sums)
+
+
+def typical_error(recording: ThinnedRecording, terms: Terms, p: Parameters) -> float | None:
+    """Velocity error with these terms, m/s rms, without outliers; None where nothing can be compared."""
+    return without_outliers(recording.compared(np.arange(len(recording.dvl.times)), terms, p).error)
+
+
+def without_outliers(error: Array) -> float | None:
+    """Errors (N, 3) m/s rms without outliers; None where all are nan."""
+    square = (error[np.isfinite(error[:, 0])] ** 2).sum(axis=1)
+    if not len(square):
+        return None
+    good = square[square <= OUTLYING**2 * median(square)]
+    return math.sqrt(float(good.mean()))
+
+
+class _Errors(NamedTuple):
+    """Of N DVL samples: reference less what the DVL says it is (N, 3) m/s, nan where there is none; its derivative by
+    the state (N, 3, n); the variance that noise gives it (N,), summed over the axes; and what interpolating leaves of
+    the reference's if that is white (N,)."""
+
+    error: Array
+    jacobian: Array
+    noise: Array
+    interpolated: Array
+
+
+class Terms(NamedTuple):
+    """What is to be corrected, beyond what the parameters say: errors (6,) φ rad and δk, lever_arm (3,) m, delay s."""
+
+    errors: Array
+    lever_arm: Array
+    time_offset: float
+
+    @staticmethod
+    def of_state(state: Array) -> Terms:
+        """Of G2's states (n,)."""
+        return Terms(np.array([*state[:5], 0.0]), state[LEVER_ARM], float(state[DELAY]))
+
+
+NO_TERMS = Terms(np.zeros(6), np.zeros(3), 0.0)
+
+
+class Compared(NamedTuple):
+    """N DVL samples beside the reference.
+
+    error (N, 3): reference less what the DVL says it is, body, m/s; nan where there is none, 0 along what the reference
+    does not measure. measured (N, 3, 3): onto what it does measure, body. body (N, 3): the reference velocity.
+    rotation_enu_from_body (N, 3, 3), oriented (N,): whether that is known. variance (N,): of the reference, over the
+    axes that it measures; interpolated (N,): what is left of that between two samples if their noise is white;
+    claimed (N,): its message says so, and the DVL's is to be added. acceleration (N, 3): of the
+    reference, body. rates (N, 3): rad/s.
+    """
+
+    error: Array
+    measured: Array
+    body: Array
+    rotation_enu_from_body: Array
+    oriented: Mask
+    variance: Array
+    interpolated: Array
+    claimed: Mask
+    acceleration: Array
+    rates: Array
+
+
+class ThinnedRecording(NamedTuple):
+    """All that was kept, times in s since an epoch."""
+
+    dvl: DvlColumns
+    noise_dvl: Array
+    reference: ReferenceColumns
+    imu: ImuColumns
+
+    @staticmethod
+    def of(kept: Sequence[ThinnedBlock]) -> ThinnedRecording:
+        """Blocks one after the other."""
+        dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
+        noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
+        reference = zip(*(each.reference for each in kept), strict=True)
+        imu = zip(*(each.imu for each in kept), strict=True)
+        return ThinnedRecording(
+            dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
+        )
+
+    def errors(self, at: Index, state: Array, p: Parameters) -> _Errors:
+        """Errors of some DVL samples with a state (n,), interpolated as pairing does."""
+        n, v = len(at), self.dvl.velocity[at]
+        seen = self.compared(at, Terms.of_state(state), p)
+        t = p.rotation_dvl_from_body
+        jacobian = np.zeros((n, 3, len(state)))
+        jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
+        jacobian[:, :, LEVER_ARM] = skew(seen.rates)
+        jacobian[:, :, DELAY] = -seen.acceleration
+        share = np.where(seen.claimed, np.trace(seen.measured, axis1=1, axis2=2) / 3.0, 0.0)
+        noise = seen.variance + self.noise_dvl[at] * share
+        return _Errors(seen.error, seen.measured @ jacobian, noise, seen.interpolated)
+
+    def judged(self, p: Parameters) -> tuple[float, Array]:
+        """The first two of the sums of `Moments` over all that can be compared."""
+        seen = self.compared(np.arange(len(self.dvl.times)), NO_TERMS, p)
+        use = np.isfinite(seen.error[:, 0])
+        v, along = self.dvl.velocity[use], np.diagonal(seen.measured[use], axis1=1, axis2=2) > 0.5
+        return float(np.count_nonzero(use)), np.einsum("nk,ni,nj->kij", along, v, v)
+
+    def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
+        """Some DVL samples beside the reference, corrected, interpolated as pairing does."""
+        times, v = self.dvl.times[at] - terms.time_offset, self.dvl.velocity[at]
+        stamps = self.reference.times
+        after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+        gap = stamps[after] - stamps[after - 1]
+        part = ((times - stamps[after - 1]) / gap)[:, None]
+        g0, g1 = self.reference.velocity[after - 1], self.reference.velocity[after]
+        in_body = self.reference.in_body[after]
+        rotation, oriented = attitude_at(self.imu, times, p.imu_timeout)
+        body_from_reference = np.where(in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
+        body = np.matmul(body_from_reference, (g0 + (g1 - g0) * part)[..., None])[..., 0]
+        rates = np.zeros_like(v)
+        if len(self.imu.times):
+            rates = np.column_stack([np.interp(times, self.imu.times, c) for c in self.imu.angular_velocity.T])
+        lever = np.array(p.lever_arm) + terms.lever_arm
+        matrix = correction_matrix(terms.errors[:3], terms.errors[3:], p.rotation_dvl_from_body)
+        error = body + (cross(rates, lever) if lever.any() else 0.0) - v @ matrix.T
+        found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
+        found &= (v**2).sum(axis=1) >= p.min_speed**2
+        # axes are left out in the reference's own frame: tilted by 2°, a vertical that is not measured would still
+        # reach the horizontal of the body
+        variance = np.diagonal(self.reference.noise, axis1=1, axis2=2)
+        axes = (np.maximum(variance[after], variance[after - 1]) < MEASURED_BELOW).astype(float)
+        measured = (body_from_reference * axes[:, None]) @ body_from_reference.swapaxes(1, 2)
+        error = np.matmul(measured, error[..., None])[..., 0]
+        error[~found] = np.nan
+        acceleration = np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
+        total = (variance[after] * axes).sum(axis=1)
+        blended = (((1.0 - part) ** 2 * variance[after - 1] + part**2 * variance[after]) * axes).sum(axis=1)
+        claimed = self.reference.claimed[after]
+        return Compared(error, measured, body, rotation, oriented, total, blended, claimed, acceleration, rates)
+
+
+def thinned(stamps_ns: Stamps) -> Index:
+    """Those of increasing stamps that are at least KEPT_EVERY_S apart."""
+    return _thinned_seconds((stamps_ns - stamps_ns[0]) * 1e-9 if len(stamps_ns) else np.zeros(0))
+
+
+def _thinned_seconds(times: Array) -> Index:
+    if len(times) < 2 or steps(times).min() >= KEPT_EVERY_S:
+        return np.arange(len(times))
+    bins = np.floor(times / KEPT_EVERY_S)
+    return np.append(0, np.flatnonzero(steps(bins)) + 1)
+
+
+def _mean_around(times: Array, values: Array, at: Array, reach: float) -> Array:
+    """Means (M, c) of the finite values (N, c) within reach (s) of each time (M,) s; nan where there is none."""
+    first, end = times.searchsorted(at - reach), times.searchsorted(at + reach, side="right")
+    sums, finite = np.zeros((len(times) + 1, values.shape[1])), np.isfinite(values)
+    if finite.all():
+        np.cumsum(values, axis=0, out=sums[1:])
+        number = (end - first)[:, None]
+    else:
+        np.cumsum(np.where(finite, values, 0.0), axis=0, out=sums[1:])
+        counts = np.pad(np.cumsum(finite, axis=0), ((1, 0), (0, 0)))
+        number = counts[end] - counts[first]
+    return np.where(number > 0, (sums[end] - sums[first]) / np.maximum(number, 1), np.nan)
