@@ -19,7 +19,7 @@ from dvl_calib_ros.bag_replay.replay import Replayed, replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.workers import AtOnce
+from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from dvl_calib_ros.files.result_file import result_document, result_text

@@ -15,9 +15,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator
 
 from dvl_calib_ros.bag_replay.replay import Replayed, replay
+from dvl_calib_ros.calibration.assessment.dead_reckoning import Drift, Navigation
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.navigation import Drift, Navigation
 from dvl_calib_ros.calibration.numerics.frames import rotation_of
 from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.followed import Followed

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.calibration.checks.speed_of_sound import speed_of_sound
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
-from dvl_calib_ros.calibration.water import speed_of_sound
 from dvl_calib_ros.messages.encode import SampleWriter, WaterReading
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

@@ -10,8 +10,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.calibration.displacement.legs import DeadReckoning, Fixes
-from dvl_calib_ros.calibration.displacement.solve import DisplacementFit, solve
+from dvl_calib_ros.calibration.estimators.displacement_least_squares import DeadReckoning, DisplacementFit, Fixes, solve
 from dvl_calib_ros.calibration.filters.filter_setup import prior
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters

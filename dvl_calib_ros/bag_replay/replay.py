@@ -15,14 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.advice import data_advice, gate_advice, message_advice, reference_advice
+from ..calibration.assessment.dead_reckoning import Navigation, navigation_document, objections
+from ..calibration.assessment.manoeuvre_planner import drift_left_open
+from ..calibration.assessment.objections import doubts
 from ..calibration.calibrator import Calibrator
+from ..calibration.checks.data_warnings import data_advice, gate_advice, message_advice, reference_advice
+from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_document
 from ..calibration.comparison.mounting_change import Comparison
 from ..calibration.comparison.mounting_change_reasons import comparison_document
-from ..calibration.doubts import doubts
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
-from ..calibration.navigation import Navigation, navigation_document, objections
 from ..calibration.numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.numerics.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
 from ..calibration.results.extrinsics import Extrinsics, dvl_in_words, extrinsics_of
@@ -30,8 +32,6 @@ from ..calibration.results.held_out_verification import verification_document
 from ..calibration.results.results import Day, Result
 from ..calibration.streams.screening import are_valid_velocities, unit_quaternions
 from ..calibration.streams.stream_order import SHORTEST_PAUSE_NS
-from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_document
-from ..calibration.worth import drift_left_open
 from ..errors import InputError
 from ..files.result_file import days_document, estimate_document, load_initial_calibration
 from ..messages.decode import MessageDecoder

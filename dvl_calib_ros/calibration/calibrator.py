@@ -20,20 +20,19 @@ import numpy as np
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
-from .delay.workers import Worker
-from .estimates import Estimates
-from .estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
+from .assessment.dead_reckoning import Navigation
+from .assessment.manoeuvre_planner import RecentMotion
+from .assessment.model_selection import Selection
+from .assessor import Estimates, FurtherEstimators, Judge
+from .estimators.estimator import Estimator, EstimatorSetup, LinearEstimator, Worker, kind_of
 from .filters.build_observations import Observer
 from .filters.filter_bank import Group, groups_of
 from .filters.heading_diversity import EVERY_NS, Headings
 from .filters.state_history import Counts, Numbers, StateTrace
-from .further import FurtherEstimators
-from .judging import Judge
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
 from .models.base import Observations
 from .models.parameter_spec import ParameterError
 from .models.parameters import IAC, Parameters
-from .navigation import Navigation
 from .numerics.frames import Array, Vector, rotation_from_quaternion
 from .numerics.kalman import GaussianState
 from .numerics.samples import (
@@ -54,10 +53,8 @@ from .registration.clock_domains import StreamClocks
 from .registration.registration import Registration
 from .results.results import Day, Estimate, Result, Verification
 from .results.thinned_recording import Terms, ThinnedRecording
-from .selection import Selection
 from .streams.aligner import Aligner, counted
 from .streams.position_velocities import are_positions, check_model
-from .worth import RecentMotion
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64

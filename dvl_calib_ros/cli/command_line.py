@@ -1,4 +1,4 @@
-"""The command line of ``dvl-calib``: its parser, and what becomes of errors, signals, closed streams and changed files."""
+"""The command line of ``dvl-calib``: its parser, errors, signals, closed streams and changed files."""
 
 from __future__ import annotations
 

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from ..bag_replay.replay import replay
+from ..calibration.assessment.dead_reckoning import Navigation, dead_reckoned, navigation_document
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.build_observations import Observer
 from ..calibration.models import MODELS, Needs
 from ..calibration.models.parameters import Parameters
-from ..calibration.navigation import Navigation, dead_reckoned, navigation_document
 from ..calibration.numerics.error_model import correction_matrix
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import AlignedBlock

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from ..calibration.assessment.model_selection import eligible
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.observability import OBSERVED_SHARE, scale_std_ahead
 from ..calibration.models import MODELS
@@ -13,7 +14,6 @@ from ..calibration.numerics.samples import Stream
 from ..calibration.registration.registration import Registration
 from ..calibration.results.mounting_quantities import Quantity, quantities
 from ..calibration.results.results import Estimate, rpy_std
-from ..calibration.selection import eligible
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
 from ..recordings.topics import Topics

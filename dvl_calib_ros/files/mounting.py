@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..calibration.filters.observability import Convergence, observability
 from ..calibration.models import MODELS, Model
 from ..calibration.models.parameter_spec import ParameterError
@@ -33,7 +34,6 @@ from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of
 from ..calibration.results.results import position_in_body, scale_and_delay
 from ..calibration.results.velocity_correction import lever_arm
-from ..calibration.water import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from ..version import __version__

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from ..calibration.checks.speed_of_sound import Water, water_document
 from ..calibration.filters.cross_validation import with_states_of
 from ..calibration.filters.filter_setup import prior
 from ..calibration.filters.observability import Convergence
@@ -33,7 +34,6 @@ from ..calibration.numerics.frames import (
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.held_out_verification import verification_document
 from ..calibration.results.results import Estimate, Result, mounting_pose, position_in_body, scale_and_delay
-from ..calibration.water import Water, water_document
 from ..disk.atomic import own_stream, save_bytes
 from ..disk.yaml_files import load_yaml
 from ..errors import InputError, printable

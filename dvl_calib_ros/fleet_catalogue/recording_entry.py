@@ -15,11 +15,11 @@ import numpy as np
 
 from ..bag_replay.checked_replay import checked_replay
 from ..bag_replay.replay import Replayed, extrinsics_of_replay
+from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models.parameters import Parameters
 from ..calibration.results.extrinsics import Extrinsics
 from ..calibration.results.mounting_quantities import quantities
 from ..calibration.results.results import Estimate, Result
-from ..calibration.water import Water
 from ..discovery.discover import Given, discover
 from ..errors import InputError
 from ..recordings.recording import open_recording

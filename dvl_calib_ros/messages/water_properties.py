@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..calibration.checks.speed_of_sound import SALINITIES, TEMPERATURES, THERMOMETER, Water
 from ..calibration.numerics.frames import Array
-from ..calibration.water import SALINITIES, TEMPERATURES, THERMOMETER, Water
 
 _FLOATS = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
 _PHASED_ARRAY = 1

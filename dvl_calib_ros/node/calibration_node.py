@@ -27,6 +27,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from ..calibration.calibrator import Calibrator
+from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models import MODELS, Model
 from ..calibration.models.parameter_spec import ParameterError
 from ..calibration.models.parameters import SCHEMA, Parameters
@@ -36,7 +37,6 @@ from ..calibration.numerics.samples import DvlSample, VelocityFrame
 from ..calibration.results.results import mounting_pose
 from ..calibration.results.velocity_correction import NOT_ESTIMATED, Correction, lever_arm, twist_terms
 from ..calibration.streams.position_velocities import check_model
-from ..calibration.water import Water
 from ..discovery.gravity import believed_heading
 from ..discovery.transforms import Frames, not_default, placement
 from ..disk.atomic import check_writable

@@ -9,21 +9,21 @@ from typing import NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-from ..calibration.advice import (
+from ..calibration.calibrator import Calibrator
+from ..calibration.checks.data_warnings import (
     consistency_advice,
     data_advice,
     gate_advice,
     message_advice,
     reference_advice,
 )
-from ..calibration.calibrator import Calibrator
+from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
 from ..calibration.registration.clock_domains import apart
 from ..calibration.results.results import Estimate, scale_and_delay
-from ..calibration.water import CauseOfScale, Water, cause_of_scale
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding

@@ -11,12 +11,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ..calibration.calibrator import Calibrator
-from ..calibration.models import MODELS
-from ..calibration.numerics.frames import rpy_from_rotation
-from ..calibration.numerics.kalman import GaussianState
-from ..calibration.results.results import Estimate, rpy_std, scale_and_delay
-from ..calibration.worth import (
+from ..calibration.assessment.manoeuvre_planner import (
     KM,
     Outlook,
     PredictedDrift,
@@ -26,6 +21,11 @@ from ..calibration.worth import (
     outlook,
     predicted_drift,
 )
+from ..calibration.calibrator import Calibrator
+from ..calibration.models import MODELS
+from ..calibration.numerics.frames import rpy_from_rotation
+from ..calibration.numerics.kalman import GaussianState
+from ..calibration.results.results import Estimate, rpy_std, scale_and_delay
 from ..verdict.reasons import Reason, finding
 
 # What to drive next is thought of anew so often, s: it takes a few milliseconds.

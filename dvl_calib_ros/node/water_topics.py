@@ -13,7 +13,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
-from ..calibration.water import Water
+from ..calibration.checks.speed_of_sound import Water
 from ..errors import InputError
 from ..messages.water_properties import WaterCollector, readers, water_of
 from .message_queue import take

@@ -19,7 +19,7 @@ from ..verdict.reasons import Reason
 if TYPE_CHECKING:
     import pandas
 
-    from ..calibration.navigation import Navigation
+    from ..calibration.assessment.dead_reckoning import Navigation
     from .figure_style import Picture
 
 

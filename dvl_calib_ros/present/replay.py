@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from ..bag_replay.replay import Replayed
+from ..calibration.assessment.dead_reckoning import in_words, metres
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
-from ..calibration.navigation import in_words, metres
 from ..calibration.numerics.frames import FLU_FROM_FRD, rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.results.mounting_quantities import not_shown, quantities

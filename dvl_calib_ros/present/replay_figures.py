@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
+from ..calibration.assessment.dead_reckoning import Navigation
 from ..calibration.models.parameters import Parameters
-from ..calibration.navigation import Navigation
 from ..calibration.numerics.frames import Array, rotation_from_rpy, rotation_of, turn_between
 from ..calibration.results.results import Result
 from .figure_data import MapTrack

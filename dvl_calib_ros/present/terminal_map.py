@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..calibration.navigation import Navigation
+from ..calibration.assessment.dead_reckoning import Navigation
 
 if TYPE_CHECKING:
     from rich.text import Text

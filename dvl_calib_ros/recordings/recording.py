@@ -19,10 +19,10 @@ import numpy as np
 
 from ..bags.columns import windows
 from ..bags.reader import BagReader
+from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.samples import Stamps, Stream, Streams, no_samples
 from ..calibration.registration.registration import Registration
-from ..calibration.water import Water
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.type_recognition import open_bags

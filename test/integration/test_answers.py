@@ -14,8 +14,8 @@ from io_fixtures import run, write_bag
 from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion, true_mounting
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.calibration.assessment.dead_reckoning import Drift, Navigation, objections
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.navigation import Drift, Navigation, objections
 from dvl_calib_ros.calibration.numerics.frames import rpy_from_rotation
 from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.discovery.discover import discover

@@ -64,7 +64,7 @@ def test_auto_takes_legs_of_noisy_positions_and_verifies_them_on_legs_not_seen(u
 @pytest.mark.slow
 def test_a_wrong_calibration_of_positions_is_not_verified(usbl, monkeypatch):
     """Folds that say something else: what is judged is what dead reckoning makes of legs not seen."""
-    from dvl_calib_ros.calibration.displacement import filter as of_positions
+    from dvl_calib_ros.calibration.estimators import displacement_estimator as of_positions
 
     solve = of_positions.solve
 

@@ -18,7 +18,7 @@ from log_fixtures import nortek, pd0
 from water_fixtures import SALINITY, TEMPERATURE, USED, dive, with_water
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.calibration.water import speed_of_sound
+from dvl_calib_ros.calibration.checks.speed_of_sound import speed_of_sound
 from dvl_calib_ros.files.mounting import load_calibrated_mounting
 from dvl_calib_ros.instruments.settings import instrument_settings
 from dvl_calib_ros.messages.water_properties import OfWater, water_of

@@ -10,7 +10,7 @@ import numpy as np
 from dvl_calib_ros.calibration.results.results.thinned_recording import ThinnedRecording
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.workers import AtOnce
+from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.filters.cross_validation import FOLDS, folds_of
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import Streams

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Comparison of calibrations of one DVL."""

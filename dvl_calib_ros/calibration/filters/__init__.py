@@ -1,1 +1,1 @@
-"""TODO."""
+"""The bank of published models: filter set-up, covariance, observability, cross-validation."""

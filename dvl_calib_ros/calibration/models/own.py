@@ -250,7 +250,7 @@ G2 = Model(
     rows_in_body=True,
     in_correction_parameters=True,
     extends="G1",
-    estimator="dvl_calib_ros.calibration.delay.filter:DelayFilter",
+    estimator="dvl_calib_ros.calibration.estimators.block_estimator:DelayFilter",
 )  # fmt: skip
 
 
@@ -276,7 +276,7 @@ D1 = Model(
     wrong_when="the positions' frame is turned or scaled: a map off true north, a USBL with a wrong sound speed",
     scale_axes=(("delta_k", (0, 1, 2)),),
     from_positions=True,
-    estimator="dvl_calib_ros.calibration.displacement.filter:Displacements",
+    estimator="dvl_calib_ros.calibration.estimators.displacement_estimator:Displacements",
 )  # fmt: skip
 
 

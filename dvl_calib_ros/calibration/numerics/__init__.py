@@ -1,1 +1,1 @@
-"""TODO."""
+"""Frames, statistics, the Kalman filter and the sample types."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Results of a calibration, and their verification on held-out data."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""Order, pairing and interpolation of the three streams."""

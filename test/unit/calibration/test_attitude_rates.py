@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.attitude_rates import CONVENTIONS, AttitudeRates
+from dvl_calib_ros.calibration.checks.imu_rate_consistency import CONVENTIONS, AttitudeRates
 from dvl_calib_ros.calibration.numerics.frames import (
     ENU_FROM_NED,
     quaternion_from_rotation,

@@ -12,8 +12,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from runs import ONE_HERTZ, SECOND, START_NS, STRETCH, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
-from dvl_calib_ros.calibration.advice import data_advice
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.checks.data_warnings import data_advice
 from dvl_calib_ros.calibration.filters import filter_bank
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
 from dvl_calib_ros.calibration.models.parameter_spec import ParameterError

@@ -16,9 +16,9 @@ from dvl_calib_ros.calibration.streams.stream_order.interpolation import local_f
 from runs import START_NS, calibrate, feed, feed_columns, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay import contradicted
-from dvl_calib_ros.calibration.delay import solver as delay_solver
-from dvl_calib_ros.calibration.delay.workers import AtOnce
+from dvl_calib_ros.calibration.estimators import block_preprocessing
+from dvl_calib_ros.calibration.estimators import block_solver as delay_solver
+from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.own import BEYOND
 from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
@@ -470,8 +470,8 @@ def test_what_a_vehicle_does_between_two_samples_of_a_slow_dvl_is_not_left_out(m
     looked_at, left_out = [], []
 
     def watched(dvl, *others):
-        kept, rows = contradicted.without_contradicted(dvl, *others)
-        looked_at.extend(contradicted._suspicious(dvl.velocity))
+        kept, rows = block_preprocessing.without_contradicted(dvl, *others)
+        looked_at.extend(block_preprocessing._suspicious(dvl.velocity))
         left_out.extend(np.flatnonzero(~kept))
         return kept, rows
 

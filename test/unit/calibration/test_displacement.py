@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.displacement.legs import DeadReckoning
+from dvl_calib_ros.calibration.estimators.displacement_least_squares import DeadReckoning
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import skew
 from validation.positions import NOISES, Driven, Noise, Truth, drawn, driven, errors_of, fitted

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.dvl_stream import DvlStream
+from dvl_calib_ros.calibration.checks.dvl_self_consistency import DvlStream
 
 
 def measured(rng, seconds=300.0, hz=5.0, noise=0.01, wave=0.1, speed=1.5):

@@ -9,7 +9,7 @@ import pytest
 from conftest import few
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.heading_deviation import FIRST, heading_advice, heading_deviation, how_bad
+from dvl_calib_ros.calibration.checks.heading_deviation import FIRST, heading_advice, heading_deviation, how_bad
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState

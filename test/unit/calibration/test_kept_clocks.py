@@ -7,20 +7,20 @@ import pytest
 from dvl_calib_ros.calibration.results.results.thinned_recording import ThinnedRecording
 from runs import MatchedRun, calibrate, make_samples
 
-from dvl_calib_ros.calibration.delay import clocks
+from dvl_calib_ros.calibration.estimators import registration_schedule
 from dvl_calib_ros.calibration.models.parameters import Parameters
 
 
 @pytest.fixture(scope="module")
 def kept():
     """Blocks of a run of five minutes."""
-    run = MatchedRun("free", 300.0, gnss_std=0.05, dvl_std=0.01, frame=clocks.FRAMES[1])
+    run = MatchedRun("free", 300.0, gnss_std=0.05, dvl_std=0.01, frame=registration_schedule.FRAMES[1])
     calibrator = calibrate(make_samples(run), verified=True, models=("G2",))
     return calibrator._estimators["G2"]._idle_solver().kept
 
 
 def test_all_that_blocks_are_registered_and_judged_by_is_kept(kept):
-    seen = clocks._Registered()
+    seen = registration_schedule._Registered()
     for each in kept:
         seen.add(each)
     motion = seen.motion()
@@ -36,8 +36,8 @@ def test_all_that_blocks_are_registered_and_judged_by_is_kept(kept):
 
 
 def test_of_more_blocks_the_newest_are_kept_and_room_does_not_grow(kept, monkeypatch):
-    monkeypatch.setattr(clocks, "MOST", 5)
-    seen = clocks._Registered()
+    monkeypatch.setattr(registration_schedule, "MOST", 5)
+    seen = registration_schedule._Registered()
     seen.take_room()
     for each in [*kept, *kept]:
         seen.add(each)

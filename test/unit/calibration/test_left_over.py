@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.left_over import left_over, left_over_advice, std_along
+from dvl_calib_ros.calibration.checks.residual_tests import left_over, left_over_advice, std_along
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy

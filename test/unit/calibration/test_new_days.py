@@ -11,7 +11,7 @@ from runs import START_NS, calibrate, feed_columns, shifted
 from test_delay import LEVER_ARM, NOISE, PHI, late
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.rows import OF_DAY
+from dvl_calib_ros.calibration.estimators.observation_rows import OF_DAY
 from dvl_calib_ros.calibration.filters.cross_validation import with_states_of
 from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks

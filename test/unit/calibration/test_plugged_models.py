@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dvl_calib_ros.calibration.estimator import kind_of
+from dvl_calib_ros.calibration.estimators.estimator import kind_of
 from dvl_calib_ros.calibration.models import MODELS, plugins
 from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.shared_noise import SharedNoise
+from dvl_calib_ros.calibration.checks.reference_independence import SharedNoise
 
 SECONDS = 400.0
 

@@ -7,7 +7,7 @@ import pytest
 from runs import MatchedRun, feed, feed_columns, make_samples
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.workers import AtOnce
+from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
 from dvl_calib_ros.calibration.registration import clock_domains

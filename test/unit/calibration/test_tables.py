@@ -10,8 +10,8 @@ from dvl_calib_ros.calibration.results.results.thinned_recording import KEPT_EVE
 from dvl_calib_ros.calibration.streams.stream_order.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.clocks import MOST, MOST_OF_A_BLOCK, KeptClocks
-from dvl_calib_ros.calibration.delay.filter import DelayFilter
+from dvl_calib_ros.calibration.estimators.block_estimator import DelayFilter
+from dvl_calib_ros.calibration.estimators.registration_schedule import MOST, MOST_OF_A_BLOCK, KeptClocks
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.numerics.tables import RowTable

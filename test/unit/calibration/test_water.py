@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from dvl_calib_ros.calibration.water import (
+from dvl_calib_ros.calibration.checks.speed_of_sound import (
     Water,
     cause,
     cause_of_setting,

@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 from runs import ONE_HERTZ, MatchedRun, calibrate, make_samples
 
-from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy, skew
-from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
-from dvl_calib_ros.calibration.worth import (
+from dvl_calib_ros.calibration.assessment.manoeuvre_planner import (
     KM,
     RecentMotion,
     _information,
@@ -22,6 +18,10 @@ from dvl_calib_ros.calibration.worth import (
     outlook,
     predicted_drift,
 )
+from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy, skew
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 
 RUN = MatchedRun(dvl_std=0.01, gnss_std=0.05, frame=VelocityFrame.ENU, **ONE_HERTZ)
 EASTWARD = RecentMotion(1.5, 0.0, True, 0.05**2)

@@ -22,7 +22,7 @@ from report_fixtures import drawn
 from water_fixtures import SALINITY, TEMPERATURE, USED, with_water
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.calibration.water import speed_of_sound
+from dvl_calib_ros.calibration.checks.speed_of_sound import speed_of_sound
 from dvl_calib_ros.fleet_catalogue import update as running
 from dvl_calib_ros.fleet_catalogue.parquet_parts import Catalogue
 from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued

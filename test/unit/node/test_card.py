@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 from runs import MatchedRun, calibrate, make_samples
 
+from dvl_calib_ros.calibration.assessment.manoeuvre_planner import PredictedDrift, predicted_drift
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
-from dvl_calib_ros.calibration.worth import PredictedDrift, predicted_drift
 from dvl_calib_ros.node.operator_card import LEAST_LOOKS, SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, RecentWorth
 
 RUN = MatchedRun("box", 120.0, (0.0, 0.0, 0.05), dvl_std=0.01, gnss_std=0.03, frame=VelocityFrame.ENU)

@@ -11,9 +11,9 @@ from runs import ONE_HERTZ, MatchedRun, make_samples
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import Compression, Storage
+from dvl_calib_ros.calibration.assessor import Judge
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.delay.workers import AtOnce
-from dvl_calib_ros.calibration.judging import Judge
+from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from dvl_calib_ros.messages import live_feed

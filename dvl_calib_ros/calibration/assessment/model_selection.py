@@ -1,0 +1,223 @@
+"""Which model's estimate is the one: automatic selection with timeout and hysteresis, in stamps."""
+
+from __future__ import annotations
+
+from bisect import insort
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...verdict.reasons import Reason, finding
+from ..models import EXTENDED_BY, WITH_HEADINGS, WITH_POSITIONS
+from ..models.parameters import AUTO, IAC, Parameters
+from ..numerics.samples import Mask, Stamps
+from ..results.results import Segment
+
+# The published selection; the first and the last are what the paper recommends
+IAC_G = ("M3", "M4")
+IAC_GF = ("M5", "M6", "M7")
+
+
+class GnssAvailability:
+    """Whether GNSS is available: paired samples keep arriving, and a change has held for the hysteresis.
+
+    Before the first sample GNSS is not available. losses: how often it stopped for longer than the timeout, whether or
+    not for long enough to count.
+    """
+
+    def __init__(self) -> None:
+        self.available = False
+        self.losses = 0
+        self._fresh = False
+        self._last_paired_ns: int | None = None
+        self._changing_since_ns: int | None = None
+
+    def update(self, stamp_ns: int, paired: bool, timeout_ns: int, hysteresis_ns: int) -> None:
+        """Take note of one DVL sample and whether it was paired with a reference."""
+        if paired:
+            self._last_paired_ns = stamp_ns
+        fresh = self._last_paired_ns is not None and stamp_ns - self._last_paired_ns <= timeout_ns
+        self.losses += self._fresh and not fresh
+        self._fresh = fresh
+        if fresh == self.available:
+            self._changing_since_ns = None
+            return
+        if self._changing_since_ns is None:
+            self._changing_since_ns = stamp_ns
+        if stamp_ns - self._changing_since_ns >= hysteresis_ns:
+            self.available = fresh
+            self._changing_since_ns = None
+
+    def stays_with(self, stamps_ns: Stamps, paired: Mask) -> bool:
+        """Take note of samples (N,) that change nothing, and say True: of a receiver that is steadily there, or not."""
+        if self._changing_since_ns is not None or self._fresh != self.available:
+            return False
+        if self.available and paired.all():
+            self._last_paired_ns = int(stamps_ns[-1])
+            return True
+        return not self.available and not paired.any()
+
+    @property
+    def reason(self) -> Reason:
+        """For the operator."""
+        if self._changing_since_ns is None:
+            return finding("GNSS_AVAILABLE" if self.available else "GNSS_NOT_AVAILABLE")
+        return finding("GNSS_GOING" if self.available else "GNSS_COMING")
+
+
+class Evidence(NamedTuple):
+    """For the model that extends another: chi-square of what only it has, or the share of a variance that only it knows
+    of; and what of the other model that says: the code of a reason, and its numbers beside the model.
+    """
+
+    chi_square: float
+    code: str = "NO_EVIDENCE"
+    numbers: Mapping[str, Any] = {}
+
+
+NO_EVIDENCE = Evidence(0.0)
+# Chi-square (four degrees of freedom at most) from which the extending model is taken, and below which it is left: by
+# chance 30 comes once in 200 000 times, and an effect of a few σ that comes and goes does not flap the output.
+EXTENDED_FROM, EXTENDED_UNTIL = 30.0, 15.0
+
+
+# Evidence comes with every block of 10 s in which there is a reference; without it for so long, there is none.
+EVIDENCE_HOLDS_NS = 12_000_000_000
+
+
+class _Positions(NamedTuple):
+    """That the model of positions is to be taken, and why."""
+
+    evidence: Evidence
+
+
+def _why(evidence: Evidence) -> Reason:
+    return finding(evidence.code, **evidence.numbers)
+
+
+class Selection:
+    """The selected model over time."""
+
+    def __init__(self) -> None:
+        self.gnss = GnssAvailability()
+        self.segments: list[Segment] = []
+        self._evidence = NO_EVIDENCE
+        self._extended = False
+        self._referenced_until_ns = 0
+        self._headings = self._trimmed = False
+        self._by_positions: Evidence | None = None
+        # what is to be taken note of once DVL samples reach its stamp: evidence, or that headings show the current
+        self._coming: deque[tuple[int, Evidence | _Positions | None]] = deque()
+
+    def extend(self, from_ns: int, evidence: Evidence) -> None:
+        """From this stamp on, go by this evidence for the model that extends the one with GNSS."""
+        self._note(from_ns, evidence)
+
+    def headings_show_the_current(self, from_ns: int, trimmed: bool = False) -> None:
+        """From this stamp on, a model with attitude can do without GNSS. trimmed: it is the trim that asks for it."""
+        self._trimmed = trimmed
+        self._note(from_ns, None)
+
+    def go_by_positions(self, from_ns: int, evidence: Evidence) -> None:
+        """From this stamp on, go by the model of positions, for what velocities made of them are worth."""
+        self._note(from_ns, _Positions(evidence))
+
+    def _note(self, from_ns: int, what: Evidence | _Positions | None) -> None:
+        insort(self._coming, (from_ns, what), key=lambda each: each[0])
+
+    def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
+        """Take note of DVL samples (N,), in order of stamps, and of whether they were paired."""
+        while self._coming and len(stamps_ns) and self._coming[0][0] <= stamps_ns[-1]:
+            from_ns, evidence = self._coming.popleft()
+            at = int(np.searchsorted(stamps_ns, from_ns))
+            if at:
+                self._update(stamps_ns[:at], paired[:at], parameters)
+            stamps_ns, paired = stamps_ns[at:], paired[at:]
+            if evidence is None:
+                self._headings = True
+                self.record(int(stamps_ns[0]), parameters)
+                continue
+            if isinstance(evidence, _Positions):
+                self._by_positions = evidence.evidence
+                self.record(int(stamps_ns[0]), parameters)
+                continue
+            self._evidence = evidence
+            self._referenced_until_ns = from_ns + EVIDENCE_HOLDS_NS
+            extended = evidence.chi_square >= (EXTENDED_UNTIL if self._extended else EXTENDED_FROM)
+            if extended != self._extended:
+                self._extended = extended
+                self.record(int(stamps_ns[0]), parameters)
+        if len(stamps_ns):
+            self._update(stamps_ns, paired, parameters)
+
+    def _update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
+        timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
+        if self._extended:  # which finds references that pairing, at the stamps as they are, does not
+            paired = paired | (stamps_ns < self._referenced_until_ns)
+        if self.segments and self.gnss.stays_with(stamps_ns, paired):
+            return
+        for stamp_ns, is_paired in zip(stamps_ns.tolist(), paired.tolist(), strict=True):
+            self.gnss.update(stamp_ns, is_paired, timeout_ns, hysteresis_ns)
+            self.record(stamp_ns, parameters)
+
+    def record(self, stamp_ns: int, parameters: Parameters) -> None:
+        """Start a new segment if another model is selected now; one that had no time is replaced."""
+        model = self.model(parameters)
+        if self.segments and self.segments[-1].from_ns == stamp_ns:
+            self.segments.pop()
+        if not self.segments or self.segments[-1].model != model:
+            self.segments.append(Segment(stamp_ns, model))
+
+    def model(self, parameters: Parameters) -> str:
+        """Name of the selected model."""
+        if parameters.model == IAC:
+            aided, unaided = published_models(parameters)
+        elif parameters.model == AUTO:
+            aided, unaided = parameters.gnss_model, parameters.gnss_free_model
+        else:
+            return parameters.model
+        if parameters.model == AUTO and self._by_positions is not None:
+            return WITH_POSITIONS
+        if not self.gnss.available:
+            return WITH_HEADINGS.get(unaided, unaided) if parameters.model == AUTO and self._headings else unaided
+        if parameters.model == AUTO and self._extended:
+            return EXTENDED_BY.get(aided, aided)
+        return aided
+
+    def reason(self, parameters: Parameters, evidence: Evidence | None = None) -> Reason:
+        """Why it is that model. evidence: as it is now, for a model that extends another; None: as it was noted."""
+        if parameters.model not in (AUTO, IAC):
+            return finding("MODEL_NAMED")
+        chosen = {"by": parameters.model, "gnss": self.gnss.reason}
+        if parameters.model == AUTO and self._by_positions is not None:
+            return finding("MODEL_CHOSEN_AS", **chosen, why=_why(self._by_positions))
+        if parameters.model == AUTO and not self.gnss.available and parameters.gnss_free_model in WITH_HEADINGS:
+            headings = "TRIM_KNOWN" if self._trimmed else "HEADINGS_TELL_CURRENT"
+            return finding("MODEL_CHOSEN_AS", **chosen, why=finding(headings if self._headings else "HEADINGS_TOO_FEW"))
+        if parameters.model == IAC or self.model(parameters) != EXTENDED_BY.get(parameters.gnss_model):
+            return finding("MODEL_CHOSEN", **chosen)
+        seen = evidence or self._evidence
+        return finding("MODEL_CHOSEN_AS", **chosen, why=finding(seen.code, model=parameters.gnss_model, **seen.numbers))
+
+
+def eligible(parameters: Parameters) -> frozenset[str]:
+    """The models that may be selected, and those that extend them."""
+    if parameters.model == IAC:
+        own = set(published_models(parameters))
+    elif parameters.model == AUTO:
+        unaided = parameters.gnss_free_model
+        own = {parameters.gnss_model, unaided, WITH_HEADINGS.get(unaided, unaided), *filter(None, [WITH_POSITIONS])}
+    else:
+        own = {parameters.model}
+    return frozenset(own | {EXTENDED_BY[name] for name in own if name in EXTENDED_BY})
+
+
+def published_models(parameters: Parameters) -> tuple[str, str]:
+    """What `iac` runs: IAC-G with GNSS, IAC-GF without, of Yampolsky and Klein (see the table of models).
+
+    Where gnss_model or gnss_free_model name no such model, as by default, the ones that the paper ends with.
+    """
+    aided = parameters.gnss_model if parameters.gnss_model in IAC_G else IAC_G[0]
+    return aided, parameters.gnss_free_model if parameters.gnss_free_model in IAC_GF else IAC_GF[-1]

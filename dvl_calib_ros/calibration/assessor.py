@@ -1,0 +1,417 @@
+"""A calibrator's estimates held against data that they had not seen: verdicts, and what is left with each.
+
+What each model's estimator says, with σ worth believing: of this recording, and of the next on another day.
+
+The estimators that are more than the linear filter, asked as one: the first that has an answer gives it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from typing import TypeVar
+
+import numpy as np
+
+from ..verdict.reasons import Reason
+from .assessment.dead_reckoning import Navigation, dead_reckoned, objections
+from .assessment.manoeuvre_planner import drift_left_open
+from .assessment.objections import doubts
+from .estimators.estimator import NEVER, Estimator, Rest
+from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
+from .filters.day_to_day_covariance import day_covariance, offset_covariance
+from .filters.filter_setup import nis_bounds
+from .filters.observability import MEASURES_VERTICAL, convergence, observability
+from .models import EXTENDED_BY, MODELS, Model
+from .models.parameters import Parameters
+from .numerics.error_model import correction_matrix
+from .numerics.frames import Array
+from .numerics.kalman import GaussianState
+from .numerics.samples import Index, Stamps
+from .registration.registration import Registration
+from .results import results
+from .results.held_out_verification import SEVERAL, verify
+from .results.results import Estimate, Verification, finds_arm
+from .results.thinned_recording import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
+
+# What is said of a running calibration on the way: of the rest its diagnostics say more than a verdict does.
+JUDGED_LIVE = {
+    "HELD_OUT_WORSE", "HELD_OUT_SEVERAL_TIMES", "HELD_OUT_IMPLAUSIBLE", "HELD_OUT_OUTLIERS", "MISALIGNMENT_LARGE",
+    "SCALE_LARGE", "LEVER_ARM_TURNS_ANGLE",
+}  # fmt: skip
+
+
+class Judge:
+    """Judges the estimates of one calibrator."""
+
+    def __init__(self, estimates: Estimates) -> None:
+        self._estimates, self._further = estimates, estimates.further
+        self._compared: tuple[ThinnedRecording, Compared] | None = None  # as mounted
+
+    def verification(self, name: str, moments: Moments) -> Verification:
+        """The verdict on one model's calibration, by hold-out. moments: of the samples that it is judged by."""
+        estimate = self._estimates.without_tilt(self._estimates.estimate(name))
+        model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
+        held_out = self._held_out(name, moments)
+        is_suspect = held_out is not None and held_out.corrected > min(
+            SEVERAL * held_out.predicted, held_out.uncorrected
+        )
+        typical = self.typical_error(model, state) if is_suspect else None
+        samples, vv, *_ = moments.total
+        return self._judged(estimate, held_out, typical, (float(samples), vv), self._further.suggestion)
+
+    def so_far(self, name: str, *, fresh: bool) -> Verification:
+        """The same of a running calibration, by what the worker looked at; nothing is waited for unless fresh."""
+        estimate, further = self._estimate(name, fresh=fresh), self._further
+        rest, suggestion = further.rest(fresh=fresh), further.suggestion if fresh else further.suggestion_so_far
+        if MODELS[name].from_positions:
+            held_out = self._held_out(name, Moments()) if fresh else None
+            return self._judged(estimate, held_out, None, (0.0, np.zeros((3, 3, 3))), suggestion)
+        if rest is None or not MODELS[name].aided:
+            return self._judged(estimate, None, None, (0.0, np.zeros((3, 3, 3))), suggestion)
+        return self._judged(estimate, rest.held_out, rest.typical, rest.judged, suggestion)
+
+    def _held_out(self, name: str, moments: Moments) -> HeldOutError | None:
+        rotation_dvl_from_body = self._estimates.parameters.rotation_dvl_from_body
+        return self._estimates.estimators[name].held_out_error(moments, rotation_dvl_from_body)
+
+    def _estimate(self, name: str, *, fresh: bool) -> Estimate:
+        estimate = self._estimates.estimate(name)
+        return self._estimates.without_tilt(estimate) if fresh else estimate
+
+    def _judged(
+        self,
+        estimate: Estimate,
+        held_out: HeldOutError | None,
+        typical: float | None,
+        judged: tuple[float, Array],
+        suggestion: Reason | None,
+    ) -> Verification:
+        """As of `verify`. judged: as of `calibration_error`."""
+        name, p = estimate.model, self._estimates.parameters
+        model, estimator = MODELS[name], self._estimates.estimators[name]
+        of_velocity = self._estimates.of_recording(name).p - estimator.of_bias.covariance
+        return verify(
+            model,
+            GaussianState(estimate.state, estimate.covariance),
+            estimate.convergence,
+            held_out,
+            p,
+            (estimate.used, estimate.gated),
+            suggestion if model.aided else None,
+            self._further.reference_claims,
+            self._further.doubt if model.aided else None,
+            bool(model.estimator) and estimator.claims,
+            typical,
+            calibration_error(model, of_velocity, judged, p.rotation_dvl_from_body),
+        )
+
+    def doubts(self, name: str, of_clocks: Sequence[Reason], *, fresh: bool) -> list[Reason]:
+        """What the data say against one model's calibration, as bad as that is to a verdict; of a running one.
+
+        of_clocks: what clocks say against every calibration. fresh: by a look at all there is, else by one that the
+        worker took a little ago.
+        """
+        further, p = self._further, self._estimates.parameters
+        suggested, rest = further.suggestion if fresh else further.suggestion_so_far, further.rest(fresh=fresh)
+        navigation = None if rest is None else rest.navigation
+        if MODELS[name].from_positions:
+            navigation = self._estimates.estimators[name].navigation() if fresh else None
+        found = doubts(
+            self._estimate(name, fresh=fresh),
+            (self._estimate(each.name, fresh=fresh) for each in self._estimates.arm_finders),
+            navigation,
+            p,
+            suggested=suggested is not None,
+            in_earth=rest is not None and rest.in_earth,
+            is_level=fresh and further.is_level,
+        )
+        found += of_clocks
+        if navigation is None:
+            return found
+        held_out = self.so_far(name, fresh=fresh).reasons
+        known_to = drift_left_open(self._estimate(name, fresh=fresh), p)
+        return [*found, *objections(navigation, known_to), *(each for each in held_out if each.code in JUDGED_LIVE)]
+
+    def navigation(self, name: str, deviation: GaussianState | None) -> Navigation | None:
+        """What one model's calibration is worth to dead reckoning, on data that it had not seen. None without
+        reference, or with hardly any motion. deviation: how the heading deviates."""
+        with self._further.settled():
+            own = self._estimates.estimators[name].navigation()
+        if own is not None:
+            return own
+        kept = self._further.recording
+        if kept is None:
+            return None
+        recording, epoch_ns = kept
+        try:
+            terms = self.held_out_terms(name)
+        except np.linalg.LinAlgError:
+            return None
+        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
+        # of every fold and day what corrects it
+        n_days, p = len(terms[0]), self._estimates.parameters
+        parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
+        corrections = [each for of_days in terms for each in of_days]
+        return dead_reckoned(recording, parts, corrections, p, epoch_ns, deviation)
+
+    def held_out_terms(self, name: str) -> list[list[Terms]]:
+        """For every fold what one model corrects on every day, had it not seen that fold.
+
+        Raises numpy.linalg.LinAlgError for a configuration so wrong that there is no estimate without a fold.
+        """
+        return self._estimates.estimators[name].held_out_terms(self._further.n_days)
+
+    def typical_error(self, model: Model, state: GaussianState) -> float | None:
+        """Velocity error of a state, m/s rms, without outliers; None where nothing was kept."""
+        kept, p = self._further.recording, self._estimates.parameters
+        if kept is None:
+            return None
+        x, recording = state.x, kept[0]
+        if finds_arm(model):
+            return typical_error(recording, Terms.of_state(x), p)
+        if self._compared is None or self._compared[0] is not recording:
+            every = np.arange(len(recording.dvl.times))
+            self._compared = recording, recording.compared(every, NO_TERMS, p)
+        seen, errors, t = self._compared[1], model.error_terms_from_state @ x, p.rotation_dvl_from_body
+        change = recording.dvl.velocity @ (t.T - correction_matrix(errors[:3], errors[3:], t)).T
+        return without_outliers(seen.error + np.matmul(seen.measured, change[..., None])[..., 0])
+
+
+# Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.
+OPEN_FROM = 4.0
+# So many σ of the difference between the two are no chance, and as many of its own are too little claimed.
+NO_CHANCE = 3.0
+
+
+class Estimates:
+    """The estimates of a calibrator's models.
+
+    estimators: by model. further: those of them that are more than the linear filter. models: names of those that are
+    wanted. parameters: those that can change at run time are set here.
+    """
+
+    def __init__(
+        self,
+        estimators: Mapping[str, Estimator],
+        further: FurtherEstimators,
+        models: Sequence[str],
+        parameters: Parameters,
+    ) -> None:
+        self.estimators, self.further, self.parameters = estimators, further, parameters
+        self._models = models
+        self._day_covariances: dict[str, Array] = {}
+
+    def estimate(self, name: str) -> Estimate:
+        """Estimate of one model, with all that is known about it."""
+        model, estimator = MODELS[name], self.estimators[name]
+        state, covariance = self.of_recording(name)
+        of_bias = estimator.of_bias
+        of_velocity = covariance - of_bias.covariance  # more of the same motion tells no more of a bias
+        used, gated, mean_nis, rows, _ = estimator.counts
+        return Estimate(
+            model=name,
+            state=state,
+            covariance=covariance + self._day_covariance(name),
+            recording_covariance=covariance,
+            filter_covariance=estimator.filter_covariance,
+            left_open=estimator.left_open + self._by_clock(name),
+            of_bias=of_bias,
+            used=used,
+            gated=gated,
+            mean_nis=mean_nis,
+            nis_bounds=nis_bounds(rows, self.parameters, used),
+            convergence=convergence(model, of_velocity, self.parameters),
+            observability=observability(model, of_velocity, self.parameters),
+            heading_deviation=estimator.heading_deviation,
+        )
+
+    def of_recording(self, name: str) -> GaussianState:
+        """State and covariance, σ as of the same day: the larger of what the filter claims and what blocks of time
+        show."""
+        estimator = self.estimators[name]
+        state, covariance = estimator.of_recording()
+        worse = offset_covariance(MODELS[name], state, estimator.filter_covariance, self.parameters)
+        unknown = self._by_unknown_arm(name, state, covariance) + self._by_clock(name)
+        return GaussianState(state, covariance + worse + unknown)
+
+    def next_recording(self, name: str) -> GaussianState:
+        """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it."""
+        state = self.of_recording(name)
+        return GaussianState(state.x, state.p + self._day_covariance(name))
+
+    def _day_covariance(self, name: str) -> Array:
+        if name not in self._day_covariances:
+            self._day_covariances[name] = day_covariance(MODELS[name], self.parameters)
+        return self._day_covariances[name]
+
+    def _by_clock(self, name: str) -> Array:
+        """(n, n) of a model that takes clocks as known: what one in a steady turn makes of the angles, with an arm that
+        was told."""
+        n, estimator = MODELS[name].n_state, self.estimators.get(EXTENDED_BY.get(name, ""))
+        found = np.zeros((n, n))
+        if estimator is not None and any(self.parameters.lever_arm):
+            found[:3, :3] = estimator.turn_open
+        return found
+
+    def _by_unknown_arm(self, name: str, state: Array, covariance: Array) -> Array:
+        """(n, n) that a model claims too little of angles, for it takes a lever arm that nobody told as known.
+
+        Its angles are off by what the model that finds the arm has otherwise, and by what that one is off.
+        """
+        found = np.zeros_like(covariance)
+        estimator = self.estimators.get(EXTENDED_BY.get(name, ""))
+        if estimator is None or not estimator.claims or any(self.parameters.lever_arm):
+            return found
+        other = estimator.of_recording()
+        # a bias of the DVL is there with an arm as without
+        own = np.diag(covariance - self.estimators[name].of_bias.covariance)[:3]
+        open_arm = np.diag(other.p - estimator.of_bias.covariance)[:3]
+        by_arm = open_arm - own
+        away = (state - other.x[: len(state)])[:3] ** 2
+        is_open = (open_arm > OPEN_FROM * own) | (away > NO_CHANCE**2 * np.minimum(own, np.maximum(by_arm, 0.0)))
+        np.fill_diagonal(found[:3, :3], np.where(is_open & (by_arm > 0.0), by_arm + away, 0.0))
+        return found
+
+    @property
+    def arm_finders(self) -> Iterator[Model]:
+        """Wanted models that find the lever arm, the best first."""
+        return (MODELS[name] for name in self._models if results.finds_arm(MODELS[name]))
+
+    def without_tilt(self, estimate: Estimate) -> Estimate:
+        """An estimate that claims no roll and pitch where those of the vehicle are not known, or no reference measures
+        the vertical, which leaves the arm's height open too; and no roll where another lever arm is found than was
+        told: an attitude of another time makes one, and in waves a roll."""
+        model, p = MODELS[estimate.model], self.parameters
+        needs = ""
+        if self.further.is_level:
+            needs = "an IMU that measures roll and pitch"
+        elif self.further.is_horizontal:
+            needs = MEASURES_VERTICAL
+        unknown_axes = 0 if not model.aided else 2 if needs else int(self._finds_another_arm)
+        if not unknown_axes:
+            return estimate
+        level = p.rotation_dvl_from_body[:, :unknown_axes]
+        unknown = np.zeros((model.n_state, model.n_state))
+        unknown[:3, :3] = p.initial_std_misalignment**2 * (level @ level.T)
+        if needs == MEASURES_VERTICAL and results.finds_arm(model):  # nor does anything show its height
+            height = model.state_names.index("lever_arm_z")
+            unknown[height, height] = p.initial_std_lever_arm**2
+        own = estimate.velocity_covariance + unknown
+        return replace(
+            estimate,
+            covariance=estimate.covariance + unknown,
+            recording_covariance=estimate.recording_covariance + unknown,
+            convergence=convergence(model, own, p),
+            observability=observability(model, own, p, needs),
+        )
+
+    @property
+    def _finds_another_arm(self) -> bool:
+        """Whether the lever arm that was told is contradicted."""
+        model = next(self.arm_finders, None)
+        if model is None:
+            return False
+        estimator = self.estimators[model.name]
+        x, p = estimator.of_recording()
+        shown = GaussianState(x, p - estimator.left_open)
+        return bool(results.contradicted(model, shown, self.parameters).any())
+
+
+_Answer = TypeVar("_Answer")
+
+
+class FurtherEstimators:
+    """Those of a calibrator, in the order of their models. Names and answers are those of `Estimator`."""
+
+    def __init__(self, estimators: Sequence[Estimator]) -> None:
+        self._all = tuple(estimators)
+
+    def __iter__(self) -> Iterator[Estimator]:
+        return iter(self._all)
+
+    def _first(self, ask: Callable[[Estimator], _Answer | None]) -> _Answer | None:
+        return next((answer for each in self._all if (answer := ask(each)) is not None), None)
+
+    @property
+    def n_taken(self) -> int:
+        """Number of the first aligned row that one of them has not copied."""
+        return min((each.n_taken for each in self._all), default=NEVER)
+
+    @property
+    def n_told(self) -> tuple[int, ...]:
+        """What grows when one of them may have more to say, by estimator."""
+        return tuple(each.n_told for each in self._all)
+
+    @property
+    def told_until_ns(self) -> int | None:
+        """Stamp of the first DVL sample that may go by something that is only gathered; None."""
+        return min((until for each in self._all if (until := each.told_until_ns) is not None), default=None)
+
+    @property
+    def reference_claims(self) -> bool:
+        """Whether it is the reference's messages that say how noisy it is, and no parameter."""
+        return any(each.reference_claims for each in self._all)
+
+    @property
+    def is_level(self) -> bool:
+        """Whether references were turned into the body by a heading alone: roll and pitch then hold the trim."""
+        return any(each.is_level for each in self._all)
+
+    @property
+    def is_horizontal(self) -> bool:
+        """Whether no reference measures the vertical."""
+        return any(each.is_horizontal for each in self._all)
+
+    @property
+    def are_clocks_known(self) -> bool:
+        """Whether the data show how the clocks stand, in time or not."""
+        return any(each.registration is not None and each.registration.are_known for each in self._all)
+
+    @property
+    def doubt(self) -> Reason | None:
+        """What is known against models that take for granted what these find."""
+        return self._first(lambda each: each.doubt)
+
+    @property
+    def suggestion(self) -> Reason | None:
+        """What configuration the data fit, where the one given is grossly wrong."""
+        return self._first(lambda each: each.suggestion)
+
+    @property
+    def suggestion_so_far(self) -> Reason | None:
+        """`suggestion` as it was seen a little ago, which nobody has to wait for."""
+        return self._first(lambda each: each.suggestion_so_far)
+
+    @property
+    def registration_so_far(self) -> Registration | None:
+        """How the instruments stand, as it was seen a little ago; None where that is not known."""
+        return self._first(lambda each: each.registration_so_far)
+
+    def rest(self, *, fresh: bool) -> Rest | None:
+        """What the calibration leaves, by a look at all there is or, not fresh, by one a little ago; None for none."""
+        return self._first(lambda each: each.rest(fresh=fresh))
+
+    @property
+    def recording(self) -> tuple[ThinnedRecording, int] | None:
+        """What was kept of all streams for verification, and the stamp (ns) of its time 0; None for nothing."""
+        return self._first(lambda each: each.recording)
+
+    @property
+    def n_days(self) -> int:
+        """Number of days so far."""
+        return max((each.n_days for each in self._all), default=1)
+
+    def day_of(self, stamps_ns: Stamps) -> Index:
+        """Which day (N,) stamps are of, from 0, as far as `recording` goes."""
+        days = [each.day_of(stamps_ns) for each in self._all]
+        return np.max(days, axis=0) if days else np.zeros(len(stamps_ns), dtype=np.intp)
+
+    @contextmanager
+    def settled(self) -> Iterator[None]:
+        """All that is complete has taken effect, in here."""
+        with ExitStack() as each_settled:
+            for each in self._all:
+                each_settled.enter_context(each.settled())
+            yield

@@ -1,0 +1,1 @@
+"""Checks of instruments against themselves and each other."""

@@ -1,0 +1,152 @@
+"""What a calibration's counts say that a user must not overlook: findings, for the replay and for /diagnostics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ...verdict.reasons import Reason, finding
+from ..filters.day_to_day_covariance import OFFSETS, OFTEN_OFF
+from ..models.parameters import Parameters
+from ..results.mounting_quantities import date
+from ..results.results import ARM, Day, Estimate
+
+# Share of gated samples above which the configuration is more likely wrong than the data.
+SUSPICIOUS_GATED = 0.2
+# Fewer samples say nothing yet.
+ENOUGH_SAMPLES = 20
+# Share of DVL velocities that repeat the one before exactly above which its driver hangs.
+SUSPICIOUS_REPEATED = 0.05
+# A constant error of the reference is said if it is larger than this, m/s, and than so many σ.
+OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
+# It is not shown from this share of its prior σ on.
+NOT_SHOWN = 0.6
+# Of a lever arm (m) and a delay (s) that a clock leaves open, what is worth a word.
+SAID_FROM_M, SAID_FROM_S = 0.05, 0.05
+# So many losses of GNSS are flapping.
+FLAPPING = 3
+
+_STREAMS = {"dvl": "DVL", "reference": "GNSS", "imu": "IMU"}
+_MESSAGE_FAULTS = {
+    "invalid": "SAMPLES_INVALID",
+    "duplicate": "STAMP_REPEATED",
+    "out_of_order": "STAMP_OUT_OF_ORDER",
+    "stray": "STAMP_STRAY",
+    "late": "SAMPLES_LATE",
+    "before_restart": "SAMPLES_BEFORE_RESTART",
+}
+
+
+def message_advice(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
+    """What is wrong with messages of each stream that were not used; from `Calibrator.counts`."""
+    return [
+        finding(code, count=counts[stream][fault], stream=name)
+        for stream, name in _STREAMS.items()
+        for fault, code in _MESSAGE_FAULTS.items()
+        if counts[stream].get(fault)
+    ]
+
+
+def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
+    """What is wrong with the data that came; from `Calibrator.counts`."""
+    dvl, pairing = counts["dvl"], counts["pairing"]
+    found = []
+    if dvl["received"] >= ENOUGH_SAMPLES and not dvl["accepted"]:
+        lost = ", ".join(f"{count} {name}" for name, count in dvl.items() if count and name != "received")
+        found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=lost))
+    if _never_meet(counts):
+        found.append(finding("DVL_NO_REFERENCE"))
+    if pairing["without_attitude"]:
+        found.append(finding("REFERENCE_NO_ATTITUDE", count=pairing["without_attitude"]))
+    if dvl["dropouts"]:
+        found.append(finding("DVL_DROPOUTS", count=dvl["dropouts"]))
+    if dvl["frozen"]:
+        found.append(finding("DVL_FROZEN", count=dvl["frozen"]))
+    elif dvl["repeated"] >= ENOUGH_SAMPLES and dvl["repeated"] > SUSPICIOUS_REPEATED * dvl["usable"]:
+        found.append(finding("DVL_REPEATS", count=dvl["repeated"]))
+    if pairing["gnss_losses"] >= FLAPPING:
+        found.append(finding("GNSS_LOSSES", count=pairing["gnss_losses"]))
+    if dvl["no_turn_rate"]:
+        found.append(finding("NO_TURN_RATE", count=dvl["no_turn_rate"]))
+    if dvl.get("lever_arm_uncompensated"):
+        found.append(finding("LEVER_ARM_NOT_COMPENSATED", count=dvl["lever_arm_uncompensated"]))
+    for name, count in counts["calibration"].items():
+        if count and name.endswith(" restarted"):
+            found.append(finding("MODEL_RESTARTED", model=name.removesuffix(" restarted"), count=count))
+    if dvl["accepted"] and dvl["slow"] == dvl["accepted"]:
+        found.append(finding("ALL_SLOW"))
+    return found
+
+
+def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
+    """Whether valid DVL and reference samples come, and enough of them have gone by without a single pair."""
+    reference, pairing = counts["reference"], counts["pairing"]
+    usable = 2 * reference["received"] - sum(reference.values())
+    if pairing["paired"] or pairing["without_attitude"]:
+        return False
+    return usable >= ENOUGH_SAMPLES and pairing["unpaired"] >= ENOUGH_SAMPLES
+
+
+def gate_advice(estimate: Estimate) -> list[Reason]:
+    """Whether a model's gate throws away so much that the configuration must be wrong."""
+    given = estimate.used + estimate.gated
+    if given < ENOUGH_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
+        return []
+    return [finding("SAMPLES_GATED", model=estimate.model, gated=estimate.gated, given=given)]
+
+
+def consistency_advice(estimate: Estimate) -> list[Reason]:
+    """Whether a model's innovations are larger than it believes; smaller ones only make σ too large."""
+    if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
+        return []
+    return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]
+
+
+def one_heading_advice(estimate: Estimate, parameters: Parameters, speed: float) -> list[Reason]:
+    """Whether nothing but what is assumed of it tells a constant error of reference or DVL from yaw and scale.
+
+    speed: m/s, usual.
+    """
+    own, assumed = estimate.state_names, parameters.reference_offset_std
+    if OFFSETS[0] not in own or not estimate.used or speed <= 0.0:
+        return []
+    std = estimate.filter_std[[own.index(name) for name in OFFSETS]]
+    if float(std.min()) < NOT_SHOWN * assumed:
+        return []
+    off = OFTEN_OFF * assumed
+    share = off / speed
+    return [finding("ONE_HEADING", off=off, degrees=math.degrees(share), percent=100.0 * share)]
+
+
+def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reason]:
+    """Whether its clock leaves lever arm or yaw open, and whether it is wrong by a constant, on each of several days.
+
+    days: that the model found something of, if there are several.
+    """
+    std = estimate.std_of(*OFFSETS)
+    if std is None:
+        return []
+    said = []
+    open_std = np.sqrt(np.diag(estimate.left_open))
+    if open_std.any():
+        by_name = dict(zip(estimate.state_names, open_std.tolist(), strict=True))
+        metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
+        turn = math.degrees(float(np.linalg.norm(open_std[:3])))
+        seconds = by_name.get("time_offset", 0.0)
+        if metres < SAID_FROM_M and seconds < SAID_FROM_S:  # the arm was told
+            said.append(finding("CLOCK_ON_TURN", degrees=turn))
+        else:
+            said.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
+    found = [
+        (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
+        for day in days
+    ] or [("", np.array([estimate.state_of(name) for name in OFFSETS]), std)]
+    for where, offset, own_std in found:
+        size = float(np.linalg.norm(offset))
+        if size < OFFSET_SAID_FROM or (np.abs(offset) < OFFSET_SIGMAS * own_std).all():
+            continue
+        course = math.degrees(math.atan2(*offset)) % 360.0
+        said.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))
+    return said

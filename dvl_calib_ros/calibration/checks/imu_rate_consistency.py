@@ -1,0 +1,165 @@
+"""Whether an IMU's angular velocity is how its own attitude turns.
+
+Both come from one instrument, and the calibration uses both: the attitude turns the reference into the body, the
+angular velocity moves the DVL about the reference point. Where a driver mixes conventions (rates negated, in degrees,
+in the earth's axes, a compass heading as ENU yaw), a lever arm of the wrong sign or size explains the data nearly as
+well, and no residual shows it. So the attitude is differentiated and held against the rates, with no other sensor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, permutations
+from itertools import product as all_of
+
+import numpy as np
+
+from ...verdict.reasons import Reason, finding
+from ..numerics.frames import ENU_FROM_NED, Array, product, rotation_from_quaternion, rotation_vector
+from ..numerics.samples import Index
+from ..streams.imu_frame import quaternion_product
+
+# The attitude is differentiated over so long, s: 0.05° of its noise are then 0.1 °/s. Longer gaps are passed over.
+SPAN_S, LONGEST_S = 0.5, 1.6
+# A vehicle with a DVL turns no faster than this, rad/s: such a difference is an outlier of the attitude.
+FASTEST = 1.5
+# So many differences, and a turning of so much (rms, rad/s), tell anything.
+ENOUGH, LEAST_TURNING = 60, 0.005
+# What is left of the attitude's turning, as a share of its square: of another convention, and beside that as given.
+LEFT_AT_MOST, BETTER_BY, WRONG_FROM = 0.25, 0.25, 0.02
+# Explanations within so much of the best one are named with it; a rotation or a scale this near 1 is none.
+AS_GOOD, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
+# A rotation whose rows have an element this near 1 only exchanges axes, which has been looked at.
+EXCHANGED_FROM = 0.95
+# An attitude that is nowhere tilted by so much (sine of the angle) is a heading alone.
+LEVEL_BELOW = 1e-6
+_BODY, _ENU, _NED = range(3)
+_AXES = "xyz"
+_INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
+_KNOWN = {
+    (1, 1, -1): "HEADING_CLOCKWISE",
+    (-1, -1, -1): "RATES_NEGATED",
+    (1, -1, -1): "IMU_AXES_MIXED",
+}
+
+
+def _conventions() -> Iterator[tuple[Reason, Array]]:
+    """All axes that may be exchanged or negated, and as B (3, 3), turning = B rates; the likely ones first.
+
+    On a level vehicle that only turns about z many fit alike.
+    """
+    known_ones = [(finding(code), np.diag(signs).astype(float)) for signs, code in _KNOWN.items()]
+    yield from known_ones
+    for order in permutations(range(3)):
+        for signs in all_of((1, -1), repeat=3):
+            axes = ", ".join("-"[: sign < 0] + _AXES[axis] for sign, axis in zip(signs, order, strict=True))
+            matrix = np.diag(signs).astype(float) @ np.eye(3)[list(order)]
+            if axes != "x, y, z" and not any((matrix == known).all() for _, known in known_ones):
+                yield finding("RATES_EXCHANGED", axes=axes), matrix
+
+
+CONVENTIONS = tuple(_conventions())
+
+
+class AttitudeRates:
+    """Sums over the turning of an attitude and the angular velocity meanwhile; constant memory."""
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._tilted = False
+        self._turning = np.zeros((3, 3))  # Σ a aᵀ, a: turning of the attitude, rad/s
+        # with the angular velocity w taken to be in the body, ENU and NED: Σ a wᵀ and Σ w wᵀ
+        self._both = np.zeros((3, 3, 3))
+        self._rates = np.zeros((3, 3, 3))
+
+    def add(self, times: Array, orientation: Array, angular_velocity: Array, begins: Sequence[int] = (0,)) -> None:
+        """Take samples in order of time that follow those before.
+
+        times: (M,) s. orientation: (M, 4) unit quaternions (x, y, z, w), ``enu from body``. angular_velocity: (M, 3)
+        rad/s, body. Both nan where not known. begins: numbers of the samples with which stretches begin of which none
+        is looked at together with the next one.
+        """
+        known = ~(np.isnan(orientation[:, 0]) | np.isnan(angular_velocity).any(axis=1))
+        bounds = [*begins, len(times)]
+        if not known.all():
+            bounds = np.append(0, np.cumsum(known))[bounds].tolist()
+            times, orientation, angular_velocity = times[known], orientation[known], angular_velocity[known]
+        pairs = [_spans(times[start:end]) + start for start, end in pairwise(bounds) if end - start >= 2]
+        if not pairs:
+            return
+        first, last = np.concatenate(pairs, axis=1)
+        seconds = times[last] - times[first]
+        before, after = orientation[first], orientation[last]
+        a = rotation_vector(quaternion_product(before * _INVERSE, after)) / seconds[:, None]
+        steps = 0.5 * (angular_velocity[1:] + angular_velocity[:-1]) * np.diff(times)[:, None]
+        sums = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        w = (sums[last] - sums[first]) / seconds[:, None]
+        good = (seconds <= LONGEST_S) & ((a**2).sum(axis=1) < FASTEST**2)
+        a, w, before, after = a[good], w[good], before[good], after[good]
+        middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
+        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+        body_from_enu = rotation_from_quaternion(middle).swapaxes(1, 2)
+        self._n += len(a)
+        self._tilted = self._tilted or bool((np.abs(body_from_enu[:, :2, 2]) > LEVEL_BELOW).any())
+        self._turning += a.T @ a
+        for frame, in_body in enumerate((w, product(body_from_enu, w), product(body_from_enu, w @ ENU_FROM_NED.T))):
+            self._both[frame] += a.T @ in_body
+            self._rates[frame] += in_body.T @ in_body
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the attitude is a heading alone, without roll and pitch."""
+        return self._n >= ENOUGH and not self._tilted
+
+    def contradiction(self) -> Reason | None:
+        """What the data fit, where attitude and angular velocity do not agree."""
+        shown = slice(None) if self._tilted else slice(2, None)  # of a heading alone, what is about the vertical
+        total = float(np.trace(self._turning[shown, shown]))
+        if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
+            return None
+        if not self._rates[_BODY].any():
+            return finding("IMU_NO_RATES")
+        given = self._left(_BODY, np.eye(3), shown)
+        if given < WRONG_FROM * total:
+            return None
+        explained = [(self._left(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
+        best = min(left for left, _ in explained)
+        if best > min(LEFT_AT_MOST * total, BETTER_BY * given):
+            return None
+        found, *others = (fits for left, fits in explained if left <= AS_GOOD * best + 1e-3 * total)
+        if others:
+            return finding("IMU_CONTRADICTS_EITHER", found=found, other=others[0])
+        return finding("IMU_CONTRADICTS", found=found)
+
+    def _left(self, frame: int, matrix: Array, shown: slice) -> float:
+        """Σ|a - B w|² over the axes that are shown, for one B (3, 3) and a frame of w."""
+        matrix = matrix[shown]
+        crossed = float((matrix * self._both[frame][shown]).sum())
+        turning = float(np.trace(self._turning[shown, shown]))
+        return turning - 2.0 * crossed + float(np.trace(matrix @ self._rates[frame] @ matrix.T))
+
+    def _explanations(self) -> Iterator[tuple[int, Array, Reason]]:
+        """Frames of the angular velocity, and B (3, 3), that may be what was recorded, and what each is."""
+        yield from ((_BODY, matrix, convention) for convention, matrix in CONVENTIONS)
+        both, rates = self._both[_BODY], self._rates[_BODY]
+        scale = float(np.trace(both) / np.trace(rates))
+        if scale > 0.0 and abs(math.log(scale)) > SCALED_FROM:
+            in_degrees = abs(math.log(scale * 180.0 / math.pi)) < SCALED_FROM
+            size = finding("RATES_DEGREES") if in_degrees else finding("RATES_SCALED", times=1.0 / scale)
+            yield _BODY, scale * np.eye(3), size
+        yield _ENU, np.eye(3), finding("RATES_IN_EARTH", frame="ENU")
+        yield _NED, np.eye(3), finding("RATES_IN_EARTH", frame="NED")
+        yield _ENU, -np.eye(3), finding("ATTITUDE_INVERTED")
+        u, _, vt = np.linalg.svd(both)
+        turned = u @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))]) @ vt
+        angle = math.degrees(math.acos(float(np.clip(0.5 * (np.trace(turned) - 1.0), -1.0, 1.0))))
+        if angle > TURNED_FROM_DEG and np.abs(turned).max(axis=1).min() < EXCHANGED_FROM:
+            yield _BODY, turned, finding("RATES_TURNED", degrees=angle)
+
+
+def _spans(times: Array) -> Index:
+    """Numbers of the first and the last sample (2, S) of spans of about SPAN_S, of times (M > 1,) s."""
+    wanted = np.searchsorted(times, np.arange(times[0], times[-1] + SPAN_S, SPAN_S)).clip(max=len(times) - 1)
+    at = wanted[np.flatnonzero(np.diff(wanted, prepend=-1))]
+    return np.stack([at[:-1], at[1:]])

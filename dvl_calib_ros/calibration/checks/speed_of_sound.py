@@ -1,0 +1,227 @@
+"""The speed of sound that the water had against the one that the DVL used: what a scale may be, said in its cause.
+
+A DVL that counts with a speed of sound `used` in water of another, c, reads too fast by used / c - 1, except along the
+face of a phased array. Medwin's equation (J. Acoust. Soc. Am. 58, 1975, p. 1318) holds for 0 to 35 °C, 0 to 45 PSU and
+1000 m of depth; what it adds to the uncertainty is small beside a thermometer's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any, NamedTuple
+
+from ..filters.observability import observability
+from ..models import Model
+from ..models.parameters import Parameters
+from ..numerics.kalman import GaussianState
+from ..results.results import scale_and_delay
+
+# Where the equation holds: °C, with the sea's coldest water; m.
+TEMPERATURES, DEEPEST = (-2.0, 35.0), 1000.0
+# The salinity of water that nobody measured, PSU: fresh to the saltiest sea.
+SALINITIES = (0.0, 40.0)
+# What is believed of a thermometer and of a measured salinity (2 σ), and of the equation (m/s).
+THERMOMETER, SALINOMETER, EQUATION = 0.5, 1.0, 0.5
+
+
+def speed_of_sound(temperature: float, salinity: float, depth: float = 0.0) -> float:
+    """Speed of sound, m/s, of water of a temperature (°C) and salinity (PSU) at a depth (m), by Medwin (1975)."""
+    return _of_salinity_35(temperature, depth) + _by_salinity(temperature) * (salinity - 35.0)
+
+
+def _of_salinity_35(temperature: float, depth: float) -> float:
+    cubic = 4.6 * temperature - 0.055 * temperature**2 + 0.00029 * temperature**3
+    return 1449.2 + cubic + 0.016 * depth
+
+
+def _by_salinity(temperature: float) -> float:
+    """m/s for each PSU."""
+    return 1.34 - 0.010 * temperature
+
+
+class Between(NamedTuple):
+    """What a quantity is at least and at most."""
+
+    least: float
+    most: float
+
+    def meets(self, other: Between) -> bool:
+        """Whether the two have a value in common."""
+        return self.least <= other.most and other.least <= self.most
+
+
+@dataclass(frozen=True)
+class Water:
+    """What a recording says of its water, nan where it says nothing.
+
+    temperature: °C; temperature_error: half of its range, °C. salinity: PSU, measured. depth: m. used: speed of sound
+    that the DVL counted with, m/s. source: the topic of the temperature.
+    """
+
+    temperature: float = math.nan
+    temperature_error: float = THERMOMETER
+    salinity: float = math.nan
+    depth: float = 0.0
+    used: float = math.nan
+    source: str = ""
+
+    @property
+    def speed(self) -> Between | None:
+        """The water's speed of sound, m/s; None without a temperature that the equation holds for."""
+        if not (TEMPERATURES[0] <= self.temperature <= TEMPERATURES[1] and 0.0 <= self.depth <= DEEPEST):
+            return None
+        salinities = SALINITIES
+        if not math.isnan(self.salinity):
+            salinities = (max(self.salinity - SALINOMETER, 0.0), self.salinity + SALINOMETER)
+        least, most = (
+            speed_of_sound(self.temperature + sign * self.temperature_error, salinity, self.depth) + sign * EQUATION
+            for sign, salinity in zip((-1.0, 1.0), salinities, strict=True)
+        )
+        return Between(least, most)
+
+    @property
+    def scale(self) -> Between | None:
+        """The scale-factor error that this makes; None where the water's speed or the DVL's is not known."""
+        speed = self.speed
+        if speed is None or math.isnan(self.used):
+            return None
+        return Between(self.used / speed.most - 1.0, self.used / speed.least - 1.0)
+
+    def salinities(self, speed: Between) -> Between:
+        """The salinities, of those that water has, at which sound has such a speed at this temperature."""
+        least, most = (
+            35.0 + (each - _of_salinity_35(at, self.depth)) / _by_salinity(at)
+            for each, at in (
+                (speed.least, self.temperature + self.temperature_error),
+                (speed.most, self.temperature - self.temperature_error),
+            )
+        )
+        return Between(max(least, SALINITIES[0]), min(most, SALINITIES[1]))
+
+
+# As data, beside the water's own
+_KEYS = {"used": "dvl_speed_of_sound"}
+
+
+def water_document(water: Water) -> dict[str, Any]:
+    """Plain data, with None where nothing is known; ranges are least and most."""
+    ranges = {"speed_of_sound": water.speed, "scale_explained": water.scale}
+    return {
+        **{_KEYS.get(name, name): None if each != each else each for name, each in asdict(water).items()},
+        **{name: None if each is None else list(each) for name, each in ranges.items()},
+    }
+
+
+def water_of_document(document: Mapping[str, Any]) -> Water:
+    """What `water_document` gave. Raises LookupError, TypeError or ValueError for what is none."""
+    told = {each.name: document[_KEYS.get(each.name, each.name)] for each in fields(Water)}
+    source = str(told.pop("source"))
+    return Water(**{name: math.nan if each is None else float(each) for name, each in told.items()}, source=source)
+
+
+class CauseOfScale(NamedTuple):
+    """What a scale-factor error may come from.
+
+    sentence: in full. brief: behind the words "speed of sound", in a line of a terminal. setting: the speed of sound to
+    set, m/s, nan where there is none to say.
+    """
+
+    sentence: str
+    brief: str
+    setting: float
+
+
+def cause_of_scale(
+    model: Model, state: GaussianState, parameters: Parameters, water: Water | None
+) -> CauseOfScale | None:
+    """What a calibration's scale comes from; None where the recording tells nothing.
+
+    state: of a model, x (n,), P (n, n) of the recording alone, without what differs from day to day.
+    """
+    found = scale_and_delay(model, state, parameters)
+    is_shown = all(each.observed for each in observability(model, state.p, parameters) if each.axis == "scale")
+    if found.scale_std is None or not is_shown:
+        return cause_of_setting(water)
+    return cause(water, found.scale, found.scale_std)
+
+
+def cause_of_setting(water: Water | None) -> CauseOfScale | None:
+    """What the speed of sound that a DVL used makes of a scale that no motion has shown."""
+    if water is None or water.speed is None or water.scale is None:
+        return None
+    said = f"{_used(water)}; {_of_water(water, water.speed)}"
+    if water.scale.least <= 0.0 <= water.scale.most:
+        return CauseOfScale(f"{_begun(said)}. They agree.", f"{water.used:.1f} m/s used, as this water has", math.nan)
+    middle = 0.5 * (water.speed.least + water.speed.most)
+    return CauseOfScale(
+        f"{_begun(said)}. That makes a scale of {_percent(water.scale)}: set the water's speed of sound.",
+        f"{water.used:.1f} m/s used, but this water has {water.speed.least:.1f} to {water.speed.most:.1f}",
+        math.nan if math.isnan(water.salinity) else middle,
+    )
+
+
+def cause(water: Water | None, scale: float, std: float) -> CauseOfScale | None:
+    """What a scale-factor error with this σ comes from, and what to set; None where the recording tells nothing."""
+    if water is None or (water.speed is None and math.isnan(water.used)):
+        return None
+    speed, explained = water.speed, water.scale
+    found = Between(scale - 2.0 * std, scale + 2.0 * std)
+    parts = ["" if math.isnan(water.used) else _used(water), "" if speed is None else _of_water(water, speed)]
+    said = f"Scale {100.0 * scale:+.2f} ± {200.0 * std:.2f} % (2σ): {'; '.join(filter(None, parts))}"
+    new = water.used / (1.0 + scale)
+    if speed is None:
+        return CauseOfScale(
+            f"{said}. Set to {new:.1f} m/s, it would read right.",
+            f"set to {new:.1f} m/s it would read right (the DVL used {water.used:.1f})",
+            new,
+        )
+    if explained is None:
+        was = [each * (1.0 + end) for each, end in zip(speed, found, strict=True)]
+        return CauseOfScale(
+            f"{said}. The speed of sound explains the scale if the DVL was set to {was[0]:.0f} to {was[1]:.0f} m/s.",
+            f"{speed.least:.1f} to {speed.most:.1f} m/s here; what the DVL used is not known",
+            math.nan,
+        )
+    if not explained.meets(found):
+        return CauseOfScale(
+            f"{said}. That explains {_percent(explained)}; the rest has another cause, such as beam angles or the "
+            f"reference. Set to {new:.1f} m/s, the DVL would read right in this water.",
+            f"explains {_percent(explained)} of the scale, not the rest",
+            new,
+        )
+    if found.least <= 0.0 <= found.most:
+        return CauseOfScale(
+            f"{said}. The setting agrees with the scale that was found.",
+            f"the DVL's {water.used:.1f} m/s agrees with the scale",
+            math.nan,
+        )
+    condition = ""
+    if math.isnan(water.salinity):
+        needed = water.salinities(Between(water.used / (1.0 + found.most), water.used / (1.0 + found.least)))
+        condition = f" if the salinity is {needed.least:.0f} to {needed.most:.0f} PSU"
+    return CauseOfScale(
+        f"{said}. That explains the scale{condition}: set the speed of sound to {new:.1f} m/s.",
+        f"{new:.1f} m/s would take the scale out (the DVL used {water.used:.1f})",
+        new,
+    )
+
+
+def _used(water: Water) -> str:
+    return f"the DVL used a speed of sound of {water.used:.1f} m/s"
+
+
+def _of_water(water: Water, speed: Between) -> str:
+    salinity = "unknown salinity (0 to 40 PSU)" if math.isnan(water.salinity) else f"{water.salinity:.1f} PSU"
+    source = f" ({water.source})" if water.source else ""
+    named = f"water of {water.temperature:.1f} °C{source} and {salinity}"
+    return f"{named} has {speed.least:.1f} to {speed.most:.1f} m/s"
+
+
+def _percent(scale: Between) -> str:
+    return f"{100.0 * scale.least:+.2f} to {100.0 * scale.most:+.2f} %"
+
+
+def _begun(said: str) -> str:
+    return said[:1].upper() + said[1:]

@@ -1,0 +1,320 @@
+"""A block's streams as they are compared: thinned, in seconds, without samples that are far off.
+
+One bends the curve that is read between the DVL's samples for all references about it, and no gate would see that.
+
+A block of time of all streams, copied from what the aligner holds: what G2 is solved by, in whatever thread.
+
+Samples of a slow DVL that are far off, left out before they bend the curve that references are held against.
+
+Of a fast stream, neighbours tell a sample that is far off (spikes.py). Between the samples of a slow one a vehicle can
+turn: there neighbours only raise a suspicion, and the references about it decide. Without a sample that is wrong they
+fit much better, with whatever delay they are beside it; without one that is right they do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from ..models.parameters import Parameters
+from ..numerics.frames import ENU_FROM_NED, Array
+from ..numerics.robust import median, robust_std, steps
+from ..numerics.samples import FRAME_CODES, Codes, Index, Mask, Stamps, VelocityFrame
+from ..results.thinned_recording import NOT_MEASURED, thinned
+from ..streams.interpolation import MARGIN_S, DvlColumns, ImuColumns, ReferenceColumns, binned
+from ..streams.outliers import beside, off_neighbours, without_spikes
+from ..streams.position_velocities import are_positions, of_moments
+from .observation_rows import DelayedRows
+
+_BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
+# No vehicle with a DVL turns faster, rad/s.
+FASTEST_TURN = 20.0
+_BITS = np.array([1, 2, 4], dtype=np.uint8)
+# A stream that scatters by less about what its neighbours tell is taken to do so by this, m/s; one whose samples are
+# further apart than this, s, by more: a vehicle turns between them, though not by metres per second.
+LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
+
+
+class Cleaned(NamedTuple):
+    """A block's samples.
+
+    raw: its own references (J,) as the messages had them, thinned; own: places of them in the block. good: (J,) those
+    that are no outliers, which are in reference. dvl: without outliers; binned_dvl: as a curve is read from it.
+    dvl_ns, reference_ns: stamps. noise_dvl: (3, 3) (m/s)², the DVL's mean covariance. own_dvl, own_imu: places of the
+    block's own samples. are_compared: whether it has references, and the others there are for them. is_slow: the DVL.
+    """
+
+    block: Block
+    raw: ReferenceSamples
+    own: Index
+    good: Mask
+    reference: ReferenceColumns
+    reference_ns: Stamps
+    reference_spikes: int
+    dvl: DvlColumns
+    binned_dvl: DvlColumns
+    dvl_ns: Stamps
+    dvl_spikes: int
+    noise_dvl: Array
+    imu: ImuColumns
+    own_dvl: slice
+    own_imu: slice
+    are_compared: bool
+    is_slow: bool
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether DVL and IMU are enough for curves."""
+        return len(self.dvl.times) >= 6 and len(self.imu.times) >= 2
+
+
+def cleaned(block: Block, parameters: Parameters, epoch_ns: int, contradicted: Stamps) -> Cleaned:
+    """A block's samples. epoch_ns: stamp of time 0. contradicted: stamps of DVL samples that are left out already."""
+    block = block._replace(reference=_of_moments(block.reference, parameters))
+    own = _own(block)
+    raw = block.reference.part(own)
+    reference, good = _reference(block, own, raw, parameters, epoch_ns)
+    noise_dvl: Array = np.eye(3)
+    dvl, dvl_ns, dvl_spikes = DvlColumns(np.zeros(0), np.zeros((0, 3))), block.dvl.stamps_ns[:0], 0
+    imu = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
+    are_compared = len(reference.times) > 0 and not block.silent
+    if are_compared:
+        dvl, noise_dvl, dvl_ns, dvl_spikes = _dvl_columns(block, parameters, epoch_ns, contradicted)
+        imu = _imu(block.imu, epoch_ns)
+    from_s, to_s = seconds(np.array([block.from_ns, block.end_ns]), epoch_ns).tolist()
+    return Cleaned(
+        block=block,
+        raw=raw,
+        own=own,
+        good=good,
+        reference=reference,
+        reference_ns=raw.stamps_ns[good],
+        reference_spikes=int(np.count_nonzero(~good)),
+        dvl=dvl,
+        binned_dvl=dvl if is_slow(dvl.times) else DvlColumns(*binned(*dvl)),
+        dvl_ns=dvl_ns,
+        dvl_spikes=dvl_spikes,
+        noise_dvl=noise_dvl,
+        imu=imu,
+        own_dvl=slice(*np.searchsorted(dvl.times, (from_s, to_s)).tolist()),
+        own_imu=slice(*np.searchsorted(imu.times, (from_s, to_s)).tolist()),
+        are_compared=are_compared,
+        is_slow=is_slow(dvl.times),
+    )
+
+
+def _dvl_columns(
+    block: Block, p: Parameters, epoch_ns: int, contradicted: Stamps
+) -> tuple[DvlColumns, Array, Stamps, int]:
+    """A block's DVL samples that are no outliers (N), their mean covariance (3, 3), their stamps (N,), and how many
+    outliers it has."""
+    stamps_ns, velocity, covariance = block.dvl
+    if len(contradicted):
+        known = ~np.isin(stamps_ns, contradicted, assume_unique=True)
+        stamps_ns, velocity, covariance = stamps_ns[known], velocity[known], covariance[known]
+    # one bends the curve that is read between samples for all references about it, and no gate would see that
+    good = _good(stamps_ns, velocity)
+    n_spikes = 0
+    if not good.all():
+        spikes = stamps_ns[~good]
+        stamps_ns, velocity, covariance = stamps_ns[good], velocity[good], covariance[good]
+        n_spikes = int(np.count_nonzero((spikes >= block.from_ns) & (spikes < block.end_ns)))
+    given = ~np.isnan(covariance[:, 0, 0])
+    noise: Array = np.eye(3) * p.gnss_free_std**2
+    if given.any() and p.use_message_covariance:
+        noise = covariance[given].mean(axis=0)
+    return DvlColumns(seconds(stamps_ns, epoch_ns), velocity), noise, stamps_ns, n_spikes
+
+
+def _imu(samples: ImuSamples, epoch_ns: int) -> ImuColumns:
+    values = samples.values
+    rates = np.where(np.abs(values[:, 4:7]) < FASTEST_TURN, values[:, 4:7], np.nan)
+    return ImuColumns(seconds(samples.stamps_ns, epoch_ns), values[:, :4], rates)
+
+
+def _reference(
+    block: Block, own: Index, raw: ReferenceSamples, p: Parameters, epoch_ns: int
+) -> tuple[ReferenceColumns, Mask]:
+    """A block's references without outliers, and which of its own, as thinned, these are.
+
+    own: places of them in the block. raw: themselves.
+    """
+    around = block.reference
+    velocity = around.values[:, :3]
+    if around.unmeasured.any():
+        velocity = np.where((around.unmeasured[:, None] & _BITS) == 0, velocity, 0.0)
+    good = _good(around.stamps_ns, velocity)[own]
+    stamps_ns, values, frames, unmeasured = raw if good.all() else raw.part(np.flatnonzero(good))
+    noise = values[:, 3:12].reshape(-1, 3, 3)
+    given = ~np.isnan(noise[:, 0, 0]) & p.use_message_covariance
+    noise = np.where(given[:, None, None], noise, np.eye(3) * p.gnss_aided_std**2)
+    velocity, ned = values[:, :3], frames == _NED
+    if unmeasured.any():
+        axes = (unmeasured[:, None] & _BITS) != 0
+        velocity = np.where(axes, 0.0, velocity)
+        noise = np.where(axes[:, :, None] | axes[:, None, :], 0.0, noise) + np.eye(3) * np.where(
+            axes[:, :, None], NOT_MEASURED, 0.0
+        )
+    if ned.any():
+        velocity = np.where(ned[:, None], velocity @ ENU_FROM_NED.T, velocity)
+        noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
+    return ReferenceColumns(seconds(stamps_ns, epoch_ns), velocity, noise, frames == _BODY, given), good
+
+
+def _of_moments(around: ReferenceSamples, p: Parameters) -> ReferenceSamples:
+    """A block's references at the moments of their stamps."""
+    if not are_positions(p):
+        return around
+    velocity = of_moments(1e-9 * (around.stamps_ns - around.stamps_ns[:1]), around.values[:, :3], p.position_window)
+    return around._replace(values=np.hstack([velocity, around.values[:, 3:]]))
+
+
+def _own(block: Block) -> Index:
+    """Which of a block's references are its own and no margin's, thinned."""
+    stamps_ns = block.reference.stamps_ns
+    start, end = np.searchsorted(stamps_ns, (block.from_ns, block.end_ns)).tolist()
+    return start + thinned(stamps_ns[start:end])
+
+
+def is_slow(times: Array) -> bool:
+    """Whether samples at times (N,) s are so far apart that a vehicle turns between them."""
+    if len(times) < 2:
+        return False
+    apart = steps(times)
+    return float(apart.max()) > SLOW_S and float(median(apart)) > SLOW_S
+
+
+def _good(stamps_ns: Stamps, velocity: Array) -> Mask:
+    """Which samples of a stream are no spikes, (N,) of (N,) ns and (N, 3) m/s."""
+    smallest = LEAST_SCATTER_SLOW_MPS if is_slow(1e-9 * stamps_ns) else LEAST_SCATTER_MPS
+    return without_spikes(velocity, smallest=smallest, also_at_ends=True)
+
+
+def seconds(stamps_ns: Stamps, epoch_ns: int) -> Array:
+    """Times (N,) s since the epoch."""
+    since: Array = (stamps_ns - epoch_ns) * 1e-9
+    return since
+
+
+MARGIN_NS = round(MARGIN_S * 1e9)
+
+
+class DvlSamples(NamedTuple):
+    """stamps_ns (N,), velocity (N, 3) m/s and covariance (N, 3, 3) (m/s)², nan where not given; DVL frame."""
+
+    stamps_ns: Stamps
+    velocity: Array
+    covariance: Array
+
+
+class ReferenceSamples(NamedTuple):
+    """stamps_ns (J,), values (J, 12), frames (J,) and unmeasured (J,), as in `Track`."""
+
+    stamps_ns: Stamps
+    values: Array
+    frames: Codes
+    unmeasured: Codes
+
+    def part(self, at: Index) -> ReferenceSamples:
+        """Some of them."""
+        return ReferenceSamples(self.stamps_ns[at], self.values[at], self.frames[at], self.unmeasured[at])
+
+
+class ImuSamples(NamedTuple):
+    """stamps_ns (M,) and values (M, 12), as in `Track`."""
+
+    stamps_ns: Stamps
+    values: Array
+
+
+class Block(NamedTuple):
+    """All streams from MARGIN_NS before from_ns until MARGIN_NS behind end_ns, copied.
+
+    new_days: how many days begin with it. silent: the DVL stops behind it for so long that tracks forget what was
+    before.
+    """
+
+    from_ns: int
+    end_ns: int
+    new_days: int
+    silent: bool
+    dvl: DvlSamples
+    reference: ReferenceSamples
+    imu: ImuSamples
+
+
+# Scatter about what neighbours tell, from which on a sample is suspicious; less than so much is noise, m/s.
+SUSPICIOUS, LEAST_NOISE_MPS = 6.0, 0.03
+# So many of them are looked at, those furthest off: a block of 10 s of a DVL that is wrong more often is lost anyway.
+MOST = 8
+# It is left out if by that the references' squared misfit falls below this share, and by more than noise can make it.
+SHARE_LEFT, LEAST_GAIN = 0.8, 50.0
+# Delays whose probability is smaller than that of the likeliest by more than this (logarithm) have no say.
+UNLIKELY = 10.0
+# A reference is beside a sample that is nearer than this, s: where the curve between samples is most of all that one.
+BESIDE_S = 0.25
+
+
+def without_contradicted(
+    dvl: DvlColumns,
+    reference_times: Array,
+    rows_of: Callable[[DvlColumns], DelayedRows],
+    misfits: Callable[[DelayedRows], tuple[Array, Array]],
+    delays_s: Array,
+) -> tuple[Mask, DelayedRows]:
+    """Which DVL samples (N,) are not contradicted, and the references' rows by these.
+
+    reference_times: (J,) s. rows_of: what references are beside some of the DVL's samples. misfits: as
+    `DelayBank.misfits`; delays_s: (K,) of its hypotheses.
+    """
+    kept = np.arange(len(dvl.times))
+    rows = rows_of(dvl)
+    while len(rows):
+        tried = []
+        for at in _suspicious(dvl.velocity[kept]).tolist():
+            without = np.delete(kept, at)
+            fewer = rows_of(DvlColumns(*(column[without] for column in dvl)))
+            share = _share_left(dvl.times[kept[at]], reference_times, rows, fewer, misfits, delays_s)
+            tried.append((share, without, fewer))
+        share, without, fewer = min(tried, key=lambda each: each[0], default=(1.0, kept, rows))
+        if share > SHARE_LEFT:
+            break
+        kept, rows = without, fewer
+    mask: Mask = np.zeros(len(dvl.times), dtype=bool)
+    mask[kept] = True
+    return mask, rows
+
+
+def _share_left(
+    sample_s: float,
+    reference_times: Array,
+    rows: DelayedRows,
+    fewer: DelayedRows,
+    misfits: Callable[[DelayedRows], tuple[Array, Array]],
+    delays_s: Array,
+) -> float:
+    """What is left of the misfit without a sample, by the delay to which that matters least; 1 if it gains too little.
+
+    A delay by which no reference is beside the sample cannot say that it is right.
+    """
+    both = rows.index[np.isin(rows.index, fewer.index)]
+    if not len(both):
+        return 1.0
+    before, _ = misfits(rows.part(np.isin(rows.index, both)))
+    after, log_share = misfits(fewer.part(np.isin(fewer.index, both)))
+    distance = np.abs(reference_times[both][:, None] + delays_s - sample_s).min(axis=0)
+    has_say = (log_share > log_share.max() - UNLIKELY) & (distance < BESIDE_S)
+    if not has_say.any():
+        return 1.0
+    share = np.where(before - after > LEAST_GAIN, after / np.maximum(before, 1e-300), 1.0)
+    return float(share[has_say].max())
+
+
+def _suspicious(velocity: Array) -> Index:
+    """Which samples of (N, 3) m/s are further from what neighbours tell than most, and than those beside them."""
+    off = off_neighbours(velocity)
+    far = (np.abs(off) / np.maximum(robust_std(off), LEAST_NOISE_MPS)).max(axis=1)
+    found = np.flatnonzero((far > SUSPICIOUS) & (far >= beside(far)))
+    return found[np.argsort(-far[found], kind="stable")[:MOST]]

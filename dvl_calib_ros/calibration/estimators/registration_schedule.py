@@ -1,0 +1,244 @@
+"""Which clock is late: the DVL's, the reference's, or the IMU's. G2 takes it to be the DVL's, and is told otherwise.
+
+Where the reference is stamped late, attitude and angular velocity of the wrong time turn its velocity by ω ρ, which a
+lever arm of ρ u explains almost as well: so what G2 has kept of each day is registered.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from ...verdict.reasons import Reason
+from ..assessment.dead_reckoning import dead_reckoned
+from ..filters.cross_validation import folds_of
+from ..models.parameters import Parameters
+from ..numerics.frames import Array
+from ..numerics.samples import FRAMES, Codes, Mask
+from ..numerics.tables import RowTable
+from ..registration.configuration_check import fitting_configuration
+from ..registration.motion_streams import MotionStreams, make_motion
+from ..registration.registration import Registration, register
+from ..results.thinned_recording import (
+    KEPT_EVERY_S,
+    MEASURED_BELOW,
+    Terms,
+    ThinnedBlock,
+    ThinnedRecording,
+    held_out_error,
+    typical_error,
+)
+from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
+from .delay_hypotheses import DelayBank
+from .estimator import Rest
+from .posterior_types import Posterior
+
+# Live, what was found stands until so much more is there.
+AGAIN_FROM = 1.5
+# Fewer blocks tell nothing, and live there is no look before a minute. Of more, which are 40 minutes, the oldest are
+# forgotten: no more rows are looked at than a third of these have, and a node's memory is to be flat.
+ENOUGH, FIRST_LOOK, MOST = 2, 6, 240
+# Rows that a block of 10 s has of each stream.
+MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
+
+
+class _DvlVelocities(RowTable):
+    """times s and velocities m/s of the DVL, and the trace of its noise, (m/s)²."""
+
+    IS_REUSED = True  # a motion has copies
+    LAYOUT: ClassVar = {"times": (np.float64, ()), "velocity": (np.float64, (3,)), "noise": (np.float64, ())}
+    times: Array
+    velocity: Array
+    noise: Array
+
+
+class _Reference(RowTable):
+    """The same of references, with the variance (m/s)² of each axis, as of `ReferenceColumns`."""
+
+    IS_REUSED = True  # a motion has copies
+    LAYOUT: ClassVar = {
+        "times": (np.float64, ()),
+        "velocity": (np.float64, (3,)),
+        "variance": (np.float64, (3,)),
+        "in_body": (np.bool_, ()),
+        "claimed": (np.bool_, ()),
+    }
+    times: Array
+    velocity: Array
+    variance: Array
+    in_body: Mask
+    claimed: Mask
+
+
+class _Imu(RowTable):
+    """times s, attitudes and rates of the IMU, as of `ImuColumns`."""
+
+    IS_REUSED = True  # a motion has copies
+    LAYOUT: ClassVar = {
+        "times": (np.float64, ()),
+        "orientation": (np.float64, (4,)),
+        "angular_velocity": (np.float64, (3,)),
+    }
+    times: Array
+    orientation: Array
+    angular_velocity: Array
+
+
+class _Registered:
+    """What is looked at of the newest blocks, without what is of no use here, such as covariances between axes."""
+
+    def __init__(self) -> None:
+        self._streams = _DvlVelocities(), _Reference(), _Imu()
+        self._blocks: deque[tuple[int, ...]] = deque()  # rows of each in the streams
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    def take_room(self) -> None:
+        """Take all room that will be needed at once, so that memory does not grow for 40 minutes."""
+        for stream in self._streams:
+            stream.reserve((MOST + 1) * MOST_OF_A_BLOCK)
+
+    def add(self, kept: ThinnedBlock) -> None:
+        """Take a block; of more than `MOST` the oldest is forgotten."""
+        r = kept.reference
+        variance = np.diagonal(r.noise, axis1=1, axis2=2)
+        own_noise = np.full(len(kept.dvl.times), np.trace(kept.noise_dvl))
+        columns = (*kept.dvl, own_noise), (r.times, r.velocity, variance, r.in_body, r.claimed), kept.imu
+        for stream, own in zip(self._streams, columns, strict=True):
+            at = stream.extend(len(own[0]))
+            for name, column in zip(stream.LAYOUT, own, strict=True):
+                getattr(stream, name)[at] = column
+        self._blocks.append(tuple(len(own[0]) for own in columns))
+        if len(self._blocks) > MOST:
+            for stream, n in zip(self._streams, self._blocks.popleft(), strict=True):
+                stream.forget_before(stream.begin + n)
+
+    def clear(self) -> None:
+        """Forget all blocks."""
+        self._blocks.clear()
+        for stream in self._streams:
+            stream.clear()
+
+    def recording(self) -> ThinnedRecording:
+        """All that is there, as for verification."""
+        (dvl_times, dvl, own_noise), (times, velocity, variance, in_body, claimed), imu = self._columns()
+        reference = ReferenceColumns(times, velocity, variance[:, :, None] * np.eye(3), in_body, claimed)
+        return ThinnedRecording(DvlColumns(dvl_times, dvl), own_noise, reference, ImuColumns(*imu))
+
+    def motion(self) -> MotionStreams | None:
+        """All that is there, without references that are not like most; None where that is too little."""
+        dvl, (times, velocity, variance, in_body, _), imu = self._columns()
+        is_measured = variance < MEASURED_BELOW
+        alike = in_body == (2 * np.count_nonzero(in_body) > len(in_body))
+        x, y, z = (2 * np.count_nonzero(is_measured[alike], axis=0) > np.count_nonzero(alike)).tolist()
+        return make_motion(
+            (dvl[0].copy(), dvl[1].copy()),
+            (times[alike], velocity[alike]),
+            not bool(in_body[alike].all()) if alike.any() else False,
+            (x, y, z),
+            ImuColumns(*(column.copy() for column in imu)),
+        )
+
+    def _columns(self) -> tuple[list[Any], ...]:
+        return tuple(
+            [getattr(stream, name)[stream.begin : stream.size] for name in stream.LAYOUT] for stream in self._streams
+        )
+
+
+class ToldSoFar(NamedTuple):
+    """What blocks have told so far: the bank, what it found, and the stamp (ns) of their time 0."""
+
+    bank: DelayBank
+    posterior: Posterior
+    epoch_ns: int
+
+
+class Looked(NamedTuple):
+    """After so many blocks: how the instruments stand, what configuration fits where the one given does not, and,
+    live, what is left."""
+
+    blocks: int = 0
+    registration: Registration | None = None
+    configuration: Reason | None = None
+    rest: Rest | None = None
+
+
+class KeptClocks:
+    """What registration says of clocks and frames, of the days that are over and of this one."""
+
+    def __init__(self, parameters: Parameters, live: bool, known: Registration | None = None) -> None:
+        """live: they go on for hours. known: what registration says, where nobody has to ask."""
+        self._parameters, self._is_live, self._known = parameters, live, known
+        self._seen = _Registered()
+        if live:
+            self._seen.take_room()
+        self._blocks = 0  # of this day
+        self._declared = np.zeros(len(FRAMES), dtype=np.int64)  # references said to be in each frame
+        self._over: Looked | None = None  # of a day that is over, where something was off
+        self._latest = Looked()
+
+    def add(self, kept: ThinnedBlock, frames: Codes, from_ns: int) -> None:
+        """Take a block's streams, which begins at a stamp. frames: (J,) codes of those that its references are said to
+        be in."""
+        self._seen.add(kept)
+        self._declared += np.bincount(frames, minlength=len(FRAMES))
+        self._blocks += 1
+
+    def end_day(self) -> None:
+        """The blocks from here on are of another day, whose clocks may be others."""
+        found = self.looked()
+        self._over = found if found.configuration or self.contradiction(found) else None
+        self._seen.clear()
+        self._blocks, self._latest = 0, Looked()
+
+    def look_again(self, told: ToldSoFar | None) -> None:
+        """Look if there is so much more to see than the last time. told: by the blocks; None for nothing."""
+        if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest.blocks, FIRST_LOOK):
+            self._latest = self._look(told)
+
+    def looked(self, told: ToldSoFar | None = None, *, fresh: bool = True) -> Looked:
+        """What the blocks so far show, or a day that is over, where something was off.
+
+        fresh: all of them, else those there were when `look_again` looked.
+        """
+        if self._over is not None:
+            return self._over
+        if fresh and self._blocks > self._latest.blocks:
+            self._latest = self._look(told)
+        return self._latest
+
+    def contradiction(self, looked: Looked) -> Reason | None:
+        """What clocks fit what was seen, where one is off."""
+        return None if looked.registration is None else looked.registration.contradiction(self._parameters)
+
+    def _look(self, told: ToldSoFar | None) -> Looked:
+        motion = self._seen.motion() if self._known is None and len(self._seen) >= ENOUGH else None
+        if motion is None:
+            return Looked(self._blocks, self._known)
+        nominal, lever_arm = self._parameters.rotation_dvl_from_body.T, np.array(self._parameters.lever_arm)
+        declared = FRAMES[int(self._declared.argmax())]
+        try:
+            found = register(motion, nominal, lever_arm)
+            configuration = fitting_configuration(motion, declared, nominal, lever_arm, found)
+            rest = self._rest(told) if self._is_live and told is not None else None
+            return Looked(self._blocks, found, configuration, rest)
+        except np.linalg.LinAlgError:  # numbers that ran away
+            return Looked(self._blocks)
+
+    def _rest(self, told: ToldSoFar) -> Rest:
+        """Of all that is kept, corrected by what the blocks have told without each fold."""
+        recording, p = self._seen.recording(), self._parameters
+        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + told.epoch_ns
+        without = [[states[-1]] for states in told.bank.without_folds()]
+        terms = [Terms.of_state(state.x) for [state] in without]
+        held_out = held_out_error(recording, stamps_ns, np.zeros(len(stamps_ns), dtype=np.intp), without, p)
+        return Rest(
+            held_out,
+            typical_error(recording, Terms.of_state(told.posterior.state.x), p),
+            recording.judged(p),
+            dead_reckoned(recording, folds_of(stamps_ns, p), terms, p, told.epoch_ns, told.posterior.heading),
+            not recording.reference.in_body.any(),
+        )
