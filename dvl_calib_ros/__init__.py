@@ -4,7 +4,7 @@ The public interface, which is `api`: what the commands do, as functions, and wh
 when it is asked for, since the command line must not wait for NumPy to print its help.
 """
 
-from .version import __version__ as __version__
+from .version import __version__
 
 TYPE_CHECKING = False  # as in typing, which takes longer than all else here
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dvl_calib_ros.calibration.results.results.results import Result
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.typesys import Stores, get_typestore
@@ -22,6 +21,7 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
+from dvl_calib_ros.calibration.results.results import Result
 from dvl_calib_ros.files.result_file import result_document, result_text
 from dvl_calib_ros.messages.decode import MessageDecoder
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from dvl_calib_ros.calibration.results.results.results import Result
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros import NODE, PATIENCE_S, World, until
@@ -21,6 +20,7 @@ from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.results.results import Result
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.messages.live_feed import MessageFeed

@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from dvl_calib_ros.calibration.comparison.mounting_change.mounting_change import Comparison, compare
-from dvl_calib_ros.calibration.results.results.extrinsics import Extrinsics
 from io_fixtures import run, write_bag
 from matplotlib.category import StrCategoryLocator
 from matplotlib.figure import Figure
@@ -16,16 +14,17 @@ from matplotlib.ticker import FixedLocator
 
 from dvl_calib_ros.bag_replay.replay import Replayed, replay
 from dvl_calib_ros.calibration.assessment.dead_reckoning import Drift, Navigation
+from dvl_calib_ros.calibration.comparison.mounting_change import Comparison, compare
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_of
-from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
-from dvl_calib_ros.diagnosis.followed import Followed
-from dvl_calib_ros.diagnosis.noise_findings import NoiseFinding
-from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict, FoundEffect
-from dvl_calib_ros.diagnosis.series import DiagnosisSeries
-from dvl_calib_ros.diagnosis.unexplained import Unexplained
-from dvl_calib_ros.diagnosis.where import GapPlace
+from dvl_calib_ros.calibration.results.extrinsics import Extrinsics
+from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
+from dvl_calib_ros.diagnosis.answer.gap_location import GapPlace
+from dvl_calib_ros.diagnosis.answer.noise_findings import NoiseFinding
+from dvl_calib_ros.diagnosis.answer.plotted_series import DiagnosisSeries, Followed
+from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict, FoundEffect
+from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.evaluation.cross_check import CrossCheck
 from dvl_calib_ros.evaluation.results import (
     UNCALIBRATED,

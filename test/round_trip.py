@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli.common import write_json
-from dvl_calib_ros.diagnosis.results import diagnosis_document
+from dvl_calib_ros.diagnosis.answer.results import diagnosis_document
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from ..calibration.models import BY_VELOCITY
 from ..calibration.models.parameter_spec import ParameterError
 from ..calibration.models.parameters import Parameters
-from ..diagnosis.results import Diagnosis
+from ..diagnosis.answer.results import Diagnosis
 from ..discovery.discover import Discovery, Given, discover
 from ..errors import InputError
 from ..examination.examine import Examination

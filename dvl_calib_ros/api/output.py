@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..calibration.comparison.mounting_change import Comparison
-from ..diagnosis.results import Diagnosis
+from ..diagnosis.answer.results import Diagnosis
 from ..disk.text_files import write_json
 from ..errors import InputError
 from ..examination.examine import Examination
@@ -93,7 +93,7 @@ def _plain(result: Any) -> Callable[[], Any]:
 
         return lambda: comparison_document(result)
     if isinstance(result, Diagnosis):
-        from ..diagnosis.results import diagnosis_document
+        from ..diagnosis.answer.results import diagnosis_document
 
         return lambda: diagnosis_document(result)
     from ..evaluation.cross_check import CrossCheck, cross_check_document

@@ -203,7 +203,7 @@ class BagWriter:
 class _Part:
     """One file of a bag."""
 
-    def __init__(self, writer: McapWriter) -> None:
+    def __init__(self, writer: Writer) -> None:
         self.writer = writer
         self.connections: dict[Channel, Any] = {}
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NoReturn
 
-from ..streams import give_up, open_streams, say
+from ..standard_streams import give_up, open_streams, say
 from ..version import __version__
 from .commands import COMMANDS
 

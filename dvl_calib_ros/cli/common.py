@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from ..streams import give_up
+from ..standard_streams import give_up
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..streams import give_up
+from ..standard_streams import give_up
 from . import common
 from .common import add_report_option, report_writer
 

@@ -48,11 +48,11 @@ def run(arguments: argparse.Namespace) -> None:
         run_against_simulator(arguments, DEFAULTS)
         return
     check_without(arguments)
-    from ..diagnosis.compensation import compensated, parameter_file
+    from ..diagnosis.answer.compensation import compensated, parameter_file
+    from ..diagnosis.answer.results import diagnosis_document
+    from ..diagnosis.answer.simulated_twin import write_twins
     from ..diagnosis.diagnose import diagnose
-    from ..diagnosis.recordings import recording_names
-    from ..diagnosis.results import diagnosis_document
-    from ..diagnosis.twin_bags import write_twins
+    from ..diagnosis.model.recorded_streams import recording_names
     from ..disk.atomic import save_all
     from ..present import diagnosis as present
 
@@ -120,7 +120,7 @@ def _applied_to_each(path: Path | None, names: Sequence[str]) -> dict[str, Path]
 
 def _check_twins(folder: Path | None, names: Sequence[str]) -> None:
     """Raise InputError if a twin is there already, before work is done."""
-    from ..diagnosis.twin_bags import twin_paths
+    from ..diagnosis.answer.simulated_twin import twin_paths
     from ..errors import InputError
 
     if folder is None:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ..streams import say
+from ..standard_streams import say
 from . import common
 from .common import add_report_option, report_writer
 

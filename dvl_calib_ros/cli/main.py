@@ -17,7 +17,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         return run(argv)
     except KeyboardInterrupt:
-        from ..streams import say
+        from ..standard_streams import say
 
         say(f"dvl-calib {next((word for word in argv if not word.startswith('-')), '')}: interrupted")
         return 130

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..streams import say
+from ..standard_streams import say
 from . import common
 
 if TYPE_CHECKING:

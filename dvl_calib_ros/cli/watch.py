@@ -20,7 +20,7 @@ from typing import IO, TYPE_CHECKING
 
 from ..errors import printable
 from ..node.main import ENDS_WITH_STDIN
-from ..streams import say
+from ..standard_streams import say
 from . import common
 
 if TYPE_CHECKING:

@@ -20,25 +20,35 @@ from ..errors import InputError
 from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
-from .clock_or_arm import ARM, LAG, TWO_CLOCKS, Combination, combination, opened_combination, with_moved, with_open
-from .closure import Gap, closure_alone, held_out, measure_gap
-from .composed import amplitudes, is_time_of_run
-from .dvl import dvl_seen
-from .fitting import around, prior_std
-from .intervals import Times, Triple, covariance_of
-from .least_squares import WhitenedLeastSquares
-from .noise_findings import noise_findings
-from .recordings import RecordedStreams, load_recordings
-from .registered import check_clocks
-from .results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
-from .selection import EffectSelection, Selected, select
-from .series import collect_series
-from .settings import SETTINGS
-from .shown import somewhere, with_shown
-from .standing import borne_out, settled
-from .twin import twins
-from .unexplained import Unexplained, matters, moved_by
-from .where import places
+from .answer.confidence_intervals import Times, Triple, covariance_of
+from .answer.dvl_description import dvl_seen
+from .answer.gap_closure import Gap, closure_alone, held_out, measure_gap
+from .answer.gap_location import places
+from .answer.held_out_validation import borne_out, settled
+from .answer.noise_findings import noise_findings
+from .answer.plotted_series import collect_series
+from .answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
+from .answer.simulated_twin import twins
+from .fit.gauss_newton import around, prior_std
+from .model.hypothesis import amplitudes, is_time_of_run
+from .model.recorded_streams import RecordedStreams, load_recordings
+from .model.settings import SETTINGS
+from .noise.whitened_least_squares import WhitenedLeastSquares
+from .search.arm_clock_ambiguity import (
+    ARM,
+    LAG,
+    TWO_CLOCKS,
+    Combination,
+    combination,
+    opened_combination,
+    with_moved,
+    with_open,
+)
+from .search.effect_selection import EffectSelection, select
+from .search.identifiability import Selected
+from .search.initial_guess import check_clocks
+from .search.observable_parameters import somewhere, with_shown
+from .search.unexplained import Unexplained, matters, moved_by
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 

@@ -53,7 +53,7 @@ from ..files.result_file import (
 )
 from ..messages.decode import frame_name, heading_variance
 from ..messages.live_feed import MessageFeed
-from ..streams import say
+from ..standard_streams import say
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose

@@ -34,7 +34,7 @@ def main(args: Sequence[str] | None = None) -> int:
     standard error.
     """
     try:
-        from ..streams import open_streams
+        from ..standard_streams import open_streams
         from .shutdown import Ending
 
         open_streams()
@@ -103,7 +103,7 @@ def parameter_files(args: Sequence[str]) -> list[Path]:
 
 def _refused(error: Exception | str) -> int:
     from ..errors import printable
-    from ..streams import say
+    from ..standard_streams import say
 
     say(f"calibration_node: {printable(' '.join(str(error).split()))}")
     return 2

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..calibration.numerics.frames import Array
-from ..diagnosis.clock_or_arm import LAG
-from ..diagnosis.noise_findings import NoiseFinding
-from ..diagnosis.results import Diagnosis, FoundEffect
-from ..diagnosis.series import BODY_AXES, DiagnosisSeries, HeldOutTwin
-from ..diagnosis.where import GapPlace
+from ..diagnosis.answer.gap_location import GapPlace
+from ..diagnosis.answer.noise_findings import NoiseFinding
+from ..diagnosis.answer.plotted_series import BODY_AXES, DiagnosisSeries, HeldOutTwin
+from ..diagnosis.answer.results import Diagnosis, FoundEffect
+from ..diagnosis.search.arm_clock_ambiguity import LAG
 from ..effects.base import EffectParameter
 from ..effects.registry import EFFECTS
 from .document import (

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.signal import welch
 
 from ..calibration.numerics.frames import Array
-from ..diagnosis.series import DiagnosisSeries, HeldOutTwin
+from ..diagnosis.answer.plotted_series import DiagnosisSeries, HeldOutTwin
 from . import diagnosis_figures as figures
 from .diagnosis import twin_errors
 from .figure_style import Picture, picture

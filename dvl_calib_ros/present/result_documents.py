@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ..calibration.comparison.mounting_change import Comparison
-from ..diagnosis.results import Diagnosis
+from ..diagnosis.answer.results import Diagnosis
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.results import Evaluation
 from ..examination.examine import Examination

@@ -9,12 +9,12 @@ import numpy as np
 
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
-from ..diagnosis.curve import Curve
+from ..diagnosis.answer.results import Diagnosis
+from ..diagnosis.answer.simulated_twin import simulated, with_quiet_reference
 from ..diagnosis.diagnose import diagnose_recordings
-from ..diagnosis.recordings import RecordedStreams, load_recordings
-from ..diagnosis.results import Diagnosis
-from ..diagnosis.selection import EffectSelection
-from ..diagnosis.twin import simulated, with_quiet_reference
+from ..diagnosis.model.recorded_streams import RecordedStreams, load_recordings
+from ..diagnosis.model.stream_curve import Curve
+from ..diagnosis.search.effect_selection import EffectSelection
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..recordings.recording import Recording as Opened

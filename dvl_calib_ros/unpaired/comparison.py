@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from ..calibration.numerics.tests import holm
+from ..diagnosis.answer.results import Diagnosis
+from ..diagnosis.answer.results import DiagnosisVerdict as Explained
 from ..diagnosis.diagnose import VISIBLE_TIMES_TYPICAL
-from ..diagnosis.results import Diagnosis
-from ..diagnosis.results import DiagnosisVerdict as Explained
-from ..diagnosis.selection import EffectSelection
+from ..diagnosis.search.effect_selection import EffectSelection
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from ..verdict.reasons import Reason, finding

@@ -17,13 +17,13 @@ from scipy.stats import f as f_distribution
 from scipy.stats import norm, t
 
 from ..calibration.numerics.frames import Array
-from ..diagnosis.clock_or_arm import ATTITUDE_CLOCK, CLOCKS
-from ..diagnosis.composed import Values, amplitudes, whose_parameters
-from ..diagnosis.criteria import blocks_of
-from ..diagnosis.fitting import Fit
-from ..diagnosis.selection import EffectSelection
-from ..diagnosis.shown import somewhere
-from ..diagnosis.where import BANDS_HZ, regimes
+from ..diagnosis.answer.gap_location import BANDS_HZ, regimes
+from ..diagnosis.fit.gauss_newton import Fit
+from ..diagnosis.fit.selection_criteria import blocks_of
+from ..diagnosis.model.hypothesis import Values, amplitudes, whose_parameters
+from ..diagnosis.search.arm_clock_ambiguity import ATTITUDE_CLOCK, CLOCKS
+from ..diagnosis.search.effect_selection import EffectSelection
+from ..diagnosis.search.observable_parameters import somewhere
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS
 from .both_sides import Log

@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import robust_std
-from ..diagnosis.composed import Hypothesis, Problem, Values, amplitudes, is_time_of_run
-from ..diagnosis.folds import fitted_without, stretch_of
-from ..diagnosis.selection import EffectSelection
-from ..diagnosis.settings import SETTINGS
-from ..diagnosis.twin import simulated, with_quiet_reference
+from ..diagnosis.answer.simulated_twin import simulated, with_quiet_reference
+from ..diagnosis.fit.cross_validation import fitted_without, stretch_of
+from ..diagnosis.model.forward_model import Problem
+from ..diagnosis.model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run
+from ..diagnosis.model.settings import SETTINGS
+from ..diagnosis.search.effect_selection import EffectSelection
 from ..effects.base import ActsOn, ClockEffect, Effect, EffectWithMemory
 from .both_sides import Log
 from .effect_comparison import Size

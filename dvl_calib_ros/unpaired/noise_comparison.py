@@ -17,10 +17,10 @@ from scipy.stats import norm
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import robust_std
-from ..diagnosis.curve import FAST_ENOUGH_S
-from ..diagnosis.fitting import around
-from ..diagnosis.noise_findings import NoiseFinding
-from ..diagnosis.where import regimes
+from ..diagnosis.answer.gap_location import regimes
+from ..diagnosis.answer.noise_findings import NoiseFinding
+from ..diagnosis.fit.gauss_newton import around
+from ..diagnosis.model.stream_curve import FAST_ENOUGH_S
 from ..effects.base import EffectInput
 from .both_sides import Log
 from .stream_comparison import OUTLIER

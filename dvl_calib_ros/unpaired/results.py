@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
-from ..diagnosis.results import Diagnosis, diagnosis_document
+from ..diagnosis.answer.results import Diagnosis, diagnosis_document
 from ..verdict.answering import Answering
 from ..verdict.reasons import Reason
 

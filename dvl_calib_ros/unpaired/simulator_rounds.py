@@ -16,8 +16,8 @@ from typing import Any
 
 from ..bags.writer import Compression, Storage
 from ..calibration.models.parameters import Parameters
-from ..diagnosis.composed import amplitudes
-from ..diagnosis.results import Diagnosis, diagnosis_document
+from ..diagnosis.answer.results import Diagnosis, diagnosis_document
+from ..diagnosis.model.hypothesis import amplitudes
 from ..disk.text_files import write_json
 from ..effects.base import Effect
 from ..effects.registry import EFFECTS

@@ -9,7 +9,7 @@ import numpy as np
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import robust_std
 from ..calibration.streams.outliers import beside, off_neighbours
-from ..diagnosis.curve import FAST_ENOUGH_S
+from ..diagnosis.model.stream_curve import FAST_ENOUGH_S
 from .both_sides import DITHER_MPS, Log
 from .results import Triple
 from .stream_properties import DROPOUT_INTERVALS

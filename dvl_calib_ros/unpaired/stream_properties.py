@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import SampleBlock, Stamps
-from ..diagnosis.recordings import zeros_while_moving
+from ..diagnosis.model.recorded_streams import zeros_while_moving
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
 from ..recordings.topics import Topics

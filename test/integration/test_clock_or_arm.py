@@ -11,7 +11,7 @@ from conftest import ROOT, few
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.diagnosis.compensation import compensated
+from dvl_calib_ros.diagnosis.answer.compensation import compensated
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_folder
 
 RUNS = ("20250117163514", "20250117164453", "20250130113805")

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from command_line import fail, succeed
 from conftest import ROOT
-from dvl_calib_ros.calibration.results.results.mounting_quantities import quantities
 from io_fixtures import TOPICS, mcap_bytes, write_bag
 
 import dvl_calib_ros as dc
@@ -23,6 +22,7 @@ from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.calibration.filters.observability import MEASURES_VERTICAL
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
+from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, examine
 from dvl_calib_ros.examination.expected_result import EXPECTED_FROM_S

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.comparison.mounting_change.mounting_change import compare
 
 from dvl_calib_ros.bag_replay.checked_replay import checked_replay
 from dvl_calib_ros.bag_replay.replay import extrinsics_of_replay, replay
+from dvl_calib_ros.calibration.comparison.mounting_change import compare
 from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rpy_from_rotation

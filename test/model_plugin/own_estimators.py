@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from dvl_calib_ros.calibration.results.results.thinned_recording import Terms
 from own_models import PRIOR_STD
 
 from dvl_calib_ros.calibration.estimators.estimator import Estimator, EstimatorSetup
 from dvl_calib_ros.calibration.filters.filter_bank import ModelCounts
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.results.thinned_recording import Terms
 
 
 class MeanRise(Estimator):

@@ -7,13 +7,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from dvl_calib_ros.calibration.results.results.thinned_recording import ThinnedRecording
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.filters.cross_validation import FOLDS, folds_of
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import Streams
+from dvl_calib_ros.calibration.results.thinned_recording import ThinnedRecording
 from dvl_calib_ros.messages.decode import MessageDecoder
 from dvl_calib_ros.node.operator_card import Card
 from dvl_calib_ros.recordings.recording import open_recording

@@ -1,4 +1,4 @@
-"""TODO."""
+"""What is known of one parameter: type, unit, range, description."""
 
 from __future__ import annotations
 

@@ -6,19 +6,19 @@ import math
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.comparison.mounting_change.mounting_change import Difference, compare, fused
-from dvl_calib_ros.calibration.comparison.mounting_change.mounting_change_reasons import (
+
+from dvl_calib_ros.calibration.comparison.mounting_change import Difference, compare, fused
+from dvl_calib_ros.calibration.comparison.mounting_change_reasons import (
     comparison_document,
     reasons,
     remarks,
 )
-from dvl_calib_ros.calibration.results.results.extrinsics import COMPONENTS, MOUNTING, Extrinsics, extrinsics_of
-
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy, rotation_of, turn_between
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.results.extrinsics import COMPONENTS, MOUNTING, Extrinsics, extrinsics_of
 from dvl_calib_ros.errors import InputError
 
 DAY_NS = 86_400_000_000_000

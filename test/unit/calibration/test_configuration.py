@@ -7,7 +7,6 @@ from functools import cache
 import numpy as np
 import pytest
 from conftest import few
-from dvl_calib_ros.calibration.results.results.held_out_verification import verify
 from runs import START_NS, calibrate
 
 from dvl_calib_ros.calibration.filters.cross_validation import HeldOutError
@@ -22,6 +21,7 @@ from dvl_calib_ros.calibration.numerics.frames import (
 )
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.results.held_out_verification import verify
 from dvl_calib_ros.verdict.kinds import Severity
 
 PARAMETERS = Parameters(gnss_aided_std=0.03)

@@ -11,8 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from conftest import few
-from dvl_calib_ros.calibration.results.results.velocity_correction import lever_arm
-from dvl_calib_ros.calibration.streams.stream_order.interpolation import local_fit, reach_at, spacing_at
 from runs import START_NS, calibrate, feed, feed_columns, shifted
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
@@ -27,6 +25,8 @@ from dvl_calib_ros.calibration.numerics.block_covariance import MOST, TimeBlocks
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.results.velocity_correction import lever_arm
+from dvl_calib_ros.calibration.streams.interpolation import local_fit, reach_at, spacing_at
 from dvl_calib_ros.simulation.sensors import measure_dvl_matched
 from dvl_calib_ros.simulation.trajectories import body_rates
 from dvl_calib_ros.verdict.kinds import Severity

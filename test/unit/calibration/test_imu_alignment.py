@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.streams.stream_order.imu_frame import ImuAlignment
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -18,6 +17,7 @@ from dvl_calib_ros.calibration.numerics.frames import (
     quaternion_from_rotation,
 )
 from dvl_calib_ros.calibration.numerics.samples import ImuSample, Stream, sample_block
+from dvl_calib_ros.calibration.streams.imu_frame import ImuAlignment
 
 ANGLES = st.tuples(*[st.floats(-math.pi, math.pi)] * 3)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.results.results.thinned_recording import ThinnedRecording
 from runs import MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.estimators import registration_schedule
 from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.results.thinned_recording import ThinnedRecording
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.results.results.results import mounting_pose, rpy_std, scale_and_delay
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.models import MODELS
@@ -12,6 +11,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
 from dvl_calib_ros.calibration.numerics.frames import rpy_from_rotation
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
+from dvl_calib_ros.calibration.results.results import mounting_pose, rpy_std, scale_and_delay
 
 PARAMETERS = Parameters(
     mounting_rpy=(0.3, -0.2, 2.1), lever_arm=(0.5, 0.0, 0.2), dvl_time_offset=0.25, dvl_position="from_reference"

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.results.results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
-from dvl_calib_ros.calibration.streams.stream_order.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
 from dvl_calib_ros.calibration.assessment.dead_reckoning import Navigation, dead_reckoned, in_words, objections
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import distort
+from dvl_calib_ros.calibration.results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
+from dvl_calib_ros.calibration.streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 from dvl_calib_ros.present.terminal_map import terminal_map
 from dvl_calib_ros.verdict.kinds import Severity
 

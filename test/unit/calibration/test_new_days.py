@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.streams.stream_order.stream_order import NewDays
 from runs import START_NS, calibrate, feed_columns, shifted
 from test_delay import LEVER_ARM, NOISE, PHI, late
 
@@ -17,6 +16,7 @@ from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
+from dvl_calib_ros.calibration.streams.stream_order import NewDays
 
 SECOND_NS = 1_000_000_000
 NIGHT_NS = 86_400 * SECOND_NS

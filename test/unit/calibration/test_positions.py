@@ -1,7 +1,8 @@
 """Velocities over a window are made those of its middle."""
 
 import numpy as np
-from dvl_calib_ros.calibration.streams.stream_order.position_velocities import of_moments
+
+from dvl_calib_ros.calibration.streams.position_velocities import of_moments
 
 WINDOW_S = 1.0
 

@@ -8,7 +8,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.streams.stream_order.interpolation import ImuColumns, attitude_at
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
@@ -36,6 +35,7 @@ from dvl_calib_ros.calibration.registration.registration import (
     register,
     turn_open,
 )
+from dvl_calib_ros.calibration.streams.interpolation import ImuColumns, attitude_at
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

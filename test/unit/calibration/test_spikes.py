@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.streams.stream_order.outliers import without_spikes
+
+from dvl_calib_ros.calibration.streams.outliers import without_spikes
 
 
 def stream(n=100, noise=0.01, seed=0):

@@ -6,7 +6,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.streams.stream_order.interpolation import ImuColumns
 from test_register import ARM, run
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -14,6 +13,7 @@ from dvl_calib_ros.calibration.registration.clock_drift_and_jumps import unstead
 from dvl_calib_ros.calibration.registration.gauss_newton import Claimed, Fitted
 from dvl_calib_ros.calibration.registration.motion_streams import make_motion
 from dvl_calib_ros.calibration.registration.registration import Registration, register
+from dvl_calib_ros.calibration.streams.interpolation import ImuColumns
 
 AT_S = 250.0
 

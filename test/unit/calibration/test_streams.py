@@ -4,9 +4,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import pytest
-from dvl_calib_ros.calibration.streams.stream_order.stream_order import Order, Sequencer, Track
 from hypothesis import given
 from hypothesis import strategies as st
+
+from dvl_calib_ros.calibration.streams.stream_order import Order, Sequencer, Track
 
 SECOND = 1_000_000_000
 

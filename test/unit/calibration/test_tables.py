@@ -6,8 +6,6 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.results.results.thinned_recording import KEPT_EVERY_S, ThinnedBlock
-from dvl_calib_ros.calibration.streams.stream_order.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.block_estimator import DelayFilter
@@ -15,6 +13,8 @@ from dvl_calib_ros.calibration.estimators.registration_schedule import MOST, MOS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.numerics.tables import RowTable
+from dvl_calib_ros.calibration.results.thinned_recording import KEPT_EVERY_S, ThinnedBlock
+from dvl_calib_ros.calibration.streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
 
 class Numbers(RowTable):

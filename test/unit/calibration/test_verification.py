@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.results.results.held_out_verification import verify
 from filter_problems import random_problem
 from runs import ONE_HERTZ, MatchedRun, calibrate, make_samples
 from scipy.stats import chi2
@@ -28,6 +27,7 @@ from dvl_calib_ros.calibration.numerics.error_model import correct, correction_j
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState, Measurements
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample
+from dvl_calib_ros.calibration.results.held_out_verification import verify
 from dvl_calib_ros.verdict.kinds import Severity
 
 GOOD = HeldOutError(samples=1000, uncorrected=0.10, corrected=0.05, predicted=0.05, calibration=0.002)

@@ -9,15 +9,15 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.diagnosis.composed import no_effect
-from dvl_calib_ros.diagnosis.criteria import blocks_of
+from dvl_calib_ros.diagnosis.answer.confidence_intervals import with_unshown_turns
+from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.fitting import Fitter
-from dvl_calib_ros.diagnosis.intervals import with_unshown_turns
-from dvl_calib_ros.diagnosis.noise import white_noise
-from dvl_calib_ros.diagnosis.recordings import make_recording
-from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
-from dvl_calib_ros.diagnosis.selection import started
+from dvl_calib_ros.diagnosis.fit.gauss_newton import Fitter
+from dvl_calib_ros.diagnosis.fit.selection_criteria import blocks_of
+from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
+from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording
+from dvl_calib_ros.diagnosis.noise.noise_model import white_noise
+from dvl_calib_ros.diagnosis.search.effect_selection import started
 from dvl_calib_ros.effects.registry import EFFECTS
 
 pytestmark = pytest.mark.slow

@@ -16,41 +16,54 @@ from scipy.signal import lfilter
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.numerics.tests import holm
-from dvl_calib_ros.diagnosis import fitting, intervals, proposing, shown, standing, twice
-from dvl_calib_ros.diagnosis.called_for import (
+from dvl_calib_ros.diagnosis.answer import confidence_intervals, held_out_validation
+from dvl_calib_ros.diagnosis.answer.compensation import compensated
+from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
+from dvl_calib_ros.diagnosis.answer.held_out_validation import borne_out
+from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict, FoundEffect, diagnosis_document
+from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
+from dvl_calib_ros.diagnosis.fit import gauss_newton
+from dvl_calib_ros.diagnosis.fit.gauss_newton import Fit, Fitter, _with_time
+from dvl_calib_ros.diagnosis.fit.selection_criteria import finer_steps
+from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
+from dvl_calib_ros.diagnosis.model.hypothesis import Hypothesis, no_effect
+from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, load_recordings, make_recording
+from dvl_calib_ros.diagnosis.model.stream_curve import Curve, segments_of
+from dvl_calib_ros.diagnosis.model.time_grid import Grid, Offsets
+from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
+from dvl_calib_ros.diagnosis.noise.whitened_least_squares import WhitenedLeastSquares
+from dvl_calib_ros.diagnosis.search import backward_elimination, candidates, observable_parameters
+from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_delays, moved_arm, with_moved
+from dvl_calib_ros.diagnosis.search.backward_elimination import (
     _is_late_before_a_leap,
     _only_smooths,
+    happening_again,
+    is_taken_back,
     once_where_borne_out,
     only_called_for,
 )
-from dvl_calib_ros.diagnosis.clock_or_arm import CLOCKS, lags_and_delays, moved_arm, with_moved
-from dvl_calib_ros.diagnosis.closure import Gap, HeldOutResiduals
-from dvl_calib_ros.diagnosis.compensation import compensated
-from dvl_calib_ros.diagnosis.composed import Grid, Hypothesis, Offsets, Problem, make_problem, no_effect
-from dvl_calib_ros.diagnosis.criteria import finer_steps
-from dvl_calib_ros.diagnosis.curve import Curve
-from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
-from dvl_calib_ros.diagnosis.fitting import Fit, Fitter, _with_time
-from dvl_calib_ros.diagnosis.leaps import DELAYS, PARTS, Delays, gaps, in_gaps, time_by_stamps, told_by_stamps
-from dvl_calib_ros.diagnosis.leaps import _found as _delays
-from dvl_calib_ros.diagnosis.least_squares import WhitenedLeastSquares
-from dvl_calib_ros.diagnosis.noise import Arma, Noise, segments_of, white_noise
-from dvl_calib_ros.diagnosis.proposing import coming_and_going, told_by_other_clocks
-from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
-from dvl_calib_ros.diagnosis.registered import first_guess, guess_beside
-from dvl_calib_ros.diagnosis.results import DiagnosisVerdict, FoundEffect, diagnosis_document
-from dvl_calib_ros.diagnosis.selection import (
+from dvl_calib_ros.diagnosis.search.candidates import coming_and_going, told_by_other_clocks
+from dvl_calib_ros.diagnosis.search.clock_jumps import (
+    DELAYS,
+    PARTS,
+    Delays,
+    gaps,
+    in_gaps,
+    time_by_stamps,
+    told_by_stamps,
+)
+from dvl_calib_ros.diagnosis.search.clock_jumps import _found as _delays
+from dvl_calib_ros.diagnosis.search.effect_selection import (
     _about,
     _by_fewer_clocks,
     _leapt_where_stamps_say_so,
     _with_all_of_the_arm,
     started,
 )
-from dvl_calib_ros.diagnosis.shown import shown_parts, with_shown, without_faint
-from dvl_calib_ros.diagnosis.standing import borne_out
-from dvl_calib_ros.diagnosis.told_apart import _clock_or_arm, _selected
-from dvl_calib_ros.diagnosis.twice import happening_again, is_taken_back
-from dvl_calib_ros.diagnosis.unexplained import Unexplained, _plainest
+from dvl_calib_ros.diagnosis.search.identifiability import _clock_or_arm, _selected
+from dvl_calib_ros.diagnosis.search.initial_guess import first_guess, guess_beside
+from dvl_calib_ros.diagnosis.search.observable_parameters import shown_parts, with_shown, without_faint
+from dvl_calib_ros.diagnosis.search.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.base import ActsOn
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
@@ -266,19 +279,19 @@ def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best(seed, by_
 def test_where_all_that_is_proposed_is_beyond_its_bounds_what_is_within_them_is_tried_as_well(monkeypatch):
     """A shear of 17° and more was in every proposal, no fit of them went anywhere, and a current was not found."""
     fitter, fit, _ = fitted(scenario(effects=["velocity_bias:x_mps=0.1"]), {})
-    _, worth = proposing._worth(fitter, fit, EFFECTS)
+    _, worth = candidates._worth(fitter, fit, EFFECTS)
     assert worth and () not in worth
-    monkeypatch.setattr(proposing, "_is_possible", lambda table, chosen: chosen in ((), worth[-1]))
-    assert proposing._worth(fitter, fit, EFFECTS)[1] == worth
-    monkeypatch.setattr(proposing, "_is_possible", lambda table, chosen: chosen == ())
-    assert proposing._worth(fitter, fit, EFFECTS)[1] == [*worth, ()]
+    monkeypatch.setattr(candidates, "_is_possible", lambda table, chosen: chosen in ((), worth[-1]))
+    assert candidates._worth(fitter, fit, EFFECTS)[1] == worth
+    monkeypatch.setattr(candidates, "_is_possible", lambda table, chosen: chosen == ())
+    assert candidates._worth(fitter, fit, EFFECTS)[1] == [*worth, ()]
 
 
 def test_straight_lines_are_possible_within_the_bounds_of_all_that_they_hold():
     shear, clock = EFFECTS["axis_nonorthogonality"], EFFECTS["clock_drift"]
     (high, *_), (drift,) = ([spec.high for spec in each.parameters] for each in (shear, clock))
     variants = [
-        proposing.Variant(each, (each.defaults,), np.zeros((1, 3, p)), 1.0) for each, p in ((shear, 3), (clock, 1))
+        candidates.Variant(each, (each.defaults,), np.zeros((1, 3, p)), 1.0) for each, p in ((shear, 3), (clock, 1))
     ]
     blocks = [np.arange(6, 9), np.arange(9, 10)]
     for values, is_possible in (
@@ -288,8 +301,8 @@ def test_straight_lines_are_possible_within_the_bounds_of_all_that_they_hold():
         ([0.0, 0.0, 0.0, 1.1 * drift], False),
     ):
         part = Mock(solution=lambda values=values: np.array([9.0] * 6 + values))
-        table = proposing.StraightLines(variants, blocks, Mock(part=lambda index, part=part: part))
-        assert proposing._is_possible(table, (0, 1)) is is_possible
+        table = candidates.StraightLines(variants, blocks, Mock(part=lambda index, part=part: part))
+        assert candidates._is_possible(table, (0, 1)) is is_possible
 
 
 def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
@@ -363,7 +376,7 @@ def test_what_is_not_shown_of_an_effect_is_its_where_it_is_named():
     problem, start, _, testable = started([recording], np.eye(3), np.zeros(3), every)
     tilt = every["tilt_coupling"]
     roll = tilt.without({spec.name for spec in tilt.parameters} - {"y_per_roll"})
-    problem = replace(problem, unshown=shown.unshown_parts({tilt.name: tilt}, {tilt.name: roll}))
+    problem = replace(problem, unshown=observable_parameters.unshown_parts({tilt.name: tilt}, {tilt.name: roll}))
     seen = problem.all_seen(start)
     turns = problem.unshown_columns(start, seen)[0].shape[2]
     named = start.with_effects([*start.effects, roll], 1, {roll.name: ({"y_per_roll": -0.9},)})
@@ -511,8 +524,10 @@ def test_a_clock_that_is_nearly_set_right_again_has_leapt_twice_where_nothing_el
     values = {"seconds": -1.3, "at_s": 96.0, "again_seconds": 1.004, "again_at_s": 220.0}
     problem = SimpleNamespace(recordings=[SimpleNamespace(seconds=370.0)])
     fit = Mock(spec=Fit, effects=(leap,), values={leap.name: (values,)})
-    monkeypatch.setattr(twice, "unexplained", lambda *_: SimpleNamespace(clear_energy=instead, price=40.0))
-    monkeypatch.setattr(twice, "is_shown_by_stamps", lambda *_: False)
+    monkeypatch.setattr(
+        backward_elimination, "unexplained", lambda *_: SimpleNamespace(clear_energy=instead, price=40.0)
+    )
+    monkeypatch.setattr(backward_elimination, "is_shown_by_stamps", lambda *_: False)
     assert is_taken_back(SimpleNamespace(problem=problem), fit, leap.name, drop, Mock(spec=Fit)) is is_wanted
 
 
@@ -696,7 +711,7 @@ def test_times_of_a_leap_that_are_as_good_are_looked_for_beyond_such_as_are_not(
         at = moved - 174.0
         return 100.0 if at < -5.0 or at > 90.0 else 15.0 if abs(at) < 20.0 else 5.0
 
-    monkeypatch.setattr(fitting, "_with_time", lambda fit, effect, name, recording, at: at)
+    monkeypatch.setattr(gauss_newton, "_with_time", lambda fit, effect, name, recording, at: at)
     monkeypatch.setattr(Fitter, "_worse_at", worse)
     at, low, high = Fitter(problem).time_interval(fit, leap, "at_s", 0)
     assert at == 174.0 and 174.0 - 5.0 < low < 174.0 and 248.0 < high < 350.0
@@ -716,11 +731,13 @@ def test_what_is_not_known_of_the_time_of_a_leap_is_in_the_intervals_of_all_size
 
 def test_what_fits_to_made_up_recordings_are_off_by_is_in_the_intervals_where_it_is_no_chance(monkeypatch):
     """At 1 Hz a flexure of the mount was 4 standard deviations off, which recordings made up from the fit showed."""
-    monkeypatch.setattr(intervals, "made_up", lambda problem, fit, count: ((None, [], None) for _ in range(count)))
-    scatter = np.tile([1.0, -1.0], intervals.MADE_UP // 2)
+    monkeypatch.setattr(
+        confidence_intervals, "made_up", lambda problem, fit, count: ((None, [], None) for _ in range(count))
+    )
+    scatter = np.tile([1.0, -1.0], confidence_intervals.MADE_UP // 2)
     steps = np.column_stack([0.3 + 0.5 * scatter, 4.0 + 0.5 * scatter, 3.0 * scatter])
     fitter = Mock(spec=Fitter, problem=None, step_of=Mock(side_effect=list(steps)))
-    grown = intervals._with_samples(fitter, Mock(spec=Fit), np.eye(3))
+    grown = confidence_intervals._with_samples(fitter, Mock(spec=Fit), np.eye(3))
     expected = [1.0, 1.0 + (4.0 / 2.0) ** 2, steps[:, 2].var(ddof=1)]
     assert np.diag(grown) == pytest.approx(expected)
 
@@ -1277,9 +1294,9 @@ def test_what_explains_much_may_be_told_by_one_stretch_alone(monkeypatch):
         fit, base = (Mock(spec=Fit, deviance=each) for each in (1000.0, 1000.0 + explained))
         none = SimpleNamespace(fit=base, fitter=Mock())
         selection: Any = SimpleNamespace(fit=fit, selected=[None], withdrawn=lambda none=none: none)
-        monkeypatch.setattr(standing, "is_borne_out", lambda *_: False)
-        monkeypatch.setattr(standing, "unexplained", lambda *_: "an unknown cause")
-        monkeypatch.setattr(standing, "matters", lambda *_, is_there=is_there: is_there)
+        monkeypatch.setattr(held_out_validation, "is_borne_out", lambda *_: False)
+        monkeypatch.setattr(held_out_validation, "unexplained", lambda *_: "an unknown cause")
+        monkeypatch.setattr(held_out_validation, "matters", lambda *_, is_there=is_there: is_there)
         found = borne_out(selection, "nothing", replace(gap, shown_from=shown_from), 30)
         assert found == ((selection, "nothing") if stands else (none, "an unknown cause"))
 
@@ -1379,8 +1396,8 @@ def test_what_turns_show_best_of_an_arm_is_said_however_little_they_show():
 
 def test_a_height_that_is_not_said_is_held_where_it_is(monkeypatch):
     """At nothing, half a metre of it was what is left, and right answers were unknown for it."""
-    monkeypatch.setattr(shown, "SHOWN_FROM", 0.8)
-    monkeypatch.setattr(shown, "ARM_FROM_M", 10.0)
+    monkeypatch.setattr(observable_parameters, "SHOWN_FROM", 0.8)
+    monkeypatch.setattr(observable_parameters, "ARM_FROM_M", 10.0)
     given = scenario(effects=["lever_arm:x_m=-0.6,y_m=-1.6,z_m=-0.5"], gnss_std=0.01, waves=Waves(0.2, 6.0))
     diagnosis = diagnose_recordings([recording_of(simulate(given), given.gnss_frame, axes="xy")], Parameters())
     assert diagnosis.verdict is DiagnosisVerdict.KNOWN

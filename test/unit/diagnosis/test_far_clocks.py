@@ -10,10 +10,10 @@ from conftest import ROOT
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.registration.unregistrable_clocks import STEP_S, lag
-from dvl_calib_ros.diagnosis.curve import Curve
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.recordings import RecordedStreams, load_recordings, make_recording
-from dvl_calib_ros.diagnosis.registered import check_clocks
+from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, load_recordings, make_recording
+from dvl_calib_ros.diagnosis.model.stream_curve import Curve
+from dvl_calib_ros.diagnosis.search.initial_guess import check_clocks
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.injection import injection

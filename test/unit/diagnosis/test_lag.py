@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.diagnosis.clock_or_arm import moved_lag, with_moved
-from dvl_calib_ros.diagnosis.closure import high_frequency_variance, noise_floor
-from dvl_calib_ros.diagnosis.composed import Offsets, Problem, make_problem, no_effect
-from dvl_calib_ros.diagnosis.fitting import Fit, Fitter
-from dvl_calib_ros.diagnosis.made_up import _reference
-from dvl_calib_ros.diagnosis.noise import white_noise
-from dvl_calib_ros.diagnosis.recordings import make_recording
-from dvl_calib_ros.diagnosis.selection import EffectSelection
+from dvl_calib_ros.diagnosis.answer.gap_closure import high_frequency_variance, noise_floor
+from dvl_calib_ros.diagnosis.fit.gauss_newton import Fit, Fitter
+from dvl_calib_ros.diagnosis.fit.parametric_bootstrap import _reference
+from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
+from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
+from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording
+from dvl_calib_ros.diagnosis.model.time_grid import Offsets
+from dvl_calib_ros.diagnosis.noise.noise_model import white_noise
+from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import moved_lag, with_moved
+from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection
 from dvl_calib_ros.effects.registry import EFFECTS
 
 LAG, LAGS_S = EFFECTS["reference_lag"], 1.2

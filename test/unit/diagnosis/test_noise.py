@@ -11,17 +11,20 @@ from scipy.spatial.transform import Rotation
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.registration.unregistrable_clocks import lag
-from dvl_calib_ros.diagnosis import levels
-from dvl_calib_ros.diagnosis.claims import claims_of, exponents, followed
-from dvl_calib_ros.diagnosis.composed import Offsets, Problem, make_problem, no_effect
-from dvl_calib_ros.diagnosis.contradicted import without_contradicted
-from dvl_calib_ros.diagnosis.criteria import blocks_of
-from dvl_calib_ros.diagnosis.curve import Curve
+from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.fitting import Fitter
-from dvl_calib_ros.diagnosis.noise import Arma, white_noise
-from dvl_calib_ros.diagnosis.recordings import RecordedStreams, make_recording
-from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
+from dvl_calib_ros.diagnosis.fit.gauss_newton import Fitter
+from dvl_calib_ros.diagnosis.fit.selection_criteria import blocks_of
+from dvl_calib_ros.diagnosis.model.claimed_noise import exponents, followed
+from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
+from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
+from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, make_recording
+from dvl_calib_ros.diagnosis.model.stream_curve import Curve
+from dvl_calib_ros.diagnosis.model.time_grid import Offsets
+from dvl_calib_ros.diagnosis.noise import noise_level
+from dvl_calib_ros.diagnosis.noise.noise_level import claims_of
+from dvl_calib_ros.diagnosis.noise.noise_model import Arma, white_noise
+from dvl_calib_ros.diagnosis.search.slow_stream_outliers import without_contradicted
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
@@ -282,13 +285,13 @@ def test_a_few_quiet_rows_at_a_rare_speed_call_for_no_level(monkeypatch):
     speed[40:44] = [1.4, 1.2, 1.0, 0.9]
     innovations = np.random.default_rng(1).standard_normal((95, 2))
     innovations[40:44] *= 0.1
-    monkeypatch.setattr(levels, "covariates", lambda *_: {"speed": speed})
-    assert levels.fit_level(None, (), innovations).p > levels.SIGNIFICANT
-    monkeypatch.setattr(levels, "covariates", lambda *_: {"speed": np.where(speed < 1.5, speed, 2.0)})
-    assert levels.fit_level(None, (), innovations).p > levels.SIGNIFICANT
-    monkeypatch.setattr(levels, "covariates", lambda *_: {"speed": np.linspace(1.0, 2.0, 95)})
+    monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": speed})
+    assert noise_level.fit_level(None, (), innovations).p > noise_level.SIGNIFICANT
+    monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": np.where(speed < 1.5, speed, 2.0)})
+    assert noise_level.fit_level(None, (), innovations).p > noise_level.SIGNIFICANT
+    monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": np.linspace(1.0, 2.0, 95)})
     grown = innovations * np.exp(3.0 * np.linspace(0.0, 1.0, 95))[:, None]
-    assert levels.fit_level(None, (), grown).p < levels.SIGNIFICANT
+    assert noise_level.fit_level(None, (), grown).p < noise_level.SIGNIFICANT
 
 
 @pytest.mark.parametrize(("keep", "low"), [(0.0, 0.95), (0.5, 0.85)])

@@ -9,7 +9,7 @@ import pytest
 from conftest import ROOT
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.diagnosis.recordings import load_recordings, make_recording, recording_names
+from dvl_calib_ros.diagnosis.model.recorded_streams import load_recordings, make_recording, recording_names
 from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter, savgol_filter
 
-from dvl_calib_ros.diagnosis.curve import SMOOTH_SAMPLES, Curve
-from dvl_calib_ros.diagnosis.noise import Arma, Noise
+from dvl_calib_ros.diagnosis.model.stream_curve import SMOOTH_SAMPLES, Curve
+from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise
 from dvl_calib_ros.effects.recursion import recursion, slopes
 
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.diagnosis.recordings import make_recording
-from dvl_calib_ros.diagnosis.set_back import UP_TO_S, set_back
+from dvl_calib_ros.diagnosis.model.recorded_streams import UP_TO_S, make_recording, set_back
 
 TRUE = np.arange(0.0, 200.0, 0.2)
 STAMPS = TRUE - 1.27 * (TRUE >= 60.0)

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.diagnosis.composed import Offsets, is_time_of_run, make_problem, no_effect
-from dvl_calib_ros.diagnosis.curve import Curve
-from dvl_calib_ros.diagnosis.recordings import make_recording
-from dvl_calib_ros.diagnosis.twin import simulated
+from dvl_calib_ros.diagnosis.answer.simulated_twin import simulated
+from dvl_calib_ros.diagnosis.model.forward_model import make_problem
+from dvl_calib_ros.diagnosis.model.hypothesis import is_time_of_run, no_effect
+from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording
+from dvl_calib_ros.diagnosis.model.stream_curve import Curve
+from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.effects.registry import EFFECTS
 
 

@@ -10,17 +10,22 @@ import pytest
 from test_diagnosis import LEVER, fitted, recording_of, scenario, with_added
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.diagnosis import standing
-from dvl_calib_ros.diagnosis import unexplained as looking
-from dvl_calib_ros.diagnosis.beside import FittedBeside
-from dvl_calib_ros.diagnosis.composed import Offsets, _by_turn, make_problem, no_effect
+from dvl_calib_ros.diagnosis.answer import held_out_validation
+from dvl_calib_ros.diagnosis.answer.gap_location import places
+from dvl_calib_ros.diagnosis.answer.held_out_validation import is_borne_out, settled
+from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
-from dvl_calib_ros.diagnosis.fitting import NEARBY, SURELY, Fitter
-from dvl_calib_ros.diagnosis.noise import Noise, white_noise
-from dvl_calib_ros.diagnosis.results import DiagnosisVerdict
-from dvl_calib_ros.diagnosis.selection import EffectSelection, Selected
-from dvl_calib_ros.diagnosis.standing import is_borne_out, settled
-from dvl_calib_ros.diagnosis.unexplained import (
+from dvl_calib_ros.diagnosis.fit.gauss_newton import NEARBY, SURELY, Fitter
+from dvl_calib_ros.diagnosis.fit.selection_criteria import FittedBeside
+from dvl_calib_ros.diagnosis.model.forward_model import make_problem
+from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
+from dvl_calib_ros.diagnosis.model.seen import columns_by_turn
+from dvl_calib_ros.diagnosis.model.time_grid import Offsets
+from dvl_calib_ros.diagnosis.noise.noise_model import Noise, white_noise
+from dvl_calib_ros.diagnosis.search import unexplained as looking
+from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection
+from dvl_calib_ros.diagnosis.search.identifiability import Selected
+from dvl_calib_ros.diagnosis.search.unexplained import (
     holds_out,
     is_of_group,
     matters,
@@ -28,7 +33,6 @@ from dvl_calib_ros.diagnosis.unexplained import (
     told_elsewhere,
     unexplained,
 )
-from dvl_calib_ros.diagnosis.where import places
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.scenario import simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -75,7 +79,7 @@ def test_a_fit_from_what_was_looked_at_already_is_the_same():
 def test_columns_of_the_calibration_are_the_means_of_those_of_the_samples():
     fitter, fit, _ = fitted(scenario("lawnmower", seconds=120.0), {"lever_arm": {}})
     (seen,), (grid,) = fit.seen, fitter.problem.grids
-    by_turn = grid.averaged(_by_turn(fit.hypothesis, seen, seen.measured))
+    by_turn = grid.averaged(columns_by_turn(fit.hypothesis, seen, seen.measured))
     by_scale = -(seen.measured / (1.0 + fit.hypothesis.scale))[:, None, :] * seen.body_from_measured
     columns = fitter.problem.calibration_columns(fit.hypothesis, fit.seen)
     np.testing.assert_allclose(columns, np.concatenate([by_turn, grid.averaged(by_scale)], axis=2), atol=1e-13)
@@ -230,9 +234,9 @@ def test_an_unknown_cause_that_explains_much_less_than_effects_do_is_not_in_thei
     nothing = fit.columns[:, :, :0]
     told = share * (fit.deviance - fitted_with.deviance)
     cause = looking.Unexplained(-50.0, told, "speed", nothing, nothing, told, told)
-    monkeypatch.setattr(standing, "unexplained", lambda *_, **__: cause)
-    monkeypatch.setattr(standing, "matters", lambda _, of, __: of.effects == ())
-    monkeypatch.setattr(standing, "_better_elsewhere", lambda *_: 1000.0)
+    monkeypatch.setattr(held_out_validation, "unexplained", lambda *_, **__: cause)
+    monkeypatch.setattr(held_out_validation, "matters", lambda _, of, __: of.effects == ())
+    monkeypatch.setattr(held_out_validation, "_better_elsewhere", lambda *_: 1000.0)
     selected = (Selected(drift, -50.0, ()),)
     left, _ = settled(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS), len(EFFECTS))
     assert bool(left.selected) == kept
@@ -266,8 +270,8 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
     none = fitter.fit(fit.hypothesis.with_effects([], 1, {}), fit.noise)
     nothing, told = fit.columns[:, :, :0], 0.82 * (none.deviance - fit.deviance)
     cause = looking.Unexplained(-50.0, told, about, nothing, nothing, told, told)
-    monkeypatch.setattr(standing, "unexplained", lambda *_, **__: cause)
-    monkeypatch.setattr(standing, "matters", lambda _, of, __: of.effects == ())
-    monkeypatch.setattr(standing, "_better_elsewhere", lambda *_: 1000.0)
+    monkeypatch.setattr(held_out_validation, "unexplained", lambda *_, **__: cause)
+    monkeypatch.setattr(held_out_validation, "matters", lambda _, of, __: of.effects == ())
+    monkeypatch.setattr(held_out_validation, "_better_elsewhere", lambda *_: 1000.0)
     left, _ = settled(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS), len(EFFECTS))
     assert bool(left.selected) == is_some

@@ -7,8 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.numerics.frames import Array
-from dvl_calib_ros.diagnosis.composed import Hypothesis, Offsets, make_problem
-from dvl_calib_ros.diagnosis.recordings import make_recording
+from dvl_calib_ros.diagnosis.model.forward_model import make_problem
+from dvl_calib_ros.diagnosis.model.hypothesis import Hypothesis
+from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording
+from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.effects.composition import Injection
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.scenario import Run, Scenario, simulate

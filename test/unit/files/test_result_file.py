@@ -12,18 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.comparison.mounting_change.mounting_change import Difference
-from dvl_calib_ros.calibration.results.results.results import Result
 from hypothesis import given
 from hypothesis import strategies as st
 from io_fixtures import estimates, replayed, run, steady_run, write_bag
 from scipy.spatial.transform import Rotation
 from yaml_text import parsed, written
 
+from dvl_calib_ros.calibration.comparison.mounting_change import Difference
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.results.results import Result
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.mounting import load_extrinsics

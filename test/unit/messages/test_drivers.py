@@ -35,7 +35,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.diagnosis.recordings import load_recordings
+from dvl_calib_ros.diagnosis.model.recorded_streams import load_recordings
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.cross_check import cross_check

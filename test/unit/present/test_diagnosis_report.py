@@ -12,10 +12,10 @@ from report_fixtures import OWN_EFFECT, Page, assert_described, diagnosis, drawn
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.diagnosis.closure import Gap
+from dvl_calib_ros.diagnosis.answer.gap_closure import Gap
+from dvl_calib_ros.diagnosis.answer.plotted_series import Followed
+from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict, FoundEffect
 from dvl_calib_ros.diagnosis.diagnose import diagnose
-from dvl_calib_ros.diagnosis.followed import Followed
-from dvl_calib_ros.diagnosis.results import Diagnosis, DiagnosisVerdict, FoundEffect
 from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.diagnosis import rms
 from dvl_calib_ros.present.diagnosis_pictures import spectrum

@@ -7,11 +7,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from dvl_calib_ros.calibration.results.results.mounting_quantities import not_shown, quantities
-from dvl_calib_ros.calibration.results.results.results import Result
 from runs import MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.results.mounting_quantities import not_shown, quantities
+from dvl_calib_ros.calibration.results.results import Result
 
 
 @cache

@@ -13,7 +13,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import fail, in_fresh_process, succeed
-from dvl_calib_ros.calibration.results.results.mounting_quantities import quantities
 from io_fixtures import run, steady_run, write_bag
 from report_fixtures import FEW, Page, assert_described, drawn, evaluation, recorded, replay_page
 
@@ -23,6 +22,7 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
+from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.present.figure_data import MapTrack, explorable
 from dvl_calib_ros.present.figure_style import MODEL_STYLES, new_figure
 from dvl_calib_ros.present.page import write_replay_report, write_report

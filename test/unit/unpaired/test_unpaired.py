@@ -16,8 +16,8 @@ from report_fixtures import Page
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import Stream, VelocityFrame, sample_block
-from dvl_calib_ros.diagnosis.recordings import make_recording, zeros_while_moving
-from dvl_calib_ros.diagnosis.results import diagnosis_document
+from dvl_calib_ros.diagnosis.answer.results import diagnosis_document
+from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording, zeros_while_moving
 from dvl_calib_ros.disk.text_files import write_json
 from dvl_calib_ros.effects.base import EffectInput
 from dvl_calib_ros.effects.registry import EFFECTS

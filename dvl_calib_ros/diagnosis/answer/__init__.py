@@ -1,0 +1,1 @@
+"""The answer of a diagnosis: validation, closure, location, intervals, compensation."""

@@ -1,0 +1,74 @@
+"""How well the sizes of effects are known: by noise, by the times at which effects begin, by what fits do with samples.
+
+A fit's own covariance takes its times of the run and its curves between samples for true. Both are guesses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...calibration.numerics.frames import Array
+from ...effects.base import MountingEffect
+from ..fit.gauss_newton import Fit, Fitter
+from ..fit.parametric_bootstrap import made_up
+from ..fit.selection_criteria import FittedBeside, blocks_of
+from ..model.forward_model import Problem
+from ..model.hypothesis import is_time_of_run
+from ..search.clock_jumps import LEAP, time_by_stamps
+from ..search.effect_selection import EffectSelection
+
+Triple = tuple[float, float, float]
+Times = dict[tuple[str, int, str], Triple]
+
+# Made-up recordings that show what a fit does with samples, and from how many σ on that is not by chance: of the mean
+# of what it is off by, three of its own; of the scatter, what one of thirty sets of as many is beyond
+MADE_UP, OFF_BY, SCATTER = 12, 1.0, 1.35
+# Motion between samples goes some way between the two that are fitted and made up, so half of what these differ by
+HALF_WAY = 0.5
+
+
+def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
+    """(6 + p, 6 + p) of calibration and effects of a selection; and the times at which its effects begin or end, by
+    effect, recording and name, with their intervals of 95 per cent."""
+    fitter, fit = selection.fitter, selection.fit
+    covariance = fit.covariance(blocks_of(fitter.problem))
+    if not selection.selected:
+        return covariance, {}
+    covariance = with_unshown_turns(fitter.problem, fit, _with_samples(fitter, fit, covariance))
+    times: Times = {}
+    for effect in fit.effects:
+        for spec in filter(is_time_of_run, effect.parameters):
+            for recording in dict.fromkeys(each.recording or 0 for each in fit.hypothesis.parameters_of(effect)):
+                found = time_by_stamps(fitter, fit, spec.name) if effect.name == LEAP else None
+                found = found or fitter.time_interval(fit, effect, spec.name, recording)
+                times[effect.name, recording, spec.name] = found
+                covariance = covariance + fitter.moved_by_time(fit, effect, spec.name, recording, found[1:])
+    return covariance, times
+
+
+def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
+    """A covariance (n, n) with what fits to made-up recordings are off by, and scatter beyond it."""
+    steps = np.array(
+        [fitter.step_of(other, seen, left, fit) for other, seen, left in made_up(fitter.problem, fit, MADE_UP)]
+    )
+    std = np.sqrt(np.diag(covariance))
+    off, scatter = steps.mean(axis=0), steps.std(axis=0, ddof=1) / std
+    off = np.where(np.abs(off) > OFF_BY * std, HALF_WAY * off, 0.0)
+    grown = np.where(scatter > SCATTER, scatter, 1.0)
+    return np.asarray(covariance * np.outer(grown, grown) + np.outer(off, off))
+
+
+def with_unshown_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:
+    """A covariance (n, n) with what the turns that are not shown of a mounting that turns, beside the fit, make of it.
+
+    A mounting that turned by 4 degrees in pitch takes yaw and arm along by a few tenths of a degree and centimetres.
+    """
+    if not any(isinstance(effect, MountingEffect) for effect in fit.effects):
+        return covariance
+    beside, own = FittedBeside.of_fit(problem, fit), np.arange(fit.columns.shape[2])
+    if len(beside.std) == len(own):
+        return covariance
+    both = beside.step(fit.noise, fit.residual)
+    alone = both.part(own)
+    moved = both.solution()[own] - alone.solution()
+    return np.asarray(covariance + both.covariance()[np.ix_(own, own)] - alone.covariance() + np.outer(moved, moved))

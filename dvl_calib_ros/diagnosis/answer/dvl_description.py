@@ -1,0 +1,134 @@
+"""The DVL as the diagnosis knows it, for another simulator to be told: mounting, rate, noise, and what each error is.
+
+Sizes are in m/s, so that what a simulator cannot be given can be weighed: an error is taken out of the composed model,
+all others left in, and what the DVL's velocity changes by is its size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...calibration.models.parameters import Parameters
+from ...calibration.numerics.frames import Array
+from ...effects.registry import EFFECTS
+from ..model.forward_model import Problem
+from ..model.hypothesis import Hypothesis, Values
+from ..model.recorded_streams import RecordedStreams
+from ..model.stream_curve import Curve
+from ..search.effect_selection import EffectSelection
+from .simulated_twin import simulated, with_quiet_reference
+
+Three = tuple[float, float, float]
+# Values of an effect: what was known of it before, to which is added what was found
+_KNOWN_BEFORE = {
+    "lever_arm": ("x_m", "y_m", "z_m"),
+    "dvl_time_offset": ("seconds",),
+    "clock_drift": ("seconds_per_hour",),
+}
+
+
+@dataclass(frozen=True)
+class DvlSeen:
+    """A DVL on its vehicle, over all recordings.
+
+    mounting_rpy: (3,) rad, nominal, and lever_arm: (3,) m, both as given, without what was found. time_offset: s, and
+    clock_drift: s per s, that were taken off its stamps before. rate_hz: samples per second. noise_std: (3,) m/s, of
+    its axes, from sample to sample: what the motion does not explain, at most. speed: (3,) m/s, RMS along its axes.
+    sizes: RMS, m/s, of the vector by which each error changes what it measures: `misalignment`, `scale`, effects, and
+    what repeated samples miss.
+    """
+
+    mounting_rpy: Three
+    lever_arm: Three
+    time_offset: float
+    clock_drift: float
+    rate_hz: float
+    noise_std: Three
+    speed: Three
+    sizes: Mapping[str, float]
+
+
+# Of finding stale_samples: how much the velocity has changed since the sample that is repeated
+STALE = "stale_samples"
+
+
+def dvl_seen(selection: EffectSelection, parameters: Parameters) -> DvlSeen:
+    """The DVL of what was selected; parameters: those with which the recordings were read."""
+    problem = replace(selection.fitter.problem, lever_arm=np.zeros(3))
+    hypothesis = _whole(selection, parameters)
+    measured = _measured(problem, hypothesis)
+    without = {
+        "misalignment": replace(hypothesis, phi=np.zeros(3)),
+        "scale": replace(hypothesis, scale=np.zeros(3)),
+        **{
+            effect.name: replace(hypothesis, effects=tuple(each for each in hypothesis.effects if each is not effect))
+            for effect in hypothesis.effects
+        },
+    }
+    sizes = {name: _rms(measured - _measured(problem, each)) for name, each in without.items()}
+    repeats, received = (sum(getattr(each, name) for each in problem.recordings) for name in ("repeats", "received"))
+    if repeats:
+        sizes[STALE] = float(np.sqrt(repeats / received)) * _rms(np.diff(measured, axis=0))
+    streams = [recording.dvl for recording in problem.recordings]
+    return DvlSeen(
+        mounting_rpy=_three(parameters.mounting_rpy),
+        lever_arm=_three(parameters.lever_arm),
+        time_offset=parameters.dvl_time_offset,
+        clock_drift=parameters.dvl_clock_drift,
+        rate_hz=1.0 / float(np.median([stream.interval for stream in streams])),
+        noise_std=_three(_noise(problem.recordings, selection)),
+        speed=_three(np.sqrt((measured**2).mean(axis=0))),
+        sizes=sizes,
+    )
+
+
+def _whole(selection: EffectSelection, parameters: Parameters) -> Hypothesis:
+    """The hypothesis with what the parameters compensated before it was fitted."""
+    hypothesis = selection.fit.hypothesis
+    n = len(selection.fitter.problem.recordings)
+    before = {
+        "lever_arm": parameters.lever_arm,
+        "dvl_time_offset": (parameters.dvl_time_offset,),
+        "clock_drift": (3600.0 * parameters.dvl_clock_drift,),
+    }
+    values: dict[str, tuple[Values, ...]] = {}
+    for name, known in before.items():
+        if not any(known) or not EFFECTS[name].needs <= selection.fitter.problem.available:
+            continue
+        found = hypothesis.values.get(name) or (EFFECTS[name].defaults,) * n
+        names = dict(zip(_KNOWN_BEFORE[name], known, strict=True))
+        values[name] = tuple({**each, **{key: each[key] + names[key] for key in names}} for each in found)
+    added = [EFFECTS[name] for name in values if EFFECTS[name] not in hypothesis.effects]
+    return hypothesis.with_effects([*hypothesis.effects, *added], n, values)
+
+
+def _measured(problem: Problem, hypothesis: Hypothesis) -> Array:
+    """(N, 3) m/s, DVL frame, without noise, of all recordings."""
+    return np.concatenate([simulated(problem, hypothesis, index) for index in range(len(problem.recordings))])
+
+
+def _rms(difference: Array) -> float:
+    return float(np.sqrt((difference**2).sum(axis=1).mean()))
+
+
+def _noise(recordings: Sequence[RecordedStreams], selection: EffectSelection) -> Array:
+    """(3,) m/s: the lesser of what neighbours do not tell of the DVL's own samples, and of their residual.
+
+    The first holds motion that is too quick for the DVL's rate (of a slow one no more is believed than it claims), the
+    second what is left of the reference's noise.
+    """
+    problem = with_quiet_reference(selection.fitter.problem)
+    variances = []
+    for index, recording in enumerate(recordings):
+        rest = recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
+        own = recording.dvl.noise
+        variances.append(np.minimum(own, Curve(recording.dvl.time, rest).roughness) ** 2)
+    return np.asarray(np.sqrt(np.mean(variances, axis=0)))
+
+
+def _three(values: Sequence[float] | Array) -> Three:
+    x, y, z = map(float, values)
+    return x, y, z

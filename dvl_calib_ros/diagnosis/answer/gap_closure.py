@@ -1,0 +1,284 @@
+"""How large the error is and how much of it goes away, on data that the parameters have not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.frames import Array
+from ..fit.cross_validation import fitted_without, folds_of, stretch_of
+from ..fit.gauss_newton import Fit, Fitter
+from ..model.forward_model import Problem
+from ..model.hypothesis import Hypothesis
+from ..model.settings import SETTINGS
+from ..search.effect_selection import EffectSelection
+
+RESAMPLES = 1000
+# Noise at high frequencies that is larger than what the messages claim by more than this is not taken for noise
+WORSE_THAN_CLAIMED = 3.0
+Integers = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Vector RMS, m/s, per sample, on held-out data. before, after: errors as they are, noise included.
+
+    noise_floor: what the instruments and the high frequencies show. closure: of what is beyond that, nan where there
+    is none; interval: its 95 per cent. not_explained: what of `after` is not noise. reported: noise that the messages
+    claim, None where they do not. by_recording: before and after of each of several. left_open: what of
+    `not_explained` is in stretches that alone tell a part of the effects, and no more than was to be expected there.
+    shown_from: the lower end of `interval` but for that.
+    """
+
+    before: float
+    after: float
+    noise_floor: float
+    closure: float
+    interval: tuple[float, float]
+    not_explained: float = 0.0
+    reported: float | None = None
+    by_recording: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    left_open: float = 0.0
+    shown_from: float = np.nan
+
+    @property
+    def shown(self) -> float:
+        """Closure, but for what is left open."""
+        return float(self.closure + (self.not_explained**2 - self.not_expected**2) / max(self.beyond_noise**2, 1e-300))
+
+    @property
+    def not_expected(self) -> float:
+        """m/s, of what is not explained, beyond what is left open."""
+        return float(np.sqrt(max(0.0, self.not_explained**2 - self.left_open**2)))
+
+    @property
+    def beyond_noise(self) -> float:
+        """m/s, of before."""
+        return float(np.sqrt(max(0.0, self.before**2 - self.noise_floor**2)))
+
+
+@dataclass(frozen=True)
+class HeldOutResiduals:
+    """before, after: errors (F, 3) m/s of calibrations without and with the effects that have not seen them.
+    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling. left_open: (F,)
+    (m/s)², square of what calibrations with the effects are to be off by there, as far as what they have seen tells.
+    """
+
+    before: Array
+    after: Array
+    floor: Array
+    block: Integers
+    left_open: Array | float = 0.0
+
+    def squares(self) -> tuple[Array, Array, Array]:
+        """Squares of before, after and floor summed over each block (B,), (m/s)²."""
+        return self._summed(self.before**2), self._summed(self.after**2), self._summed(self.floor)
+
+    def open_of_blocks(self) -> Array:
+        """(B,) (m/s)², sums of what is left open, of each block no more than it has beyond the noise."""
+        _, after, floor = self.squares()
+        left_open = np.bincount(self.block, np.broadcast_to(self.left_open, len(self.block)))
+        return np.asarray(np.minimum(left_open, np.maximum(after - floor, 0.0)))
+
+    def _summed(self, squares: Array) -> Array:
+        return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
+
+
+def held_out(selection: EffectSelection) -> HeldOutResiduals:
+    """What is left before and after the effects of a selection, on held-out data.
+
+    Of one recording stretches of time in turn are held out; of several whole ones, with what belongs to the day
+    (`Effect.of_the_day`) fitted to them. Everything is fitted anew in the composed model.
+    """
+    fitter, fit = selection.fitter, selection.fit
+    problem = fitter.problem
+    before, after = np.zeros((len(problem.bin_of), 3)), np.zeros((len(problem.bin_of), 3))
+    hypotheses = selection.base.hypothesis, fit.hypothesis
+    fold_of, left_open = folds_of(problem), np.zeros(len(problem.bin_of))
+    for fold, each in fitted_without(fitter, hypotheses, fit.noise, fold_of):
+        at = (fold_of == fold)[problem.bin_of]
+        for fitted, into in zip(each, (before, after), strict=True):
+            if len(problem.recordings) > 1:
+                of_day = _with_its_own_day(selection, fitted.hypothesis, fold)
+                into[at] = only(problem, fold).errors(of_day.seen)
+            else:
+                into[at] = problem.errors(fitted.seen)[at]
+        left_open[at] = _left_open(each[-1])[problem.bin_of][at]
+    block = np.unique(_block_keys(problem), return_inverse=True)[1][problem.bin_of]
+    return HeldOutResiduals(
+        before,
+        after,
+        noise_floor(selection),
+        np.asarray(block, dtype=np.intp),
+        left_open,
+    )
+
+
+def _left_open(fit: Fit) -> Array:
+    """(M,) (m/s)², square of what a fit is to be off by in each bin; of several recordings but for what is the day's,
+    which is fitted to what is held out."""
+    of_day = [each.effect.of_the_day and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
+    own = np.flatnonzero(~np.array([False] * 6 + of_day))
+    columns, covariance = fit.columns[:, :, own], fit.system.covariance()[np.ix_(own, own)]
+    return np.asarray(np.einsum("map,map->m", columns @ covariance, columns))
+
+
+def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
+    """Fit to one recording with the vehicle as others tell it and the day as it tells itself."""
+    problem, noise = selection.fitter.problem, selection.fit.noise
+    alone = only(problem, recording)
+    of_it = problem.rows_of[recording]
+    outliers = selection.fitter.outliers
+    fitter = Fitter(alone, outliers[of_it] if isinstance(outliers, np.ndarray) else outliers)
+    values = {name: (per[recording],) for name, per in hypothesis.values.items()}
+    return fitter.fit(replace(hypothesis, values=values), noise.part(of_it), only_of_the_day=True)
+
+
+def only(problem: Problem, recording: int) -> Problem:
+    """The problem of one of its recordings."""
+    made = Problem((problem.recordings[recording],), problem.rotation_dvl_from_body, problem.lever_arm, ())
+    return replace(made, grids=(problem.grids[recording],), of_axes=problem.measured)
+
+
+def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
+    """Held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
+    before, after, floor = residuals.squares()
+    left_open, n = residuals.open_of_blocks(), len(residuals.before)
+
+    def closure(at: Integers, left: Array) -> Array:
+        gap = np.maximum((before - floor)[at].sum(axis=-1), 1e-300)
+        return np.asarray(1.0 - np.maximum((left - floor)[at].sum(axis=-1), 0.0) / gap)
+
+    drawn = np.random.default_rng(0).integers(0, len(before), (RESAMPLES, len(before)))
+    low, high = np.percentile(np.clip(closure(drawn, after), -1.0, 1.0), [2.5, 97.5]).tolist()
+    shown_from = float(np.percentile(np.clip(closure(drawn, after - left_open), -1.0, 1.0), 2.5))
+    squares = [float(part.sum()) / n for part in (before, after, floor)]
+    is_gap = bool(selection.fit.effects) and squares[0] > squares[2]
+    value = min(1.0, float(closure(np.arange(len(before)), after))) if is_gap else np.nan
+    return Gap(
+        before=float(np.sqrt(squares[0])),
+        after=float(np.sqrt(squares[1])),
+        noise_floor=float(np.sqrt(squares[2])),
+        closure=max(-1.0, value) if is_gap else np.nan,
+        interval=(low, high) if is_gap else (np.nan, np.nan),
+        not_explained=float(np.sqrt(max(0.0, squares[1] - squares[2]))),
+        reported=_reported(selection.fitter.problem),
+        by_recording=_by_recording(selection.fitter.problem, residuals),
+        left_open=float(np.sqrt(left_open.sum() / n)),
+        shown_from=shown_from if is_gap else np.nan,
+    )
+
+
+def _by_recording(problem: Problem, residuals: HeldOutResiduals) -> dict[str, tuple[float, float]]:
+    if len(problem.recordings) == 1:
+        return {}
+    of_sample = problem.recording_of[problem.bin_of]
+    found = {}
+    for index, recording in enumerate(problem.recordings):
+        at = of_sample == index
+        rms = [float(np.sqrt((each[at] ** 2).sum(axis=1).mean())) for each in (residuals.before, residuals.after)]
+        found[recording.name] = (rms[0], rms[1])
+    return found
+
+
+def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
+    """Share of the gap that one effect closes without the others, as fitted to all data."""
+    fitter, fit = selection.fitter, selection.fit
+    chosen = [effect for effect in fit.effects if effect.name == name]
+    if len(fit.effects) == 1 or not np.isfinite(gap.closure):
+        return gap.closure
+    alone = fitter.fit_kept(fit.hypothesis.with_effects(chosen, len(fit.seen), {}), fit.noise)
+    without, with_it = (
+        float(np.mean((fitter.problem.errors(each.seen) ** 2).sum(axis=1))) for each in (selection.base, alone)
+    )
+    return float(np.clip((without - with_it) / max(gap.beyond_noise**2, 1e-300), -1.0, 1.0))
+
+
+# ------------------------------------------------------------------ noise
+
+
+def noise_floor(selection: EffectSelection) -> Array:
+    """(F, 3) (m/s)²: the noise of each sample.
+
+    Where what the fit leaves is as small as the high frequencies say that the noise is, it is what is left, sample by
+    sample: so it shares the noise of before and after, and their differences are exact to the size of the gap rather
+    than of the noise. Where more is left, that is slow, and no noise: then the level of the high frequencies is.
+    """
+    problem, fit = selection.fitter.problem, selection.fit
+    left = problem.errors(fit.seen)
+    floor = np.zeros_like(left)
+    claimed, slow = claimed_std(problem), _made_slow(problem, fit)
+    parameters = fit.columns.shape[2]
+    of_sample = problem.recording_of[problem.bin_of]
+    for recording in range(len(problem.recordings)):
+        at = of_sample == recording
+        high, error = high_frequency_variance(problem.sample_time[at], left[at])
+        if claimed is not None:
+            high = np.minimum(high, WORSE_THAN_CLAIMED**2 * claimed[recording] ** 2)
+        high = high + slow[recording]
+        n = int(at.sum())
+        own = left[at] ** 2 * (1.0 + 2.0 * parameters / (3.0 * max(n, 1)))
+        is_noise = own.mean(axis=0).sum() <= high.sum() * (1.0 + SETTINGS.noise_tolerance * error)
+        floor[at] = own if is_noise else high
+    return floor
+
+
+def _made_slow(problem: Problem, fit: Fit) -> list[Array]:
+    """(3,) (m/s)² per recording: variance of the velocities' own noise, as made-up noise shows it, that a lag of the
+    fit has made slow, and high frequencies so do not show."""
+    slow: list[Array] = [np.zeros(3)] * len(problem.recordings)
+    if not fit.hypothesis.lags(0):
+        return slow
+    left = problem.errors(fit.seen)
+    of_sample = problem.recording_of[problem.bin_of]
+    for shaken in problem.shaken:
+        own = shaken.errors(shaken.all_seen(fit.hypothesis)) - left
+        for recording, before in enumerate(slow):
+            at = of_sample == recording
+            high, _ = high_frequency_variance(problem.sample_time[at], own[at])
+            slow[recording] = before + np.maximum((own[at] ** 2).mean(axis=0) - high, 0.0)
+    return slow
+
+
+def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:
+    """Variance (3,) that values (F, 3) show from sample to sample, and its relative standard error.
+
+    Of second differences: of white noise 6 times its variance, of what is slow next to nothing. Those that are far out
+    (outliers) are left out, like as many of white noise.
+    """
+    interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+    second = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    near = np.abs(time[2:] - time[:-2] - 2.0 * interval) < interval
+    second = second[near]
+    if len(second) < 4:
+        return np.zeros(values.shape[1]), np.inf
+    return np.asarray((second**2).mean(axis=0) / 6.0), float(np.sqrt(3.9 / len(second)))
+
+
+def claimed_std(problem: Problem) -> list[Array] | None:
+    """(3,) m/s per recording, that the messages claim of the difference per axis, None where one does not."""
+    found = []
+    for recording in problem.recordings:
+        if recording.dvl_std is None or recording.reference_std is None:
+            return None
+        measured = np.array(problem.measured)
+        reference = np.where(measured, recording.reference_std, 0.0)
+        found.append(np.where(measured, np.hypot(np.mean(recording.dvl_std), np.mean(reference[measured])), 0.0))
+    return found
+
+
+def _reported(problem: Problem) -> float | None:
+    claimed = claimed_std(problem)
+    return None if claimed is None else float(np.sqrt(np.mean([np.sum(each**2) for each in claimed])))
+
+
+# ------------------------------------------------------------------ folds
+
+
+def _block_keys(problem: Problem) -> Integers:
+    index = stretch_of(problem.time)
+    index -= index.min()
+    return np.asarray(problem.recording_of * (index.max() + 1) + index, dtype=np.intp)

@@ -1,0 +1,142 @@
+"""Where the gap lies: axis, regime of motion, stretch of time, band of frequency."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.frames import Array
+from ...calibration.numerics.tests import holm
+from ...effects.base import EffectInput, EffectNeeds
+from ..fit.gauss_newton import Fit, Fitter
+from ..model.forward_model import Problem
+from ..model.seen import Seen
+from ..noise.noise_model import Noise
+from ..noise.whitened_least_squares import WhitenedLeastSquares
+from ..search.unexplained import explained, orthonormal
+
+LEVEL = 0.01
+TURNING_RADPS = np.deg2rad(2.0)
+ACCELERATING_MPS2 = 0.05
+STRETCHES = 6
+BANDS_HZ = (0.0, 0.01, 0.05, 0.2, np.inf)
+ALL = "all"
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class GapPlace:
+    """share: of the gap's energy in m²/s² that lies here. p: adjusted (Holm) over all places looked at."""
+
+    axis: str
+    regime: str
+    segment_s: tuple[float, float]
+    band_hz: tuple[float, float]
+    share: float
+    p: float
+
+
+def regimes(problem: Problem, seen: Sequence[Seen], per_sample: bool = False) -> dict[str, Mask]:
+    """(M,) bool each, or of every sample (F,): where the vehicle goes straight, turns, changes speed, is slow or fast
+    (terciles).
+    """
+
+    def of(function: Callable[[EffectInput], Array]) -> Array:
+        if per_sample:
+            return np.concatenate([function(each.motion) for each in seen])
+        return problem.sampled(seen, function)
+
+    speeds = of(lambda motion: motion.speed)
+    change = of(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
+    found = {"accelerating": np.abs(change) > ACCELERATING_MPS2}
+    if EffectNeeds.ANGULAR_VELOCITY in problem.available:
+        found["turning"] = np.abs(of(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
+        found["straight"] = ~found["turning"]
+    slow, fast = np.quantile(speeds, [1 / 3, 2 / 3])
+    if fast - slow > 0.1 * fast:
+        found["slow"], found["fast"] = speeds <= slow, speeds >= fast
+    return {name: mask for name, mask in found.items() if 0.02 < mask.mean() < 0.98}
+
+
+def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[GapPlace]:
+    """Places where the residual of the calibration alone is more than noise, those with most of the gap first.
+
+    columns: (M, A, p) that make up the gap: traces of the effects, or the dictionary where no effect explains it.
+    """
+    problem, noise = fitter.problem, fit.noise
+    gap = _signal(base, fit, columns)
+    total = float((gap**2).sum())
+    if total <= 0.0:
+        return []
+    white = noise.whiten(base.residual)
+    q = orthonormal(noise.whiten(base.columns))
+    white = white - q @ (q.T @ white)
+    functions = _simplest(problem, fit.seen)
+    seconds = max(recording.seconds for recording in problem.recordings)
+    nyquist = 0.5 / problem.interval
+    names = [name for name, measured in zip("xyz", problem.measured, strict=True) if measured]
+    everywhere = np.ones(len(gap), dtype=bool)
+    masks = {ALL: everywhere} | regimes(problem, fit.seen)
+    cells = [(axis, name, (0.0, seconds), mask) for name, mask in masks.items() for axis in range(problem.axes)]
+    edges = np.linspace(0.0, seconds, STRETCHES + 1)
+    for start, end in itertools.pairwise(edges.tolist()):
+        within = (problem.time >= start) & (problem.time <= end)
+        cells += [(axis, ALL, (float(start), float(end)), within) for axis in range(problem.axes)]
+    found: list[GapPlace] = []
+    for axis, name, segment, mask in cells:
+        p = float(np.exp(_log_p(noise, functions, q, white, axis, mask)))
+        share = float((gap[mask, axis] ** 2).sum()) / total
+        found.append(GapPlace(names[axis], name, segment, (0.0, nyquist), share, p))
+        if name == ALL and segment == (0.0, seconds):
+            found += [
+                GapPlace(names[axis], ALL, segment, (low, min(high, nyquist)), part / total, p)
+                for low, high, part in _bands(gap[:, axis], nyquist)
+            ]
+    adjusted = holm([place.p for place in found])
+    kept = [
+        GapPlace(place.axis, place.regime, place.segment_s, place.band_hz, place.share, float(p))
+        for place, p in zip(found, adjusted, strict=True)
+        if p < LEVEL and place.share > 0.02
+    ]
+    return sorted(kept, key=lambda place: -place.share)
+
+
+def _signal(base: Fit, fit: Fit, columns: Array) -> Array:
+    """(M, A): the gap, as far as it is known: what the columns say beyond the calibration."""
+    noise = fit.noise
+    size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
+    raw = np.concatenate([base.columns, columns / size], axis=2)
+    ridge = np.full(raw.shape[2], 10.0)
+    system = WhitenedLeastSquares.of(noise.whiten(raw), noise.whiten(base.residual), ridge, np.zeros_like(ridge))
+    return np.asarray(raw @ system.solution())
+
+
+def _simplest(problem: Problem, seen: Sequence[Seen]) -> Array:
+    """(M, c): one, speed, and turn rate where it is known."""
+    speed = problem.sampled(seen, lambda motion: motion.speed)
+    functions = [np.ones_like(speed), speed]
+    if EffectNeeds.ANGULAR_VELOCITY in problem.available:
+        functions.append(problem.sampled(seen, lambda motion: motion.turn_rate[:, 2]))
+    return np.column_stack(functions)
+
+
+def _log_p(noise: Noise, functions: Array, q: Array, white: Array, axis: int, mask: Mask) -> float:
+    """log p of what functions of motion (M, c), within a place, explain of the whitened residual."""
+    columns = np.zeros((*noise.level.shape, functions.shape[1]))
+    columns[mask, axis] = functions[mask]
+    return explained(q, noise.whiten(columns), white, 1.0)[0]
+
+
+def _bands(gap: Array, nyquist: float) -> list[tuple[float, float, float]]:
+    energy = np.abs(np.fft.rfft(gap)) ** 2
+    frequency = np.linspace(0.0, nyquist, len(energy))
+    total = max(float(energy.sum()), 1e-300)
+    return [
+        (low, high, float((gap**2).sum()) * float(energy[(frequency >= low) & (frequency < high)].sum()) / total)
+        for low, high in itertools.pairwise(BANDS_HZ)
+        if low < nyquist
+    ]

@@ -1,0 +1,139 @@
+"""Whether what was found stands: on data it was not fitted to, and against an unknown cause in its place."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from ...effects.base import Effect
+from ..fit.gauss_newton import Fit
+from ..fit.selection_criteria import FittedBeside, blocks_of, price, robust_p
+from ..model.forward_model import Problem
+from ..model.settings import SETTINGS
+from ..search.effect_selection import EffectSelection
+from ..search.unexplained import (
+    Unexplained,
+    is_of_group,
+    matters,
+    moved_by,
+    surprise_elsewhere,
+    told_elsewhere,
+    unexplained,
+)
+from .gap_closure import Gap
+
+# p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
+WEAK = 1e-3
+# Deviance that all effects together explain, up to which they must explain this share of it on stretches that they were
+# not fitted to as well: pairs that cancel but for noise do not, of real ones nine in ten do with a signal-to-noise of 5
+FAINT, BORNE_OUT = 200.0, 0.25
+# Of what effects explain, the shares that an unknown cause must explain to be asked whether it predicts better: at
+# first sight, beyond its price, and beyond what made-up recordings show to be chance; and what curves between samples
+# leave
+TOLD_FROM, AS_MUCH, OF_INEXACT = 0.5, 0.8, 0.02
+# Deviance by which a bound on another may be off as numbers are rounded
+ROUNDING = 1e-3
+
+
+def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection, Unexplained]:
+    """A selection without what an unknown cause explains better or may be a part of, and what it then leaves.
+
+    Of effects that nobody would see without a test: a step in a bias looks like a drift, but for what that leaves.
+    Better is what explains more for its price, or predicts stretches of the run that neither was fitted to: several
+    effects together have shapes enough for a stall in turns, where they are fitted. A group of functions of which the
+    effects are some is their cause and more: it is better by what more explains alone.
+    """
+    fitter, fit = selection.fitter, selection.fit
+    rest = unexplained(fitter, fit)
+    best: tuple[float, EffectSelection, Unexplained] | None = None
+    for out in _subsets(selection):
+        reduced = selection.without({effect.name for effect in out})
+        drop = reduced.fit.deviance - fit.deviance
+        if drop > SETTINGS.instead_of:
+            continue
+        lost = drop - sum(price(effect, n_tested, len(fit.seen)) for effect in out)
+        wanted = SETTINGS.indistinguishable + SETTINGS.instead_share * drop
+        other = unexplained(fitter, reduced.fit, asked=min(wanted + lost, TOLD_FROM * drop) - ROUNDING)
+        if not other.found:
+            continue
+        gain = (other.clear_energy - other.price) - lost - wanted
+        if other.clear_energy > AS_MUCH * drop and not is_of_group(fitter.problem, fit, out, other.about):
+            better = _better_elsewhere(fitter.problem, fit, reduced.fit, other)
+            gain = max(gain, better - SETTINGS.indistinguishable - OF_INEXACT * drop)
+        if gain < 0.0 or not matters(fitter.problem, reduced.fit, other):
+            continue
+        if best is None or gain > best[0]:
+            best = gain, reduced, other
+    return _sure_beside(*((selection, rest) if best is None else best[1:]))
+
+
+def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectSelection, Unexplained]:
+    """A selection without effects that are not sure with what the rest follows fitted beside them, and what it leaves.
+
+    Which part of them is the unknown cause's nobody knows: a current and two drifts in the place of a step in a bias.
+    """
+    fitter, block = selection.fitter, blocks_of(selection.fitter.problem)
+    while selection.selected and matters(fitter.problem, selection.fit, rest):
+        fit, named = selection.fit, {each.effect.name for each in selection.selected}
+        moved = moved_by(fitter.problem, fit, rest)
+        p_values = {e.name: robust_p(fit, e, block, moved=moved) for e in fit.effects if e.name in named}
+        worst = max(p_values, key=lambda name: p_values[name])
+        if p_values[worst] < SETTINGS.robust_level:
+            break
+        reduced = selection.without({worst})
+        other = unexplained(fitter, reduced.fit)
+        if not matters(fitter.problem, reduced.fit, other):
+            break
+        selection, rest = reduced, other
+    return selection, rest
+
+
+def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
+    """By how much better, in deviance, an unknown cause beside a reduced fit predicts stretches that it was not fitted
+    to than the fit does."""
+    whole, rest = (FittedBeside.of_fit(problem, each) for each in (fit, reduced))
+    rest = rest.and_rest(other.clearest, reduced.residual)
+    effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
+    return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
+
+
+def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
+    effects = selection.fit.effects
+    return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
+
+
+def borne_out(
+    selection: EffectSelection, rest: Unexplained, gap: Gap, n_tested: int
+) -> tuple[EffectSelection, Unexplained]:
+    """A selection and what it leaves, as they are if it is borne out; else none of its effects, and what is left then.
+
+    What explains much may be told by one stretch alone, as a leap by one turn. It stands if no unknown cause does.
+    """
+    if not selection.selected or is_borne_out(selection, gap, n_tested):
+        return selection, rest
+    none = selection.withdrawn()
+    left = unexplained(none.fitter, none.fit)
+    is_told_once = none.fit.deviance - selection.fit.deviance >= FAINT and gap.shown_from > 0.0
+    if is_told_once and not matters(none.fitter.problem, none.fit, left):
+        return selection, rest
+    return none, left
+
+
+def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
+    """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
+    fit = selection.fit
+    explained = selection.base.deviance - fit.deviance
+    if explained < FAINT:
+        columns, parameters = fit.columns[:, :, 6:], fit.hypothesis.parameters()
+        values = fit.hypothesis.vector()[6:] - np.array([each.spec.default for each in parameters])
+        without = fit.residual - columns @ values
+        problem = selection.fitter.problem
+        known = FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns[:, :, :6])
+        told = told_elsewhere(problem, fit.noise, known, columns, without)
+        if told < BORNE_OUT * (explained - len(values)):
+            return False
+    p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
+    if np.isnan(gap.interval[0]):
+        return p <= WEAK and gap.after < gap.before
+    return gap.interval[0] > 0.0  # else, whatever its p, it does not hold elsewhere

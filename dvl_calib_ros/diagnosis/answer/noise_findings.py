@@ -1,0 +1,178 @@
+"""What the noise is like, beside the verdict: outliers, repeats, larger than reported, coloured; and whether it follows
+what messages claim of their own noise, where that differs from sample to sample.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...calibration.numerics.distributions import binomial_interval, binomial_sf, chi2_sf, normal_isf, normal_sf
+from ...calibration.numerics.frames import Array
+from ...calibration.numerics.robust import robust_std
+from ...calibration.numerics.tests import holm
+from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, around
+from ..fit.parametric_bootstrap import made_up
+from ..model.claimed_noise import followed
+from ..model.forward_model import Problem
+from ..noise.noise_level import SIGNIFICANT, claims_of, fit_claims, fit_level, stretches_of
+from ..noise.noise_model import Arma, Noise
+from .gap_closure import claimed_std, high_frequency_variance
+
+LEVEL = 0.01
+OUTLIER_SIGMA = 6.0
+# Repeats that chance and a coarse resolution may bring
+CHANCE_OF_REPEAT = 1e-3
+# A floor this much above the reported one is worth telling
+INFLATION = 1.2
+# Recordings with white noise that tell what colour comparing gives it
+MADE_UP = 5
+# An exponent below this is of a claim that does not hold; the other stream's noise lowers that of an honest one, too
+HALF = 0.5
+
+
+@dataclass(frozen=True)
+class NoiseFinding:
+    """One finding. parameters: value and 95 per cent interval by name."""
+
+    name: str
+    parameters: Mapping[str, tuple[float, float, float]]
+    p: float
+
+
+def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
+    """Findings that are significant, the clearest first; p is Holm's over all."""
+    problem = fitter.problem
+    raw = fit.residual + fitter.outliers
+    innovations = fit.noise.whiten(raw).reshape(raw.shape)
+    candidates = [
+        _outliers(innovations, problem),
+        _stale(problem),
+        _coloured(problem, fit),
+        *_inflation(problem, fit, innovations),
+        _reported_covariance(problem, fit, innovations * fit.noise.level),
+    ]
+    found = [each for each in candidates if each is not None]
+    if not found:
+        return []
+    adjusted = holm([each.p for each in found])
+    findings = [
+        NoiseFinding(each.name, each.parameters, float(p)) for each, p in zip(found, adjusted, strict=True) if p < LEVEL
+    ]
+    return sorted(findings, key=lambda each: each.p)
+
+
+def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
+    scale = robust_std(innovations)
+    far = (np.abs(innovations) > OUTLIER_SIGMA * scale).any(axis=1)
+    off = problem.bursts // problem.grids[0].per_bin
+    count, n = int(np.count_nonzero(far)) + off, len(innovations) + off
+    spikes, received = (sum(getattr(r, name) for r in problem.recordings) for name in ("spikes", "received"))
+    if spikes > count:
+        count, n = spikes, received
+    if count < 3:
+        return None
+    p = binomial_sf(count, n, 6.0 * float(normal_sf(OUTLIER_SIGMA)))
+    return NoiseFinding("outliers", {"share": (count / n, *binomial_interval(count, n))}, p)
+
+
+def _stale(problem: Problem) -> NoiseFinding | None:
+    count = sum(recording.repeats for recording in problem.recordings)
+    n = sum(recording.received for recording in problem.recordings)
+    if count < 3:
+        return None
+    p = binomial_sf(count, n, CHANCE_OF_REPEAT)
+    return NoiseFinding("stale_samples", {"share": (count / n, *binomial_interval(count, n))}, p)
+
+
+def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
+    """Whether the noise has a memory, beyond that which streams of white noise get where they are compared."""
+    noise, residual = fit.noise, fit.residual
+    if all(not len(arma.ar) for arma in noise.axes):
+        return None
+    drop = noise.refitted(residual, [(0, 0)]).deviance(residual) - noise.deviance(residual)
+    dof = sum(len(arma.ar) + (arma.ma != 0.0) for arma in noise.axes)
+    clearest = max(noise.axes, key=lambda arma: arma.ratio)
+    interval = problem.interval
+    constant = _time_constant(clearest, interval)
+    if constant < 2.0 * interval:
+        return None  # neighbours share samples of the reference by interpolation
+    if float(chi2_sf(drop, dof)) < LEVEL:
+        drop = min(drop, _made_by_comparing(problem, fit).deviance(residual) - noise.deviance(residual))
+    spread = constant * 2.0 / np.sqrt(max(1.0, sum(r.seconds for r in problem.recordings) / max(constant, interval)))
+    parameters = {"time_constant_s": (constant, max(0.0, constant - spread), constant + spread)}
+    return NoiseFinding("coloured_reference_noise", parameters, float(chi2_sf(max(drop, 0.0), dof)))
+
+
+def _made_by_comparing(problem: Problem, fit: Fit) -> Noise:
+    """The noise with the colour that comparing gives to white noise.
+
+    A stream that is `quiet` between its samples has only the low frequencies of its noise left, which are as slow as
+    the vehicle's motion.
+    """
+    noise, white = fit.noise, replace(fit, noise=fit.noise.white)
+    residuals = [residual for _, _, residual in made_up(problem, white, MADE_UP)]
+    m = len(fit.residual)
+    pooled = replace(
+        noise,
+        segments=tuple(
+            slice(part.start + k * m, part.stop + k * m) for k in range(len(residuals)) for part in noise.segments
+        ),
+        rotation=None if noise.rotation is None else np.concatenate([noise.rotation] * len(residuals)),
+        level=np.concatenate([noise.level] * len(residuals)),
+    ).like(np.concatenate(residuals))
+    unit = replace(noise, axes=tuple(replace(arma, std=1.0) for arma in pooled.axes))
+    stds = np.sqrt((unit.whiten(fit.residual).reshape(fit.residual.shape) ** 2).mean(axis=0)).tolist()
+    return replace(unit, axes=tuple(replace(arma, std=std) for arma, std in zip(unit.axes, stds, strict=True)))
+
+
+def _time_constant(arma: Arma, interval: float) -> float:
+    roots = np.abs(np.roots(np.concatenate([[1.0], -arma.ar])))
+    slowest = float(roots.max()) if len(roots) else 0.0
+    return interval / -np.log(slowest) if 0.0 < slowest < 1.0 else interval
+
+
+def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFinding | None]:
+    found: list[NoiseFinding | None] = []
+    claimed = claimed_std(problem)
+    if claimed is not None:
+        errors = problem.errors(fit.seen)
+        variance, error = high_frequency_variance(problem.sample_time, errors)
+        ratio = float(np.sqrt(variance.sum() / np.mean([np.sum(each**2) for each in claimed])))
+        error = 0.5 * error
+        if ratio > INFLATION:
+            p = float(2.0 * normal_sf(np.log(ratio) / error))
+            low, high = float(ratio * np.exp(-OF_INTERVAL * error)), float(ratio * np.exp(OF_INTERVAL * error))
+            found.append(NoiseFinding("noise_inflation", {"factor": (ratio, low, high)}, p))
+    names, log_claims = claims_of(problem, fit.seen, fit.noise.rotation)
+    even = innovations * fit.noise.level
+    even = even / followed(log_claims, even, names, stretches_of(problem))
+    level = fit_level(problem, fit.seen, even)
+    if level is not None and level.p < SIGNIFICANT:
+        units = {"speed": "log_per_mps", "turn_rate": "log_per_radps"}
+        z = normal_isf(np.maximum(level.p_of, 1e-300) / 2.0)
+        parameters = {
+            units[name]: around(float(slope), float(abs(slope) / z_of))
+            for name, slope, z_of, p in zip(level.names, level.slopes, z, level.p_of, strict=True)
+            if p < LEVEL
+        }
+        if parameters:
+            found.append(NoiseFinding("noise_inflation", parameters, level.p))
+    return found
+
+
+def _reported_covariance(problem: Problem, fit: Fit, even: Array) -> NoiseFinding | None:
+    """How the noise even (M, A), with its level left in, follows covariances that differ: 1 as claimed, 0 not at all.
+
+    p: of not following at all, or, of less than half, of following. None where claims are all alike.
+    """
+    found = fit_claims(problem, fit.seen, even, fit.noise.rotation)
+    if found is None:
+        return None
+    parameters, p_values = {}, []
+    for name, value, std in zip(found.names, found.exponents.tolist(), found.stds.tolist(), strict=True):
+        parameters[f"{name}_exponent"] = around(value, std)
+        p_values.append(2.0 * float(normal_sf(abs(value - (0.0 if value > HALF else 1.0)) / std)))
+    return NoiseFinding("reported_covariance", parameters, float(min(1.0, len(p_values) * min(p_values))))

@@ -1,0 +1,229 @@
+"""What the pictures of a diagnosis show, sample by sample; collected only when somebody wants to look.
+
+What is left beside what it follows: the regressor as a navigator knows it, with its unit, for a picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.frames import Array
+from ...effects.base import EffectInput
+from ..fit.gauss_newton import Fit
+from ..model.forward_model import Problem
+from ..model.stream_curve import segments_of
+from ..search.alternative_regressors import FADES_S, faded
+from ..search.effect_selection import EffectSelection
+from ..search.unexplained import Unexplained
+from .gap_closure import HeldOutResiduals
+from .gap_location import regimes
+
+BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
+
+
+@dataclass(frozen=True)
+class HeldOutTwin:
+    """What the DVL of a recording measured, less what a simulated one does whose parameters had not seen it.
+
+    These are the errors that the gap is made of, on the same samples: between those of a slow reference there is none
+    of its noise, and an error without it would be of another size than the noise that is told beside it.
+
+    Parameters
+    ----------
+    name
+        Of the recording.
+    time
+        (N,) s since its start.
+    segments
+        Stretches without a gap.
+    without, with_effects
+        (N, 3) m/s, ahead, to port and up; zero on an axis that is not measured.
+    noise
+        (3,) m/s, rms of what of it is noise.
+    regimes
+        Name -> (N,) bool.
+
+    """
+
+    name: str
+    time: Array
+    segments: tuple[slice, ...]
+    without: Array
+    with_effects: Array
+    noise: Array
+    regimes: Mapping[str, NDArray[np.bool_]]
+
+    @property
+    def level(self) -> float:
+        """Length of `noise`, m/s."""
+        return float(np.sqrt((self.noise**2).sum()))
+
+    def errors(self, has_effects: bool) -> dict[str, Array]:
+        """Recorded less twin (N, 3) m/s by what the twin has; of a diagnosis without effects there is one twin."""
+        return {"without": self.without, "with": self.with_effects} if has_effects else {"twin": self.without}
+
+
+@dataclass(frozen=True)
+class DiagnosisSeries:
+    """F samples of all recordings, ahead, to port and up; zero on an axis that is not measured.
+
+    recordings: names. recording_of: (F,) index into them. time: (F,) s since the recording's start. segments: stretches
+    without a gap. held_out: errors before and after the effects, and the noise. regimes: name -> (F,) bool.
+    traces: by effect (F, 3) m/s, as fitted, without what misalignment and scale take in. phi: (3,) rad and scale: (3,),
+    the calibration beside the effects, DVL frame; calibration_std: (6,) of both. rest: what is left after them.
+    measured: (3,) axes that the reference measures. followed: what is left beside what it follows most.
+    """
+
+    recordings: tuple[str, ...]
+    recording_of: NDArray[np.intp]
+    time: Array
+    segments: tuple[slice, ...]
+    held_out: HeldOutResiduals
+    regimes: Mapping[str, NDArray[np.bool_]]
+    traces: Mapping[str, Array]
+    phi: Array
+    scale: Array
+    calibration_std: Array
+    rest: Unexplained
+    measured: tuple[bool, bool, bool] = (True, True, True)
+    followed: Followed | None = None
+
+    @property
+    def axes(self) -> dict[str, str]:
+        """Axes that the reference measures, with what they are called."""
+        return {axis: BODY_AXES[axis] for axis, measured in zip("xyz", self.measured, strict=True) if measured}
+
+    @property
+    def twins(self) -> tuple[HeldOutTwin, ...]:
+        """Recorded against simulated, by recording."""
+        return tuple(self._twin(index) for index in range(len(self.recordings)) if (self.recording_of == index).any())
+
+    def _twin(self, index: int) -> HeldOutTwin:
+        at, held = self.recording_of == index, self.held_out
+        return HeldOutTwin(
+            self.recordings[index],
+            self.time[at],
+            segments_of([self.time[at]]),
+            held.before[at],
+            held.after[at],
+            np.sqrt(held.floor[at].mean(axis=0)),
+            {name: mask[at] for name, mask in self.regimes.items() if mask[at].any()},
+        )
+
+
+def collect_series(
+    selection: EffectSelection, residuals: HeldOutResiduals, rest: Unexplained, covariance: Array
+) -> DiagnosisSeries:
+    """The series of what was selected and of what it leaves. covariance: (6 + p, 6 + p) of the fit."""
+    fitter, fit = selection.fitter, selection.fit
+    problem, n = fitter.problem, len(fit.seen)
+    errors = problem.errors(fit.seen)
+    traces = {}
+    for effect in fit.effects:
+        others = [other for other in fit.effects if other is not effect]
+        # the calibration takes in what it can of the trace, so it is fitted anew without the effect
+        without = fitter.fit_kept(fit.hypothesis.with_effects(others, n, {}), fit.noise)
+        traces[effect.name] = problem.errors(without.seen) - errors
+    recording_of = problem.recording_of[problem.bin_of]
+    times = [problem.sample_time[recording_of == recording] for recording in range(n)]
+    return DiagnosisSeries(
+        recordings=tuple(recording.name for recording in problem.recordings),
+        recording_of=recording_of,
+        time=problem.sample_time,
+        segments=segments_of(times),
+        held_out=residuals,
+        regimes=regimes(problem, fit.seen, per_sample=True),
+        traces=traces,
+        phi=fit.hypothesis.phi,
+        scale=fit.hypothesis.scale,
+        calibration_std=np.sqrt(np.diag(covariance)[:6]),
+        rest=rest,
+        measured=problem.measured,
+        followed=what_it_follows(problem, fit, rest.about),
+    )
+
+
+# Groups of equally many samples in which the mean is told
+GROUPS = 15
+MIN_GROUP = 4
+
+
+@dataclass(frozen=True)
+class Followed:
+    """label: what is left follows, with its unit. axis: x, y or z, that follows it most. at: (M,) values of it.
+    left: (M,) m/s, what the fit leaves along the axis.
+    """
+
+    label: str
+    axis: str
+    at: Array
+    left: Array
+
+    def groups(self) -> tuple[Array, Array, Array, Array]:
+        """(G,) means of what it follows; mean, standard deviation, and that of the mean (m/s), of what is left."""
+        count = max(1, min(GROUPS, len(self.at) // MIN_GROUP))
+        parts = np.array_split(np.argsort(self.at, kind="stable"), count)
+        at = np.array([self.at[part].mean() for part in parts])
+        mean = np.array([self.left[part].mean() for part in parts])
+        std = np.array([self.left[part].std(ddof=1) if len(part) > 1 else np.nan for part in parts])
+        return at, mean, std, std / np.sqrt([len(part) for part in parts])
+
+
+def what_it_follows(problem: Problem, fit: Fit, about: str | float) -> Followed | None:
+    """What a fit leaves beside the regressor it follows most, of those that a name stands for; None if there is none.
+
+    That axis and that regressor of which groups' means scatter most, against chance.
+    """
+    best: tuple[float, Followed] | None = None
+    names = [name for name, measured in zip("xyz", problem.measured, strict=True) if measured]
+    for label, at in _regressors(problem, fit, about).items():
+        for axis, name in enumerate(names):
+            followed = Followed(label, name, at, fit.residual[:, axis])
+            _, mean, _, error = followed.groups()
+            scatter = float(np.nanmean((mean / np.maximum(error, 1e-12)) ** 2))
+            if best is None or scatter > best[0]:
+                best = scatter, followed
+    return None if best is None else best[1]
+
+
+def _regressors(problem: Problem, fit: Fit, about: str | float) -> Mapping[str, Array]:
+    """Label -> (M,) values, of what a name in `dictionary`, or a period in s, stands for."""
+    if isinstance(about, float):
+        return {f"time within a period of {about:.0f} s, s": np.mod(problem.time, about)}
+    parts = [_of_motion(each.motion, about) for each in fit.seen]
+    return {
+        label: np.concatenate([grid.averaged(part[label]) for grid, part in zip(problem.grids, parts, strict=True)])
+        for label in parts[0]
+    }
+
+
+def _of_motion(motion: EffectInput, about: str) -> dict[str, Array]:
+    velocity, rotation, rates = motion.velocity_body, motion.rotation_enu_from_body, motion.angular_velocity
+    if about in ("speed", "a band of speeds"):
+        return {"speed, m/s": motion.speed}
+    if about == "acceleration":
+        return {"acceleration ahead, m/s²": np.gradient(velocity[:, 0], motion.time)}
+    if about == "sway and heave":
+        return {"velocity to port, m/s": velocity[:, 1], "velocity up, m/s": velocity[:, 2]}
+    if about in ("time", "a step in time"):
+        return {"time, s": motion.time}
+    if rotation is not None and about == "heading":
+        return {"yaw, ° from east to north": np.degrees(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))}
+    if rotation is not None and about == "tilt":
+        pitch = np.degrees(-np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0)))
+        return {"pitch, ° (bow down)": pitch, "roll, °": np.degrees(np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]))}
+    if rotation is not None and about == "depth":
+        steps = np.clip(np.diff(motion.time, prepend=motion.time[0]), 0.0, 10.0)
+        return {"height against the start, m": np.cumsum(np.einsum("ni,ni->n", rotation[:, 2], velocity) * steps)}
+    if rates is not None and about == "turn rate":
+        return {"turn rate, °/s (to port)": np.degrees(rates[:, 2])}
+    if rates is not None and about == "turns before":
+        turns = np.degrees(rates[:, 2])
+        return {f"turns before, °/s, fading in {s:.0f} s": faded(motion.time, turns, s) for s in FADES_S}
+    if rates is not None and about == "roll and pitch rate":
+        return {"roll rate, °/s": np.degrees(rates[:, 0]), "pitch rate, °/s": np.degrees(rates[:, 1])}
+    return {}

@@ -1,0 +1,186 @@
+"""What a diagnosis says, as data, and as the JSON of `diagnose --json`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+from ...verdict.answering import Answering
+from ...verdict.reasons import Reason
+from ..search.arm_clock_ambiguity import Combination
+from ..search.effect_selection import EffectSelection
+from .dvl_description import DvlSeen
+from .gap_closure import Gap
+from .gap_location import GapPlace
+from .noise_findings import NoiseFinding
+from .plotted_series import DiagnosisSeries
+from .simulated_twin import Twin
+
+
+class DiagnosisVerdict(str, Enum):
+    """The answer in a word."""
+
+    NO_GAP = "no_gap"
+    KNOWN = "known"
+    AMBIGUOUS = "ambiguous"
+    UNKNOWN = "unknown"
+    INSUFFICIENT_EXCITATION = "insufficient_excitation"
+
+
+@dataclass(frozen=True)
+class FoundEffect:
+    """An effect that was found. equivalent_to: others that this data cannot tell from it. parameters: value, low, high
+    (95 per cent) by name; of the day's, in several recordings, their weighted mean, and by_recording the values of
+    each. closure: of the gap by this effect alone. p: adjusted over the library. combination: of a clock that a lever
+    arm could stand in for, what is known of both.
+    """
+
+    name: str
+    equivalent_to: tuple[str, ...]
+    parameters: Mapping[str, tuple[float, float, float]]
+    closure: float
+    p: float
+    by_recording: Mapping[str, Mapping[str, tuple[float, float, float]]] = field(default_factory=dict)
+    combination: Combination | None = None
+
+
+@dataclass(frozen=True, repr=False)
+class Diagnosis(Answering):
+    """The whole answer. reasons: the verdict first. notes: on the data. series: for pictures, if they were asked for
+    and there are any. calibration: value, low, high of φ (rad) and δk, three of each, beside the effects.
+    compared_axes: in words. recordings: names and first stamps (ns). twins: of the recordings. dvl: as another
+    simulator has to be told of it. selection: the fits behind it, None where nothing could be fitted.
+    """
+
+    verdict: DiagnosisVerdict
+    reasons: tuple[Reason, ...]
+    gap: Gap
+    effects: tuple[FoundEffect, ...]
+    noise: tuple[NoiseFinding, ...]
+    where: tuple[GapPlace, ...]
+    untestable: Mapping[str, str]
+    minimum_detectable: Mapping[str, Mapping[str, float]]
+    next_steps: tuple[Reason, ...]
+    notes: tuple[str, ...]
+    series: DiagnosisSeries | None = None
+    calibration: tuple[tuple[float, float, float], ...] = ()
+    compared_axes: str = "xyz"
+    recordings: tuple[tuple[str, int], ...] = ()
+    twins: tuple[Twin, ...] = ()
+    dvl: DvlSeen | None = None
+    selection: EffectSelection | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        return " ".join(reason.full_sentence for reason in self.reasons)
+
+    @property
+    def next_manoeuvre(self) -> str:
+        """What to record next, in words."""
+        return "; ".join(each.sentence for each in self.next_steps)
+
+
+def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
+    """The JSON of diagnosis.md."""
+    gap = diagnosis.gap
+    return {
+        "verdict": diagnosis.verdict.value,
+        "reasons": [reason.as_dict() for reason in diagnosis.reasons],
+        "gap": {
+            "before_mps": gap.before,
+            "after_mps": gap.after,
+            "noise_floor_mps": gap.noise_floor,
+            "not_explained_mps": gap.not_explained,
+            "reported_noise_mps": gap.reported,
+            "closure": gap.closure,
+            "closure_ci95": list(gap.interval),
+            "held_out": True,
+            **(
+                {"by_recording": {n: {"before_mps": b, "after_mps": a} for n, (b, a) in gap.by_recording.items()}}
+                if gap.by_recording
+                else {}
+            ),
+        },
+        "effects": [
+            {
+                "name": effect.name,
+                "equivalent_to": list(effect.equivalent_to),
+                "parameters": _parameters(effect.parameters),
+                "closure": effect.closure,
+                "p_adjusted": effect.p,
+                **_by_recording(effect),
+                **_combination(effect),
+            }
+            for effect in diagnosis.effects
+        ],
+        "noise": [
+            {"name": finding.name, "parameters": _parameters(finding.parameters), "p_adjusted": finding.p}
+            for finding in diagnosis.noise
+        ],
+        "where": [
+            {
+                "axis": place.axis,
+                "regime": place.regime,
+                "segment_s": list(place.segment_s),
+                "band_hz": list(place.band_hz),
+                "share": place.share,
+                "p_adjusted": place.p,
+            }
+            for place in diagnosis.where
+        ],
+        "untestable": [{"name": name, "needs": needs} for name, needs in diagnosis.untestable.items()],
+        "minimum_detectable": {name: dict(sizes) for name, sizes in diagnosis.minimum_detectable.items()},
+        "next_manoeuvre": diagnosis.next_manoeuvre,
+        "next_steps": [each.as_dict() for each in diagnosis.next_steps],
+        "calibration": {
+            "phi_rad": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[:3], strict=False)},
+            "delta_k": {axis: _value(each) for axis, each in zip("xyz", diagnosis.calibration[3:], strict=False)},
+        },
+        **({} if diagnosis.dvl is None else {"dvl": _dvl(diagnosis.dvl)}),
+        "compared_axes": diagnosis.compared_axes,
+        "notes": list(diagnosis.notes),
+    }
+
+
+def _by_recording(effect: FoundEffect) -> dict[str, Any]:
+    if not effect.by_recording:
+        return {}
+    return {"by_recording": {name: _parameters(values) for name, values in effect.by_recording.items()}}
+
+
+def _combination(effect: FoundEffect) -> dict[str, Any]:
+    found = effect.combination
+    if found is None:
+        return {}
+    known = {
+        "parameter": found.parameter,
+        "clock": found.clock,
+        "speed_mps": found.speed,
+        "arm_less_speed_times_delay_m": _value(found.value),
+    }
+    return {"combination": known}
+
+
+def _dvl(dvl: DvlSeen) -> dict[str, Any]:
+    return {
+        "mounting_rpy": list(dvl.mounting_rpy),
+        "lever_arm_m": list(dvl.lever_arm),
+        "time_offset_s": dvl.time_offset,
+        "clock_drift": dvl.clock_drift,
+        "rate_hz": dvl.rate_hz,
+        "noise_std_mps": list(dvl.noise_std),
+        "speed_mps": list(dvl.speed),
+        "sizes_mps": dict(dvl.sizes),
+    }
+
+
+def _parameters(parameters: Mapping[str, tuple[float, float, float]]) -> dict[str, Any]:
+    return {name: _value(each) for name, each in parameters.items()}
+
+
+def _value(each: tuple[float, float, float]) -> dict[str, Any]:
+    value, low, high = each
+    return {"value": value, "ci95": [low, high]}

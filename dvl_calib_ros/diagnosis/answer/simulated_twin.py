@@ -1,0 +1,121 @@
+"""Twins of recordings: what a simulated DVL measures on the recorded motion, without and with what was found.
+
+Bags of the twins that a diagnosis makes of recordings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...bags.writer import BagWriter, Compression, Storage
+from ...calibration.numerics.frames import Array, cross
+from ...calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from ...effects.base import ActsOn, EffectInput
+from ...effects.composition import at_dvl, late, traces, turns
+from ...messages.encode import SampleWriter
+from ..model.forward_model import Problem
+from ..model.hypothesis import Hypothesis
+from ..model.recorded_streams import RecordedStreams
+from ..search.effect_selection import EffectSelection
+
+# Passes in which the true time of a late stamp is found, and the motion of which a reference makes what it says
+_PASSES = 3
+
+
+@dataclass(frozen=True)
+class Twin:
+    """One recording and its twins. recording: its streams. time: (N,) s by the DVL's stamps, since its first. recorded,
+    without, with_effects: (N, 3) m/s, DVL frame; without: the calibration alone.
+    """
+
+    recording: RecordedStreams
+    time: Array
+    recorded: Array
+    without: Array
+    with_effects: Array
+
+
+def twins(selection: EffectSelection) -> tuple[Twin, ...]:
+    """Of every recording, on its own motion, at its DVL's stamps; without noise."""
+    problem = selection.fitter.problem
+    found = []
+    for index, recording in enumerate(problem.recordings):
+        without, with_effects = (simulated(problem, fit.hypothesis, index) for fit in (selection.base, selection.fit))
+        dvl = recording.dvl
+        found.append(Twin(recording, dvl.time, dvl.values, without, with_effects))
+    return tuple(found)
+
+
+def with_quiet_reference(problem: Problem) -> Problem:
+    """The problem with the noise of every reference taken off where there is no motion in it."""
+    quiet = tuple(replace(one, reference=one.reference.quiet) for one in problem.recordings)
+    return replace(problem, recordings=quiet)
+
+
+def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
+    """(N, 3) m/s: the composed model forwards, from the reference's motion to what the DVL measures."""
+    recording, injections = problem.recordings[index], hypothesis.injections(index)
+    time = recording.dvl.time
+    for _ in range(_PASSES):
+        time = recording.dvl.time - late(injections, ActsOn.DVL_CLOCK, time)
+    oriented = time + late(injections, ActsOn.ATTITUDE_CLOCK, time)
+    velocity = recording.reference(time + late(injections, ActsOn.REFERENCE_CLOCK, time))
+    rotation = None if recording.attitude is None else recording.rotation_enu_from_body(oriented)
+    if recording.frame is not VelocityFrame.BODY and rotation is not None:
+        velocity = np.einsum("nji,nj->ni", rotation, velocity)
+    has_rates = recording.attitude is not None or recording.rates is not None
+    rates = recording.angular_velocity(oriented) if has_rates else None
+    nominal = problem.rotation_dvl_from_body
+    motion = EffectInput(time, velocity, nominal, rotation, rates, recording.frame, 0.0)
+    for _ in range(_PASSES):  # the trace is that of the true motion, which is what is looked for
+        motion = replace(motion, velocity_body=velocity + traces(injections, motion, ActsOn.REFERENCE))
+    moved = at_dvl(injections, motion)
+    if rates is not None:
+        moved = replace(moved, velocity_body=moved.velocity_body + cross(rates, np.asarray(problem.lever_arm)))
+    calibration = np.linalg.inv(hypothesis.body_from_measured(nominal, turns(injections, moved)))
+    measured = np.einsum("...ij,...j->...i", calibration, moved.velocity_body)
+    return np.asarray(measured + traces(injections, moved, ActsOn.DVL) @ nominal.T)
+
+
+def twin_paths(folder: Path, name: str) -> tuple[Path, Path]:
+    """Where the twins of a recording go, without and with what was found."""
+    return folder / f"{name}_without", folder / f"{name}_with"
+
+
+def write_twins(folder: Path, twin: Twin) -> None:
+    """Write NAME_without and NAME_with: DVL simulated without noise, reference and IMU as recorded. Raises InputError.
+
+    Stamps are the recording's, less what the parameters know of its clocks.
+    """
+    for path, velocity in zip(twin_paths(folder, twin.recording.name), (twin.without, twin.with_effects), strict=True):
+        with BagWriter(path, Storage.MCAP, Compression.NONE) as bag:
+            SampleWriter(bag).recording(*_streams(twin, velocity))
+
+
+def _streams(twin: Twin, velocity: Array) -> tuple[list[ImuSample], list[ReferenceSample], list[DvlSample]]:
+    recording = twin.recording
+
+    def stamps(time: Array) -> list[int]:
+        return [recording.first_ns + round(1e9 * each) for each in time.tolist()]
+
+    dvl = [DvlSample(at, (x, y, z)) for at, (x, y, z) in zip(stamps(twin.time), velocity.tolist(), strict=True)]
+    reference = [
+        ReferenceSample(at, (x, y, z), None, recording.frame)
+        for at, (x, y, z) in zip(stamps(recording.reference.time), recording.reference.values.tolist(), strict=True)
+    ]
+    imu: list[ImuSample] = []
+    oriented = recording.attitude or recording.rates
+    if oriented is not None:
+        time = oriented.time
+        rates = recording.angular_velocity(time).tolist()
+        quaternions: list[list[float]] = []
+        if recording.attitude is not None:
+            values = recording.attitude(time)
+            quaternions = (values / np.linalg.norm(values, axis=1)[:, None]).tolist()
+        for i, at in enumerate(stamps(time)):
+            x, y, z = rates[i]
+            imu.append(ImuSample(at, tuple(quaternions[i]) if quaternions else None, (x, y, z)))  # type: ignore[arg-type]
+    return imu, reference, dvl

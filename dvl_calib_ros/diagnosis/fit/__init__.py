@@ -1,0 +1,1 @@
+"""Fits of hypotheses: Gauss-Newton, criteria, cross-validation, parametric bootstrap."""

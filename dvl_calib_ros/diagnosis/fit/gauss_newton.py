@@ -1,0 +1,455 @@
+"""Fits of hypotheses in the composed model, by Gauss-Newton until they stand still.
+
+(Long, because what a fit is, how it is reached and what its intervals hold belong together.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.frames import Array
+from ...calibration.numerics.robust import robust_std
+from ...effects.base import Effect
+from ..model.forward_model import Problem, SeenAgain
+from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, whose_parameters
+from ..model.seen import Seen
+from ..model.settings import SETTINGS
+from ..noise.noise_model import Noise
+from ..noise.whitened_least_squares import WhitenedLeastSquares
+
+# Gauss-Newton: at most so many steps; it stands still when none is longer than this share of its standard deviation
+MAX_STEPS, STANDS_STILL = 30, 0.01
+# or when one gains less than this in deviance, of which differences of 1 begin to count
+GAINS_NOTHING = 1e-3
+HALVINGS = 5
+# Times by which the last step may make the misfit larger; one that goes further is not taken
+ASTRAY = 30.0
+# Squared cosine between steps from which on they are one series
+ALIKE = 0.9
+# Standard deviations of what other noise explains by chance that are taken off
+BY_CHANCE = 1.5
+# Prior of an effect's parameters, in their typical sizes: wide enough to do nothing but where the data says nothing
+PRIOR_IN_TYPICAL = 50.0
+# A fit is not made where it would come out worse by so much deviance, and by this share of what its first step gains
+SURELY, BENT = 2.0, 0.2
+# The first, times this, where what a fit nearby promises, and does not keep, is taken off
+NEARBY = 2.0
+# A burst: bins beyond so many standard deviations of what is usually left, those about them that are beyond fewer, and
+# the share of a recording up to which all of them are taken for errors of an instrument
+BURST, ABOUT_BURST, RARE = 6.0, 3.0, 0.02
+# Deviance by which a time at which something changes may be worse in 95 of 100 (Hansen, 2000, Econometrica 68, theorem
+# 2), and from which on, going on from it, no other as good is looked for: turns show a leap, straight legs do not
+OF_A_TIME, NO_TIME_BEYOND = -2.0 * float(np.log(1.0 - np.sqrt(0.95))), 40.0
+# Standard deviations from the middle to the ends of an interval of 95 per cent
+OF_INTERVAL = 1.96
+Mask = NDArray[np.bool_]
+# A hypothesis through the model, and its residual (M, A)
+Evaluated = tuple[tuple[Seen, ...], Array]
+
+
+def around(value: float, std: float) -> tuple[float, float, float]:
+    """A value with its interval of 95 per cent."""
+    return value, value - OF_INTERVAL * std, value + OF_INTERVAL * std
+
+
+def prior_std(hypothesis: Hypothesis) -> Array:
+    """(6 + p,) standard deviations of the prior of calibration and effects."""
+    own = [PRIOR_IN_TYPICAL * each.spec.typical for each in hypothesis.parameters()]
+    return np.array([SETTINGS.prior_angle] * 3 + [SETTINGS.prior_scale] * 3 + own)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A hypothesis fitted. seen: per recording. residual: (M, A) m/s that is left, outliers drawn in. made: gives its
+    derivatives, `columns`. system: the last step's. own_noise: whitened, what made-up noise of the velocities
+    makes in it. deviance: whitened squares and prior, less those of that: a delay interpolates at another phase, a
+    low-pass takes noise off, which must not count for or against them. of_tails: by how much the squares of own_noise
+    are larger where that has heavier tails than what is made up.
+    """
+
+    hypothesis: Hypothesis
+    seen: Sequence[Seen]
+    residual: Array
+    noise: Noise
+    made: Callable[[], Array] = field(repr=False)
+    system: WhitenedLeastSquares
+    deviance: float
+    own_noise: Array
+    of_tails: float = 0.0
+
+    @cached_property
+    def columns(self) -> Array:
+        """(M, A, 6 + p) derivatives of the residual, of which of most fits nobody asks."""
+        return self.made()
+
+    def gain_over(self, rest: Fit) -> float:
+        """Deviance that this explains beyond another, for sure.
+
+        With other noise in it, it may fit the reference's noise better by chance: by a normal variable of this size.
+        """
+        other = self.own_noise - rest.own_noise
+        sure = rest.deviance - self.deviance - BY_CHANCE * 2.0 * float(np.sqrt(other @ other))
+        return sure - max(rest.of_tails - self.of_tails, 0.0)
+
+    @property
+    def effects(self) -> tuple[Effect, ...]:
+        """Of the hypothesis."""
+        return self.hypothesis.effects
+
+    @property
+    def values(self) -> Mapping[str, tuple[Values, ...]]:
+        """Of the hypothesis."""
+        return self.hypothesis.values
+
+    @property
+    def dof(self) -> float:
+        """Degrees of freedom that the effects use up."""
+        return float(self.system.freedom()[6:].sum())
+
+    def covariance(self, block: NDArray[np.intp]) -> Array:
+        """(6 + p, 6 + p), of noise as it is whitened or as the scatter of blocks (M,) shows it, what is larger.
+
+        The sandwich H⁻¹ (Σ s sᵀ) H⁻¹ of the blocks' scores s holds whatever colour and level the noise has in a block.
+        """
+        inverse = self.system.covariance()
+        scores = self.scores(block)
+        scores = scores - scores.mean(axis=0)  # their mean is what the prior and the velocities' own noise make
+        n = len(scores)
+        sandwich = inverse @ (scores.T @ scores) @ inverse * n / max(n - 1, 1)
+        grown = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
+        return np.asarray(inverse * np.outer(grown, grown))
+
+    def scores(self, block: NDArray[np.intp]) -> Array:
+        """(B, 6 + p) sums of whitened columns times residual over blocks (M,)."""
+        white = self.noise.whiten(self.columns).reshape(len(block), -1, self.columns.shape[2])
+        left = self.noise.whiten(self.residual).reshape(len(block), -1)
+        each = np.einsum("map,ma->mp", white, left)
+        return np.stack([np.bincount(block, column) for column in each.T], axis=1)
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """A hypothesis as it is looked at under a noise: seen, residual and columns as of a `Fit`; system of its step."""
+
+    seen: tuple[Seen, ...]
+    residual: Array
+    columns: Array
+    system: WhitenedLeastSquares
+
+
+@dataclass(frozen=True)
+class Fitter:
+    """Fits hypotheses to one problem. outliers: (M, A) m/s, taken off the residual. held: (M,) bins not to be seen."""
+
+    problem: Problem
+    outliers: Array | float = 0.0
+    held: Mask | None = None
+    _fits: dict[tuple[object, ...], Fit] = field(default_factory=dict, repr=False)
+
+    def without(self, held: Mask) -> Fitter:
+        """One that does not see some bins (M,)."""
+        return replace(self, held=held, _fits={})
+
+    def bursts(self, fit: Fit) -> Mask:
+        """(M,) bins in which an instrument is off for some seconds: far off, and too few for an effect.
+
+        Noise with a memory does not show them: it is the bursts' own.
+        """
+        raw = (fit.residual + self.outliers) / fit.noise.level
+        size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
+        run = np.cumsum(np.diff(size > ABOUT_BURST, prepend=False))  # odd in the runs, even between them
+        far = np.isin(run, run[size > BURST])
+        return far & (np.count_nonzero(far) <= RARE * len(far))
+
+    def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
+        """Through the model, and residual (M, A)."""
+        seen = tuple(self.problem.all_seen(hypothesis))
+        return seen, self.problem.residual(seen) - self.outliers
+
+    def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
+        """(M, A, 6 + p) derivatives of the residual."""
+        return self.problem.all_columns(hypothesis, seen)
+
+    def _looked(
+        self, hypothesis: Hypothesis, noise: Noise, seen: tuple[Seen, ...] | None = None, residual: Array | None = None
+    ) -> _Looked:
+        """seen, residual: where they are known already."""
+        if seen is None or residual is None:
+            seen, residual = self.evaluated(hypothesis)
+        columns = self.columns(hypothesis, seen)
+        return _Looked(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
+
+    def _white(self, noise: Noise, values: Array) -> Array:
+        white = noise.whiten(values)
+        if self.held is not None:
+            white = white[np.repeat(~self.held, self.problem.axes)]
+        return white
+
+    def _misfit(self, noise: Noise, residual: Array, hypothesis: Hypothesis) -> float:
+        white = self._white(noise, residual)
+        return float(white @ white + np.sum((hypothesis.vector() / prior_std(hypothesis)) ** 2))
+
+    def fit(
+        self,
+        start: Hypothesis,
+        noise: Noise,
+        max_steps: int = MAX_STEPS,
+        only_of_the_day: bool = False,
+        fixed: frozenset[str] = frozenset(),
+        careful: bool = False,
+        looked: _Looked | None = None,
+        evaluated: Evaluated | None = None,
+    ) -> Fit:
+        """Fit a hypothesis from where it is, under a noise; of the day: all that belongs to the vehicle is kept.
+
+        fixed: names of effects whose values are kept. careful: the last step, with what noise makes in the columns
+        taken off, is not one that was just seen to make it worse, as at the kink of a slow attitude. Where a fit is
+        stuck far from the best, that step is what takes it out. looked, evaluated: the start, where that is done
+        already.
+        """
+        kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
+        kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
+        hypothesis = start
+        if looked is not None:
+            evaluated = looked.seen, looked.residual
+        seen, residual = evaluated or self.evaluated(hypothesis)
+        misfit = self._misfit(noise, residual, hypothesis)
+        length, before, moved = 1.0, np.zeros(len(kept)), True
+        for _ in range(max_steps):
+            looked = looked or self._looked(hypothesis, noise, seen, residual)
+            system = looked.system
+            free = np.flatnonzero(~kept)
+            step, std = np.zeros(len(kept)), np.sqrt(np.diag(system.covariance()))
+            step[free] = system.part(free).solution() if len(free) else 0.0
+            length = _length(step / std, before, length)
+            moved, tried, before = False, length * step, step / std
+            for _ in range(HALVINGS):
+                trial = hypothesis.moved(tried)
+                trial_seen, trial_residual = self.evaluated(trial)
+                trial_misfit = self._misfit(noise, trial_residual, trial)
+                if trial_misfit <= misfit:
+                    moved = True
+                    break
+                tried = 0.4 * tried
+            if not moved:
+                break
+            gained, looked = misfit - trial_misfit, None
+            hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
+            if np.abs(step / std).max() < STANDS_STILL or gained < GAINS_NOTHING:
+                break
+        looked = looked or self._looked(hypothesis, noise, seen, residual)
+        columns, plain = looked.columns, looked.system
+        made: Callable[[], Array] = partial(np.asarray, columns)
+        system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
+        free = np.flatnonzero(~kept)
+        if len(free):
+            step = np.zeros(len(kept))
+            step[free] = system.part(free).solution()
+            if careful and not moved:
+                step[free] -= plain.part(free).solution()
+            last = hypothesis.moved(step)
+            last_seen, last_residual = self.evaluated(last)
+            last_misfit = self._misfit(noise, last_residual, last)
+            if last_misfit < ASTRAY * misfit:
+                hypothesis, seen, residual, misfit = last, last_seen, last_residual, last_misfit
+                made = partial(self.problem.all_columns, hypothesis, seen)
+        own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
+        deviance = misfit - float(own_noise @ own_noise)
+        of_each = own_noise.reshape(len(self.problem.shaken), -1)
+        of_tails = float((np.array(self.problem.tails) - 1.0) @ (of_each**2).sum(axis=1))
+        return Fit(hypothesis, seen, residual, noise, made, system, deviance, own_noise, of_tails)
+
+    def _without_own_noise(
+        self, system: WhitenedLeastSquares, hypothesis: Hypothesis, noise: Noise, columns: Array, residual: Array
+    ) -> WhitenedLeastSquares:
+        """A system less what the velocities' own noise makes in it, as made-up noise shows it.
+
+        The columns of scale and misalignment hold the noise of the very velocities that are in the residual, so each
+        would explain the other: scale for noise (errors in variables).
+        """
+        gram = system.gram
+        for shaken in self.problem.shaken:
+            seen = shaken.all_seen(hypothesis)
+            other = replace(self, problem=shaken, _fits={})
+            white = self._white(noise, other.columns(hypothesis, seen) - columns)
+            own = self._white(noise, shaken.residual(seen) - residual - self.outliers)
+            joined = np.column_stack([white, -own])
+            gram = gram - joined.T @ joined
+        found = replace(system, gram=gram)
+        return found if found.is_definite else system
+
+    def step_of(self, other: Problem, seen: Sequence[Seen], residual: Array, fit: Fit) -> Array:
+        """(6 + p,) the step that a fit's hypothesis would take in another problem, seen through it, with a residual."""
+        fitter = replace(self, problem=other, outliers=0.0, _fits={})
+        columns = fitter.columns(fit.hypothesis, seen)
+        system = fitter._system(fit.noise, columns, residual, fit.hypothesis)
+        return fitter._without_own_noise(system, fit.hypothesis, fit.noise, columns, residual).solution()
+
+    def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
+        """(S n,) whitened, what made-up noise of the velocities makes in the residual (M, A) of a hypothesis."""
+        white = [
+            self._white(noise, shaken.residual(shaken.all_seen(hypothesis)) - residual)
+            for shaken in self.problem.shaken
+        ]
+        return np.concatenate(white)
+
+    def _system(self, noise: Noise, columns: Array, residual: Array, hypothesis: Hypothesis) -> WhitenedLeastSquares:
+        """Of the step (6 + p,) from a hypothesis."""
+        return WhitenedLeastSquares.of(
+            self._white(noise, columns), -self._white(noise, residual), prior_std(hypothesis), -hypothesis.vector()
+        )
+
+    def fit_kept(self, start: Hypothesis, noise: Noise) -> Fit:
+        """`fit`, not done twice for the same effects under the same noise."""
+        windows = tuple(
+            value[spec.name]
+            for effect in start.effects
+            for value in start.values[effect.name]
+            for spec in effect.parameters
+            if is_time_of_run(spec)
+        )
+        of = sorted((effect.name, len(effect.parameters), effect.of_the_day) for effect in start.effects)
+        what = tuple(of), windows
+        key = (id(noise), *what)
+        if key not in self._fits:
+            nearest, evaluated = start, self.evaluated(start)
+            for each in self.problem.fitted.get(what, []):  # under other noise it ended nearby
+                at_end = self.evaluated(each)
+                if self._misfit(noise, at_end[1], each) < self._misfit(noise, evaluated[1], nearest):
+                    nearest, evaluated = each, at_end
+            found = self.fit(nearest, noise, evaluated=evaluated)
+            seen = SeenAgain(self.problem, found.hypothesis)
+            made = partial(self.problem.all_columns, found.hypothesis, seen)
+            self._fits[key] = replace(found, seen=seen, made=made)
+            self.problem.fitted[what] = [self._fits[key].hypothesis]
+        return self._fits[key]
+
+    def straight_on(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:
+        """Misfit that one step leaves, as straight lines tell it, and what it leads to; start: alike in the data."""
+        columns = self.columns(start, fit.seen)
+        system = self._system(fit.noise, columns, fit.residual, start)
+        step = system.solution()
+        return system.misfit(step), start.moved(step)
+
+    def refined(self, fit: Fit, steps: Sequence[float]) -> Fit:
+        """A fit with the times at which its effects begin and end made finer than the grid they were found on."""
+        for step in steps:
+            for effect in fit.effects:
+                for spec in (spec for spec in effect.parameters if is_time_of_run(spec)):
+                    fit = self._finer(fit, effect, spec.name, step)
+        return fit
+
+    def refined_as_white(self, fit: Fit, steps: Sequence[float]) -> Fit:
+        """`refined` as if the noise were white, where that is the better fit.
+
+        Noise with a memory takes in what a wrong time leaves, all but the step itself: only the exact time is better.
+        """
+        if not fit.noise.is_coloured or not any(is_time_of_run(s) for e in fit.effects for s in e.parameters):
+            return fit
+        found = self.fit(self.refined(self.fit(fit.hypothesis, fit.noise.white), steps).hypothesis, fit.noise)
+        return found if found.deviance < fit.deviance else fit
+
+    def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
+        at_rest: tuple[Fit, float] | None = None
+        for sign in (-1.0, 1.0):
+            per = fit.values[effect.name]
+            if not all(np.isfinite(each[name]) for each in per):
+                continue
+            moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
+            hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
+            looked = self._looked(hypothesis, fit.noise)
+            if at_rest is None or at_rest[0] is not fit:
+                at_rest = fit, self._promised(fit)
+            if self._is_surely_worse(hypothesis, looked, fit.noise, fit.deviance, at_rest[1]):
+                continue
+            trial = self.fit(hypothesis, fit.noise, 3, looked=looked)
+            if trial.deviance < fit.deviance:
+                fit = trial
+        return fit
+
+    def _promised(self, fit: Fit) -> float:
+        """What a straight step from a fit would gain, although it stands still: so much is promised of no step."""
+        system = self._system(fit.noise, fit.columns, fit.residual, fit.hypothesis)
+        return self._misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
+
+    def _is_surely_worse(
+        self, hypothesis: Hypothesis, looked: _Looked, noise: Noise, deviance: float, promised: float = 0.0
+    ) -> bool:
+        """Whether a hypothesis, fitted, would have a larger deviance, as one straight step tells well enough.
+
+        The deviance at which that step would end is the least there is, but for what is bent. promised: of what it
+        gains, what a step from a fit nearby, of this deviance, would gain as well, which is nothing (`_promised`).
+        """
+        own_noise = self._own_noise(hypothesis, noise, looked.residual + self.outliers)
+        least = looked.system.misfit(looked.system.solution())
+        gained = self._misfit(noise, looked.residual, hypothesis) - least
+        least -= float(own_noise @ own_noise)
+        if least > deviance + SURELY + BENT * gained:
+            return True
+        alike = min(promised, gained)
+        return least + alike > deviance + NEARBY * SURELY + BENT * (gained - alike)
+
+    def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
+        """A time at which an effect begins or ends, with those that the data takes for as good (95 per cent)."""
+        value = fit.values[effect.name][recording][name]
+        seconds = self.problem.recordings[recording].seconds
+        if not np.isfinite(value):
+            return value, seconds, value
+        ends = []
+        for sign in (-1.0, 1.0):
+            step, end, was_as_good = 0.5 * self.problem.interval, value, True
+            while 0.0 <= (at := value + sign * step) <= seconds:
+                worse = self._worse_at(_with_time(fit, effect, name, recording, at), fit)
+                if was_as_good or worse < OF_A_TIME:  # the first that is worse bounds those that are as good
+                    end = at
+                if worse > NO_TIME_BEYOND:
+                    break
+                step, was_as_good = 1.6 * step, worse < OF_A_TIME
+            ends.append(end)
+        return value, ends[0], ends[1]
+
+    def _worse_at(self, moved: Hypothesis, fit: Fit) -> float:
+        """By how much deviance a fit is worse with another time, infinite where that is surely too much."""
+        looked = self._looked(moved, fit.noise)
+        if self._is_surely_worse(moved, looked, fit.noise, fit.deviance + NO_TIME_BEYOND):
+            return np.inf
+        return self.fit(moved, fit.noise, 2, looked=looked).deviance - fit.deviance
+
+    def moved_by_time(self, fit: Fit, effect: Effect, name: str, recording: int, ends: Sequence[float]) -> Array:
+        """(6 + p, 6 + p) what is not known of a time adds to the covariance. ends: of its interval (95 per cent), s."""
+        added = np.zeros((len(fit.hypothesis.vector()),) * 2)
+        for at in ends:
+            if np.isfinite(at) and at != fit.values[effect.name][recording][name]:
+                moved = self.fit(_with_time(fit, effect, name, recording, at), fit.noise, 3).hypothesis.vector()
+                moved = (moved - fit.hypothesis.vector()) / OF_INTERVAL
+                added += np.outer(moved, moved) / len(ends)
+        return added
+
+
+def _with_time(fit: Fit, effect: Effect, name: str, recording: int, at: float) -> Hypothesis:
+    """The hypothesis of a fit with another time, s, at which an effect begins or ends in one recording."""
+    per = fit.values[effect.name]
+    moved = tuple({**each, name: at} if index == recording else each for index, each in enumerate(per))
+    return replace(fit.hypothesis, values={**fit.values, effect.name: moved})
+
+
+def _length(step: Array, before: Array, length: float) -> float:
+    """How far to go along a Gauss-Newton step (n,), having gone a length of the one before (n,); both whitened.
+
+    Far from what explains the data (an effect left out that is there) the second derivatives count: each step is the
+    one before it times nearly the same factor, to and fro. Then this length leads to where they would end (Aitken, Δ²).
+    """
+    before_square, along = float(before @ before), float(step @ before)
+    if along**2 < ALIKE * before_square * float(step @ step) or before_square == 0.0:
+        return 1.0
+    return float(np.clip(length / max(1.0 - along / before_square, 0.1), 0.3, 5.0))
+
+
+def n_amplitudes(effect: Effect, n_recordings: int) -> int:
+    """Number of parameters with a derivative, of all recordings."""
+    return len(amplitudes(effect)) * len(whose_parameters(effect, n_recordings))

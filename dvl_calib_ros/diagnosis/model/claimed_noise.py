@@ -1,0 +1,113 @@
+"""How far the noise of single samples is what their messages claim.
+
+Receivers go from a fixed to a floating solution, DVLs tell how good a ping was: then reported covariances differ from
+sample to sample. How large the noise is in all, the data tells; which sample is worth more, the claims may. The
+exponent of what they claim is fitted: 1 is a claim that holds, 0 one that says nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.distributions import normal_isf
+from ...calibration.numerics.frames import Array
+
+if TYPE_CHECKING:
+    pass
+
+# A claim is followed where its exponent is above zero at this level (one-sided)
+SURE = 1e-4
+# Who writes standard deviations where variances belong claims the roots of what is: an exponent of 2
+LARGEST = 2.0
+# Claims that differ by less (standard deviation of their logarithm) tell no sample from another
+DIFFER = 0.05
+# Samples of one stretch whose squares may be alike, whatever makes them so
+STRETCH_S = 20.0
+# However far claims lie apart: logarithm of the level about its mean
+FARTHEST = 4.0
+
+
+@dataclass(frozen=True)
+class Claims:
+    """Exponents (c,) of claims, and their standard deviations, by name of the stream."""
+
+    names: tuple[str, ...]
+    exponents: Array
+    stds: Array
+
+    @property
+    def sure(self) -> NDArray[np.bool_]:
+        """(c,) whether the noise follows the claim at all."""
+        return np.asarray(self.exponents > normal_isf(SURE) * self.stds)
+
+
+def differ(log_claims: Array) -> bool:
+    """Whether claims (M, A) tell some samples from others."""
+    return bool(np.max(np.std(log_claims, axis=0), initial=0.0) > DIFFER)
+
+
+def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: NDArray[np.intp]) -> Claims:
+    """Fit of log squares of values (M, A) to claims (M, A, c), each axis about its own mean.
+
+    Parameters
+    ----------
+    names: Of the c streams.
+    log_claims: Logarithms of standard deviations.
+    values: Noise, white; of any size.
+    stretch: (M,) index of stretches of time, by whose scatter the fit is judged.
+
+    """
+    y = np.log(np.maximum(values**2, 1e-12 * np.median(values**2) + 1e-300))
+    y = y - y.mean(axis=0)
+    x = log_claims - log_claims.mean(axis=0)
+    inverse = np.linalg.pinv(np.einsum("mac,mad->cd", x, x))
+    slopes = inverse @ np.einsum("mac,ma->c", x, y)
+    scores = np.einsum("mac,ma->mc", x, y - x @ slopes)
+    sums = np.stack([np.bincount(stretch, column) for column in scores.T], axis=1)
+    n = len(sums)
+    covariance = inverse @ (sums.T @ sums) @ inverse * n / max(n - len(slopes) - 1, 1)
+    return Claims(tuple(names), 0.5 * slopes, 0.5 * np.sqrt(np.maximum(np.diag(covariance), 1e-300)))
+
+
+def followed(log_claims: Array, values: Array, names: Sequence[str], stretch: NDArray[np.intp]) -> Array:
+    """(M, A) relative standard deviation of values (M, A), as far as they surely follow claims (M, A, c)."""
+    kept = list(range(log_claims.shape[2]))
+    while kept:
+        found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
+        if found.sure.all():
+            logarithm = (log_claims - log_claims.mean(axis=0))[:, :, kept] @ np.minimum(found.exponents, LARGEST)
+            return np.asarray(np.exp(np.clip(logarithm, -FARTHEST, FARTHEST)))
+        kept.pop(int(np.argmin(found.exponents / found.stds)))
+    return np.ones(values.shape)
+
+
+# ------------------------------------------------------------------ of one stream
+
+
+def loudness(time: Array, claims: Array | None, differences: Array, weights: Array) -> Array:
+    """(N, k) relative standard deviation of a stream's samples, of the usual one, as far as it follows their claims.
+
+    Parameters
+    ----------
+    time: (N,) s.
+    claims: (N, k) standard deviations, None without.
+    differences: (N - w + 1, k) of w neighbours, in which motion does not count.
+    weights: (w,) of the neighbours in these.
+
+    """
+    shape = len(time), differences.shape[1]
+    if claims is None or len(differences) < len(weights) or not differ(np.log(claims)):
+        return np.ones(shape)
+    variance = np.stack([np.convolve(column, weights**2, "valid") for column in (claims**2).T], axis=1)
+    middle = time[len(weights) // 2 :][: len(differences)]
+    stretch = np.floor((middle - middle[0]) / STRETCH_S).astype(np.intp)
+    found = exponents(["own"], 0.5 * np.log(variance)[:, :, None], differences, stretch)
+    if not found.sure.all():
+        return np.ones(shape)
+    usual = np.median(claims, axis=0)
+    return np.asarray((claims / usual) ** min(float(found.exponents[0]), LARGEST))

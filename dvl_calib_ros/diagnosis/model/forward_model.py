@@ -1,0 +1,533 @@
+"""The composed model: what is left of the difference between DVL and reference, with any effects, at any size.
+
+The physics of `effects.composition`, gone backwards. At a true time s, with the stamps that each clock gives it,
+
+    u = D⁻¹ (v_dvl - T traces on DVL(u))        v = u - traces on MOTION(v)        e = v - g - traces on REFERENCE(v)
+
+with D = (I + diag(δk)) Exp(φ + turns on MOUNTING(u)) T and g the reference velocity in the body frame. Exp(φ) is the
+rotation that I + [φ×] stands for. Nothing is paired: every stream is a curve of its own, so a delay of seconds is a
+change of argument, and e is averaged over bins of two intervals of the slower stream (`DiagnosisSettings`).
+
+Regressors are made of the smoothed DVL velocity, whose noise is small; those made from the reference would pull
+estimates towards zero (errors in variables). (Long, because the model and its derivatives stand side by side.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from itertools import pairwise
+from typing import Any, NamedTuple, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.frames import Array, cross
+from ...calibration.numerics.samples import VelocityFrame
+from ...effects.base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectWithMemory, MountingEffect
+from ...effects.composition import late, turns
+from ...effects.recursion import slopes
+from .hypothesis import OF_EVERY, Hypothesis, Values, amplitudes, no_effect, whose_parameters
+from .recorded_streams import RecordedStreams
+from .seen import (
+    Seen,
+    central_difference,
+    columns_by_turn,
+    lagged_columns,
+    measured_velocity,
+    rotate_vectors,
+    trace_columns,
+    undo_effects,
+    velocity_change,
+    without_remembered,
+)
+from .settings import SETTINGS
+from .stream_curve import FAST_ENOUGH_S, segments_of
+from .time_grid import Grid, Offsets, make_grid
+
+
+class _Moved(NamedTuple):
+    """What a DVL says of the motion at F times. motion, at_dvl, angles, body_from_measured, dvl_stamps: as of `Seen`.
+    raw, smooth: (F, 3) m/s, what it measured, its frame. added: (F, 3) or (3,) m/s that a lever arm that is known, and
+    effects before the reference, add to the motion, body frame. attitude_stamps: (F,) s.
+    """
+
+    motion: EffectInput
+    at_dvl: EffectInput
+    raw: Array
+    smooth: Array
+    added: Array
+    angles: Array
+    body_from_measured: Array
+    dvl_stamps: Array
+    attitude_stamps: Array
+
+
+class SeenAgain(Sequence[Seen]):
+    """What is seen of a hypothesis for who asks for it: of hours it is large, and of most fits nobody asks."""
+
+    def __init__(self, problem: Problem, hypothesis: Hypothesis) -> None:
+        self._problem, self._hypothesis = problem, hypothesis
+
+    @cached_property
+    def _each(self) -> list[Seen]:
+        return self._problem.all_seen(self._hypothesis)
+
+    def __len__(self) -> int:
+        return len(self._problem.recordings)
+
+    @overload
+    def __getitem__(self, at: int) -> Seen: ...
+    @overload
+    def __getitem__(self, at: slice) -> Sequence[Seen]: ...
+    def __getitem__(self, at: int | slice) -> Seen | Sequence[Seen]:
+        return self._each[at]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare.
+    bursts: of how many samples an instrument was far off, which are left out. shown_turns: (3, 3) projection of φ on
+    the turns of the mounting that a reference without a vertical shows; by the others it is not turned. unshown: what
+    it does not show of effects; where one of these is in a hypothesis, or on every vehicle, there may be some of that.
+    """
+
+    recordings: tuple[RecordedStreams, ...]
+    rotation_dvl_from_body: Array
+    lever_arm: Array
+    grids: tuple[Grid, ...]
+    of_axes: tuple[bool, bool, bool] = (True, True, True)
+    bursts: int = 0
+    shown_turns: Array = field(default_factory=lambda: np.eye(3), repr=False, compare=False)
+    unshown: tuple[Effect, ...] = ()
+    # Hypotheses as they were fitted last, by what they are made of: where to start from again
+    fitted: dict[Any, list[Hypothesis]] = field(default_factory=dict, repr=False, compare=False)
+
+    # ------------------------------------------------------------------ the data
+
+    @cached_property
+    def available(self) -> frozenset[EffectNeeds]:
+        """What effects may need and every recording has."""
+        return frozenset.intersection(*(recording.available for recording in self.recordings))
+
+    @cached_property
+    def measured(self) -> tuple[bool, bool, bool]:
+        """Axes that are compared, of those that the reference measures in all recordings."""
+        x, y, z = (
+            self.of_axes[axis] and all(recording.measured[axis] for recording in self.recordings) for axis in range(3)
+        )
+        return x, y, z
+
+    @property
+    def axes(self) -> int:
+        """Number of axes that are compared."""
+        return sum(self.measured)
+
+    @cached_property
+    def time(self) -> Array:
+        """(M,) s of all bins, since the beginning of the bin's recording."""
+        return np.concatenate([grid.bin_time for grid in self.grids])
+
+    def without(self, far: NDArray[np.bool_]) -> Problem:
+        """The problem without some bins (M,), as if nothing had been measured then."""
+        of_sample, ends = far[self.bin_of], np.cumsum([len(grid.stamps) for grid in self.grids])[:-1]
+        grids = tuple(
+            replace(grid, stamps=grid.stamps[~off])
+            for grid, off in zip(self.grids, np.split(of_sample, ends), strict=True)
+        )
+        return replace(self, grids=grids, bursts=int(of_sample.sum()), fitted={})
+
+    @cached_property
+    def recording_of(self) -> NDArray[np.intp]:
+        """(M,) index of the recording that a bin belongs to."""
+        return np.repeat(np.arange(len(self.grids)), [len(grid.bin_time) for grid in self.grids])
+
+    @cached_property
+    def rows_of(self) -> tuple[slice, ...]:
+        """Which of the M bins belong to each recording."""
+        ends = np.cumsum([0, *(len(grid.bin_time) for grid in self.grids)]).tolist()
+        return tuple(slice(*each) for each in pairwise(ends))
+
+    @cached_property
+    def segments(self) -> tuple[slice, ...]:
+        """Stretches of the M bins without a gap."""
+        return segments_of([grid.bin_time for grid in self.grids])
+
+    @cached_property
+    def interval(self) -> float:
+        """Median time, s, between neighbours of the M bins."""
+        return float(np.median(np.concatenate([np.diff(grid.bin_time) for grid in self.grids])))
+
+    @cached_property
+    def earth_from_compared(self) -> Array | None:
+        """(M, A, A) from the frame of the residual to the earth's, None without attitude."""
+        if EffectNeeds.ATTITUDE not in self.available:
+            return None
+        parts = []
+        for recording, grid in zip(self.recordings, self.grids, strict=True):
+            rotation = recording.rotation_enu_from_body(grid.bin_time)
+            parts.append(rotation @ np.swapaxes(self.projection(recording, rotation), 1, 2))
+        return np.concatenate(parts)[:, [axis for axis in range(3) if self.measured[axis]]]
+
+    def projection(self, recording: RecordedStreams, rotation_enu_from_body: Array | None) -> Array:
+        """(F, A, 3) from the body frame to the axes that are compared: those of the body, or of it held level."""
+        if all(self.measured):
+            return np.eye(3)[None]
+        rows = [axis for axis in range(3) if self.measured[axis]]
+        if recording.frame is VelocityFrame.BODY or rotation_enu_from_body is None:
+            return np.eye(3)[None, rows]
+        if self.measured != (True, True, False):
+            return rotation_enu_from_body[:, rows]
+        ahead = rotation_enu_from_body[:, :2, 0]
+        c, s = (ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]).T
+        level = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
+        projected: Array = level @ rotation_enu_from_body[:, :2]
+        return projected
+
+    def to_compared(self, recording: RecordedStreams, at: Array, of_dvl: bool) -> Array:
+        """(M, A, 3) or (1, A, 3) from the frame of the DVL or of the reference to the axes that are compared."""
+        oriented = EffectNeeds.ATTITUDE in self.available
+        rotation = recording.rotation_enu_from_body(at) if oriented else None
+        projection = self.projection(recording, rotation)
+        if of_dvl:
+            return np.asarray(projection @ self.rotation_dvl_from_body.T)
+        if recording.frame is VelocityFrame.BODY or rotation is None:
+            return projection
+        return np.asarray(projection @ np.swapaxes(rotation, 1, 2))
+
+    @cached_property
+    def shaken(self) -> tuple[Problem, ...]:
+        """The problem with made-up noise, like its own, in one velocity and then in the other.
+
+        Not in that of the reference where it is looked at its own samples: there its noise is the same for all.
+        """
+        rng = np.random.default_rng(0)
+        dvl = [replace(one, dvl=one.dvl.shaken(rng)) for one in self.recordings]
+        reference = [replace(one, reference=one.reference.shaken(rng)) for one in self.recordings]
+        by_dvl = any(grid.clock is ActsOn.DVL_CLOCK for grid in self.grids)
+        each = [dvl, reference] if by_dvl else [dvl]
+        return tuple(replace(self, recordings=tuple(recordings)) for recordings in each)
+
+    @cached_property
+    def tails(self) -> tuple[float, ...]:
+        """By what factor the noise that is made up for each of `shaken` has a smaller variance than its own."""
+        dvl = max(one.dvl.tails for one in self.recordings)
+        return (dvl, max(one.reference.tails for one in self.recordings))[: len(self.shaken)]
+
+    @property
+    def rougher_than_claimed(self) -> float:
+        """By what factor the DVL may be noisier than what is made up for it: no more than it is rough."""
+        each = [(one.dvl.roughness, one.dvl.noise) for one in self.recordings]
+        return max(float((rough / np.maximum(noise, 1e-12)).max()) for rough, noise in each)
+
+    # ------------------------------------------------------------------ the model
+
+    def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None) -> Seen:
+        """A recording through a hypothesis; at: true times (F,) s, by default those of the grid."""
+        stream, injections = self.recordings[recording], hypothesis.injections(recording)
+        time = self.grids[recording].true_time(injections) if at is None else at
+        reference = time + late(injections, ActsOn.REFERENCE_CLOCK, time)
+        by_dvl = self.grids[recording].clock is ActsOn.DVL_CLOCK
+        curve = stream.reference.quiet if by_dvl else stream.reference
+        g = curve.kept.at("values", reference, lambda: curve(reference))
+        moved = self._moved(hypothesis, recording, time)
+        rotation = moved.motion.rotation_enu_from_body
+        if stream.frame is not VelocityFrame.BODY and rotation is not None:
+            g = np.einsum("nji,nj->ni", rotation, g)
+        error = rotate_vectors(moved.body_from_measured, moved.raw) - moved.added - g
+        found = Seen(
+            motion=moved.motion,
+            at_dvl=moved.at_dvl,
+            measured=moved.smooth,
+            error=error,
+            angles=moved.angles,
+            body_from_measured=moved.body_from_measured,
+            dvl_stamps=moved.dvl_stamps,
+            reference_stamps=reference,
+            projection=self._kept_projection(stream, rotation, moved.attitude_stamps),
+            change=partial(velocity_change, stream.dvl.smooth, moved.dvl_stamps),
+            closely=partial(self._close, hypothesis, recording, time),
+            as_it_is=partial(self._close_as_it_is, hypothesis, recording, time),
+        )
+        if any(each.effect.acts_on is ActsOn.REFERENCE for each in injections):
+            error -= found.on_reference(injections)  # in place: what it is seen as close by is kept
+        for lag, values in hypothesis.lags(recording):
+            error -= lag.of_before(found.motion, error, values)
+        return found
+
+    def _moved(self, hypothesis: Hypothesis, recording: int, time: Array, as_it_is: bool = False) -> _Moved:
+        """What a DVL says of the motion at true times (F,) s; as_it_is: not smoothed, of a slow one."""
+        stream, injections = self.recordings[recording], hypothesis.injections(recording)
+        dvl, attitude = (time + late(injections, clock, time) for clock in (ActsOn.DVL_CLOCK, ActsOn.ATTITUDE_CLOCK))
+        rotation, rates = self._oriented(stream, attitude)
+        raw, smooth = measured_velocity(stream.dvl, dvl, self.grids[recording].clock is ActsOn.DVL_CLOCK)
+        followed = raw if as_it_is and stream.dvl.interval > FAST_ENOUGH_S else smooth
+        lever = np.zeros(3) if rates is None or not self.lever_arm.any() else cross(rates, self.lever_arm)
+        nominal = self.rotation_dvl_from_body
+        turn: Array = np.zeros(3)
+        matrix = hypothesis.body_from_measured(nominal)
+        measured = EffectInput(time, rotate_vectors(matrix, followed), nominal, rotation, rates, stream.frame, 0.0)
+        if any(each.effect.acts_on is ActsOn.MOUNTING for each in injections):
+            # turned a little otherwise, it is as fast
+            turn = turns(injections, undo_effects(injections, measured, ActsOn.DVL, matrix @ nominal)[0])
+            matrix = hypothesis.body_from_measured(nominal, turn)
+            measured = replace(measured, velocity_body=rotate_vectors(matrix, followed))
+        at_dvl, of_dvl = undo_effects(injections, measured, ActsOn.DVL, matrix @ nominal)
+        motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
+        motion, of_motion = undo_effects(injections, motion, ActsOn.MOTION, None)
+        added = of_dvl + of_motion + lever
+        return _Moved(motion, at_dvl, raw, smooth, added, hypothesis.phi + turn, matrix, dvl, attitude)
+
+    def _close(self, hypothesis: Hypothesis, recording: int, time: Array) -> tuple[Seen, NDArray[np.intp]] | None:
+        """For `Seen.close`; None where the times are close."""
+        between = self.grids[recording].between(time)
+        return between and (self.seen(hypothesis.without_memory, recording, between[0]), between[1])
+
+    def _close_as_it_is(
+        self, hypothesis: Hypothesis, recording: int, time: Array
+    ) -> tuple[EffectInput, NDArray[np.intp]] | None:
+        """For `Seen.close_as_it_is`; None where the times are close."""
+        between = self.grids[recording].between(time)
+        return between and (self._moved(hypothesis.without_memory, recording, between[0], True).motion, between[1])
+
+    def _kept_projection(self, stream: RecordedStreams, rotation: Array | None, at: Array) -> Array:
+        """`projection` at times (F,) s of the attitude, of which the last few are kept."""
+        if stream.attitude is None or all(self.measured):
+            return self.projection(stream, rotation)
+        what = f"projection {self.measured}"
+        return np.asarray(stream.attitude.kept.at(what, at, lambda: self.projection(stream, rotation)))
+
+    def _oriented(self, stream: RecordedStreams, at: Array) -> tuple[Array | None, Array | None]:
+        rotation = stream.rotation_enu_from_body(at) if EffectNeeds.ATTITUDE in self.available else None
+        return rotation, stream.angular_velocity(at) if EffectNeeds.ANGULAR_VELOCITY in self.available else None
+
+    def all_seen(self, hypothesis: Hypothesis) -> list[Seen]:
+        """Every recording through a hypothesis."""
+        return [self.seen(hypothesis, recording) for recording in range(len(self.recordings))]
+
+    def residual(self, seen: Sequence[Seen]) -> Array:
+        """e (M, A) m/s in the frame that is compared."""
+        return self.binned([each.error for each in seen], seen)
+
+    def binned(self, bodies: Sequence[Array], seen: Sequence[Seen]) -> Array:
+        """(F, 3, ...) of each recording, body frame, -> (M, A, ...) means, in the frame that is compared."""
+        return np.concatenate(list(map(self._in_bins, self.grids, bodies, seen)))
+
+    def _in_bins(self, grid: Grid, body: Array, seen: Seen) -> Array:
+        """(F, 3, ...) of one recording -> its bins, (m, A, ...)."""
+        return grid.averaged(body if all(self.measured) else seen.compared(body))
+
+    @cached_property
+    def bin_of(self) -> NDArray[np.intp]:
+        """(F,) bin of every sample of all recordings."""
+        per_bin = np.concatenate([np.full(len(grid.bin_time), grid.per_bin) for grid in self.grids])
+        return np.repeat(np.arange(len(per_bin)), per_bin)
+
+    @cached_property
+    def sample_time(self) -> Array:
+        """(F,) s of every sample, since the beginning of its recording, as true as the first guess."""
+        return np.concatenate([grid.stamps - grid.late for grid in self.grids])
+
+    def errors(self, seen: Sequence[Seen]) -> Array:
+        """(F, 3) m/s, e of every sample, not averaged, ahead, to port and up; zero on an axis that is not measured."""
+        parts = []
+        for each in seen:
+            error = each.error
+            if not all(self.measured):
+                error = np.zeros_like(error)
+                error[:, list(self.measured)] = each.compared(each.error)
+            parts.append(error)
+        return np.concatenate(parts)
+
+    def sampled(self, seen: Sequence[Seen], of: Callable[[EffectInput], Array]) -> Array:
+        """A function of the motion (F, ...) at the M bins."""
+        return np.concatenate([grid.averaged(of(each.motion)) for grid, each in zip(self.grids, seen, strict=True)])
+
+    # ------------------------------------------------------------------ its derivatives
+
+    def calibration_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
+        """(M, A, 6) d e / d (φ, δk)."""
+        parts = []
+        for recording, (grid, each) in enumerate(zip(self.grids, seen, strict=True)):
+            # of one mounting they are linear in the velocity, and so in its mean over each bin
+            lags = hypothesis.lags(recording)
+            if each.body_from_measured.ndim == 2 and all(self.measured) and not lags:
+                parts.append(self._by_calibration(hypothesis, each, grid.averaged(each.measured)))
+                continue
+            close, own = each.close if lags else (each, slice(None))
+            body = self._by_calibration(hypothesis, close, close.measured)
+            parts.append(self._in_bins(grid, lagged_columns(lags, each, close, own, body), each))
+        return np.concatenate(parts)
+
+    def _by_calibration(self, hypothesis: Hypothesis, seen: Seen, measured: Array) -> Array:
+        """(F, 3, 6) d e / d (φ, δk), body frame, of velocities (F, 3) m/s in the DVL's."""
+        columns = np.empty((len(measured), 3, 6))
+        by_turn = columns_by_turn(hypothesis, seen, measured)
+        columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
+        unscaled = measured / (1.0 + hypothesis.scale)
+        np.multiply(-unscaled[:, None, :], seen.body_from_measured, out=columns[:, :, 3:])
+        return columns
+
+    def all_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
+        """(M, A, 6 + p) d e / d (φ, δk) and all parameters of a hypothesis, in its order."""
+        effects = hypothesis.effects
+        if not hypothesis.lags(0):
+            of_each = [self.columns(hypothesis, seen, each, hypothesis.values[each.name]) for each in effects]
+            return np.concatenate([self.calibration_columns(hypothesis, seen), *of_each], axis=2)
+        # what a lag filters, of all effects at once: to filter many columns takes little longer than to filter one
+        lagging = [effect for effect in effects if effect.acts_on is not ActsOn.REFERENCE]
+        bodies = []
+        for recording, each in enumerate(seen):
+            close, own = each.close
+            of_each = [
+                self._derivatives(hypothesis, close, effect, hypothesis.values[effect.name][recording])
+                for effect in lagging
+            ]
+            body = np.concatenate([self._by_calibration(hypothesis, close, close.measured), *of_each], axis=2)
+            bodies.append(lagged_columns(hypothesis.lags(recording), each, close, own, body))
+        joined = self.binned(bodies, seen)
+        parts, at = {}, 6
+        for effect in lagging:
+            p = len(amplitudes(effect))
+            parts[effect.name] = self._of_the_day(effect, joined[:, :, at : at + p])
+            at += p
+        for effect in effects:
+            if effect not in lagging:
+                parts[effect.name] = self.columns(hypothesis, seen, effect, hypothesis.values[effect.name])
+        return np.concatenate([joined[:, :, :6], *(parts[effect.name] for effect in effects)], axis=2)
+
+    def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
+        """(M, A, p) d e / d parameters of an effect about values, per recording; of the day: by recording."""
+        per_recording = []
+        for recording, each in enumerate(seen):
+            lags = hypothesis.lags(recording)
+            of_motion = lags if effect.acts_on is not ActsOn.REFERENCE else []
+            close, own = each.close if of_motion else (each, slice(None))
+            if isinstance(effect, EffectWithMemory):
+                as_it_is, own = each.close_as_it_is
+                body = trace_columns(effect, as_it_is, values[recording])[own]
+                per_recording.append(without_remembered(lags, each, body))
+            else:
+                body = self._derivatives(hypothesis, close, effect, values[recording])
+                lagging = (
+                    lagged_columns(lags, each, close, own, body) if of_motion else without_remembered(lags, each, body)
+                )
+                per_recording.append(lagging)
+        return self._of_the_day(effect, self.binned(per_recording, seen))
+
+    def _of_the_day(self, effect: Effect, columns: Array) -> Array:
+        """(M, A, p) of an effect -> (M, A, p), or (M, A, r p) where it is another in each recording: each one's own and
+        zero in the others."""
+        whose, p = whose_parameters(effect, len(self.grids)), columns.shape[2]
+        if whose == [None]:
+            return columns
+        found = np.zeros((*columns.shape[:2], len(whose) * p))
+        for number, recording in enumerate(whose):
+            own = self.recording_of == recording
+            found[own, :, number * p : (number + 1) * p] = columns[own]
+        return found
+
+    def lacks_columns(self, hypothesis: Hypothesis) -> bool:
+        """Whether there is anything that `unshown_columns` gives of a hypothesis."""
+        named = {*hypothesis.values, *OF_EVERY}
+        return any(effect.name in named for effect in self.unshown) or not np.allclose(self.shown_turns, np.eye(3))
+
+    def unshown_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> tuple[Array, Array]:
+        """(M, A, u) d e / d what is not shown and not fitted: turns of the mounting, parts of effects; and their usual
+        sizes (u,).
+
+        Each is next to nothing, but so is an effect of which there is little: what these explain is not its.
+        """
+        parts, sizes = [], []
+        held, turns = np.linalg.eigh(np.eye(3) - self.shown_turns)
+        if (held > 0.5).any():
+            turned = replace(self, shown_turns=np.eye(3)).calibration_columns(hypothesis, seen)[:, :, :3]
+            parts.append(turned @ turns[:, held > 0.5])
+            sizes.append(np.full(parts[-1].shape[2], SETTINGS.prior_angle))
+        for effect in self.unshown:
+            named = hypothesis.values.get(effect.name)
+            if named is None and effect.name not in OF_EVERY:
+                continue
+            if isinstance(effect, MountingEffect):
+                parts += self._of_unshown_turns(hypothesis, seen, effect)
+                sizes += [np.full(parts[-2].shape[2], SETTINGS.prior_angle)]
+                sizes += [np.full(parts[-1].shape[2], 0.5 * SETTINGS.prior_angle**2)]
+                continue
+            values = [{**effect.defaults, **own} for own in named or ({},) * len(seen)]
+            parts.append(self.columns(hypothesis, seen, effect, values))
+            own = [spec.typical for spec in amplitudes(effect)]
+            sizes.append(np.tile(own, parts[-1].shape[2] // len(own)))
+        if not parts:
+            return np.zeros((len(self.time), self.axes, 0)), np.zeros(0)
+        return np.concatenate(parts, axis=2), np.concatenate(sizes)
+
+    def _of_unshown_turns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect) -> list[Array]:
+        """(M, A, t) d e / d turns of the mounting that are not shown, and (M, A, r) d e / d half their square, by
+        recording: by its cosine a turn of 4° makes all velocities of a day slower by a quarter of a per cent."""
+        turned = self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen))
+        slower = self.binned([-each.motion.velocity_body for each in seen], seen)[:, :, None]
+        return [turned, self._of_the_day(effect, slower)]
+
+    def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
+        """(M, A) m/s that an effect adds to the residual of a hypothesis that has not got it."""
+        without = [other for other in hypothesis.effects if other is not effect]
+        n = len(self.recordings)
+        plain = hypothesis.with_effects(without, n, {})
+        with_it = plain.with_effects([*without, effect], n, {effect.name: tuple(values)})
+        return self.residual(self.all_seen(plain)) - self.residual(self.all_seen(with_it))
+
+    def _derivatives(self, hypothesis: Hypothesis, seen: Seen, effect: Effect, values: Values) -> Array:
+        """(F, 3, p), body frame."""
+        specs = amplitudes(effect)
+        if isinstance(effect, ClockEffect):
+            by_late = self._by_late(seen, effect.acts_on)
+            slopes = [central_difference(spec, values, lambda at: effect.late(seen.motion.time, at)) for spec in specs]
+            return np.stack([by_late * slope[:, None] for slope in slopes], axis=2)
+        if isinstance(effect, MountingEffect):
+            slopes = [central_difference(spec, values, lambda at: effect.turn(seen.at_dvl, at)) for spec in specs]
+            by_turn = columns_by_turn(hypothesis, seen, seen.measured)
+            stacked = np.stack([np.broadcast_to(slope, seen.error.shape) for slope in slopes], axis=2)
+            return np.asarray(by_turn @ stacked)
+        if effect.acts_on is not ActsOn.DVL:
+            return trace_columns(effect, seen.motion, values)
+        of_dvl = trace_columns(effect, seen.at_dvl, values)
+        return np.asarray(seen.body_from_measured @ self.rotation_dvl_from_body @ of_dvl)
+
+    def _by_late(self, seen: Seen, clock: ActsOn) -> Array:
+        """(F, 3) d e / d lateness of a clock, m/s per s, body frame."""
+        if clock is ActsOn.DVL_CLOCK:
+            return rotate_vectors(seen.body_from_measured, seen.rate_of_change)
+        motion = seen.motion
+        turning = np.zeros_like(motion.velocity_body)
+        if motion.angular_velocity is not None and motion.reference_frame is not VelocityFrame.BODY:
+            turning = cross(motion.angular_velocity, motion.velocity_body)
+        if clock is ActsOn.ATTITUDE_CLOCK:
+            return turning
+        return -slopes(motion.time, motion.velocity_body) - turning
+
+
+def make_problem(
+    recordings: Sequence[RecordedStreams], rotation_dvl_from_body: Array, lever_arm: Array, offsets: Sequence[Offsets]
+) -> Problem:
+    """The problem on bins where all streams are known, with offsets (about which hypotheses lie) and without."""
+    grids = tuple(make_grid(recording, offset) for recording, offset in zip(recordings, offsets, strict=True))
+    problem = Problem(tuple(recordings), rotation_dvl_from_body, np.asarray(lever_arm, dtype=float), grids)
+    return problem if problem.measured[2] else replace(problem, shown_turns=_shown_turns(problem))
+
+
+# A turn of the mounting that, as large as its prior, does less than this (m/s rms), is not fitted: it would take in
+# what is left of the waves, by tens of degrees
+TURN_SHOWN_MPS = 0.002
+
+
+def _shown_turns(problem: Problem) -> Array:
+    """(3, 3) projection of φ on the turns that are shown, whatever the scale."""
+    columns = problem.calibration_columns(no_effect(), problem.all_seen(no_effect())).reshape(-1, 6)
+    if not len(columns):
+        return np.eye(3)
+    by_turn, by_scale = columns[:, :3], columns[:, 3:]
+    by_turn = by_turn - by_scale @ np.linalg.lstsq(by_scale, by_turn, rcond=None)[0]
+    squares, turns = np.linalg.eigh(by_turn.T @ by_turn * (problem.axes / len(columns)))
+    shown = turns[:, SETTINGS.prior_angle * np.sqrt(np.maximum(squares, 0.0)) > TURN_SHOWN_MPS]
+    return np.asarray(shown @ shown.T)

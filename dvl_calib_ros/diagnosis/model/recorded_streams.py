@@ -1,0 +1,501 @@
+"""What a diagnosis looks at: of each recording the streams as they are, each with stamps of its own.
+
+(Long, because every way from messages to a recording is here.)
+
+Where the DVL's clock was set back, by its stamps alone: some were given twice, or what came then was thrown away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.models.parameters import Parameters
+from ...calibration.numerics.frames import ENU_FROM_NED, Array, cross, rotation_from_quaternion
+from ...calibration.numerics.samples import FRAMES, Covariances, SampleBlock, Stream, Streams, VelocityFrame
+from ...calibration.registration.gauss_newton import white_noise
+from ...calibration.registration.registration import Registration
+from ...calibration.streams.clock_correction import Clocks
+from ...calibration.streams.position_velocities import NOISY_MPS
+from ...calibration.streams.screening import SMALLEST_VARIANCE
+from ...effects.base import EffectNeeds
+from ...errors import InputError
+from ...messages.decode import MessageDecoder
+from ...messages.drivers import VELOCITY_TYPES
+from ...recordings.recording import Recording as Opened
+from ...recordings.recording import open_recording
+from ...recordings.requirements import check_topics, hold_the_same, missing_imu
+from ...recordings.topic_messages import Recorded
+from ...recordings.topics import Topics
+from ...verdict.reasons import Reason
+from .settings import SETTINGS
+from .stream_curve import Curve
+
+# Two steps of a stream are one where it is stamped twice: shorter than so many usual steps, so many times running
+TWO_STEPS, FEWEST = 1.25, 4
+# In order of stamps its samples go to and fro between two times, by so many times what they do elsewhere; where they
+# do not, the mixture is as good as either
+TO_AND_FRO = 2.0
+# A step that differs from the usual one by a share of it tells of a clock, where so many do at most: by so many times
+# how steps scatter, within these
+RARE, REGULAR, FAR = 3, (0.03, 0.1), 8.0
+# Of two samples nearer than this share of the usual step, measured a while apart, a curve through both would ring
+TOO_SHORT = 0.5
+# By as much at most, s, is a clock set back of which the stamps do not tell by how much; and of which they do
+UP_TO_S, LONGEST_S = 2.0, 5.0
+
+
+class SetBack(NamedTuple):
+    """before, after: stamps (s) between which a clock was set back. by: s; how much at most, where it is not known."""
+
+    before: float
+    after: float
+    by: float
+
+
+def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray[np.bool_]]:
+    """Where a clock was set back, and which samples (N,) are to be kept: stamped in a time that was stamped once.
+
+    time: (N,) s, stamps in order. velocity: (N, 3) m/s, of the same samples. A clock that is set back by two seconds
+    stamps two seconds once more; or a driver that wants stamps in order throws two seconds away, which leaves one step
+    that is short, of which one sample at most is kept. A DVL that pings faster for a while has short steps as well, but
+    for longer, and its velocity goes on as smoothly.
+    """
+    once = np.ones(len(time), dtype=bool)
+    if len(time) < 4 * FEWEST:
+        return (), once
+    steps = np.diff(time)
+    usual = float(np.median(steps))
+    crowded = time[2:] - time[:-2] < TWO_STEPS * usual
+    bent = np.linalg.norm(velocity[1:-1] - 0.5 * (velocity[:-2] + velocity[2:]), axis=1)
+    found = []
+    for first, behind in np.flatnonzero(np.diff(np.pad(crowded, 1).astype(int))).reshape(-1, 2).tolist():
+        inside = float(time[behind + 1] - time[first])
+        is_mixed = np.median(bent[first:behind]) > TO_AND_FRO * np.median(bent)
+        if behind - first >= FEWEST and inside < LONGEST_S and is_mixed:
+            once[first : behind + 2] = False
+            found.append(SetBack(float(time[first]), float(time[behind + 1]), inside))
+    apart = np.abs(steps - usual) / usual
+    odd = np.flatnonzero(apart > np.clip(FAR * np.median(apart), *REGULAR))
+    short = odd[steps[odd] < usual]
+    if not found and len(short) > 0 and len(odd) <= RARE:
+        found = [SetBack(float(time[at]), float(time[at + 1]), UP_TO_S) for at in short.tolist()]
+        once[short[steps[short] < TOO_SHORT * usual] + 1] = False
+    return tuple(found), once
+
+
+SECOND_NS = 1_000_000_000
+# Of files that are recordings by themselves
+SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3")
+# A reference that moves faster than this shows that a DVL's zero is none, m/s
+MOVING_MPS = 0.1
+# However long a recording is, its streams are averaged to no less
+SLOWEST_AVERAGE_HZ = 2.5
+# So many samples of the reference tell all that can be compared with one of the DVL
+PER_DVL_SAMPLE = 2.5
+
+
+@dataclass(frozen=True)
+class RecordedStreams:
+    """The streams of one recording. Times in s since its first DVL stamp (first_ns).
+
+    name: of the bag. dvl: (N, 3) m/s, DVL frame. reference: (M, 3) m/s, in the earth (ENU) or the body by `frame`.
+    attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of neighbours alike in sign. rates: (G, 3) rad/s,
+    body. dvl_std, reference_std: (3,) m/s, RMS of what the messages claim, the reference's in its frame; None where
+    they do not. measured: (3,) which axes of the reference are measured. repeats: of `received` DVL samples, how many
+    have the very velocity of the one before; spikes: how many were far off and are left out. registration: how the
+    instruments stand, where that is known already. set_back: where the DVL's clock was.
+    """
+
+    name: str
+    dvl: Curve
+    reference: Curve
+    frame: VelocityFrame = VelocityFrame.ENU
+    attitude: Curve | None = None
+    rates: Curve | None = None
+    dvl_std: Array | None = None
+    reference_std: Array | None = None
+    measured: tuple[bool, bool, bool] = (True, True, True)
+    repeats: int = 0
+    received: int = 0
+    spikes: int = 0
+    first_ns: int = 0
+    registration: Registration | None = None
+    set_back: tuple[SetBack, ...] = ()
+
+    @property
+    def available(self) -> frozenset[EffectNeeds]:
+        """What effects may need and this recording has."""
+        has = {
+            EffectNeeds.ATTITUDE: self.attitude is not None,
+            EffectNeeds.ANGULAR_VELOCITY: self.attitude is not None or self.rates is not None,
+        }
+        return frozenset(need for need, there in has.items() if there)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the DVL's stream, s."""
+        return float(self.dvl.time[-1] - self.dvl.time[0]) if len(self.dvl.time) else 0.0
+
+    def rotation_enu_from_body(self, at: Array) -> Array:
+        """(M, 3, 3)."""
+        if self.attitude is None:
+            raise ValueError(f"{self.name}: no attitude")
+        attitude = self.attitude
+
+        def rotation() -> Array:
+            q = attitude(at)
+            return rotation_from_quaternion(q / np.sqrt((q * q).sum(axis=1))[:, None])
+
+        return np.asarray(attitude.kept.at("rotation", at, rotation))
+
+    def angular_velocity(self, at: Array) -> Array:
+        """(M, 3) rad/s, body: of the IMU's own rates, or of its attitude where these are too slow."""
+        rates, attitude = self.rates, self.attitude
+        if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
+            own = rates.quiet
+            return np.asarray(own.kept.at("values", at, lambda: own(at)))
+        if attitude is None:
+            raise ValueError(f"{self.name}: no angular velocity")
+        oriented = attitude.quiet  # a hundredth of a degree ten times a second is a tenth of a degree per second
+
+        def turning() -> Array:
+            q = oriented(at)
+            dq = oriented.derivative(np.clip(at, oriented.time[0], oriented.time[-1]))
+            square = (q * q).sum(axis=1)[:, None]
+            # vector part of 2 q* dq/dt, with q = (x, y, z, w)
+            xyz = q[:, 3:] * dq[:, :3] - dq[:, 3:] * q[:, :3] - cross(q[:, :3], dq[:, :3])
+            return np.asarray(2.0 * xyz / square)
+
+        return np.asarray(oriented.kept.at("angular velocity", at, turning))
+
+
+def make_recording(
+    name: str,
+    dvl: tuple[Array, Array],
+    reference: tuple[Array, Array],
+    *,
+    frame: VelocityFrame = VelocityFrame.ENU,
+    attitude: tuple[Array, Array] | None = None,
+    rates: tuple[Array, Array] | None = None,
+    dvl_std: Array | None = None,
+    reference_std: Array | None = None,
+    axes: str = "auto",
+    first_ns: int = 0,
+) -> RecordedStreams:
+    """A recording from stamps (s) and values of each stream; attitude as quaternions (A, 4).
+
+    Parameters
+    ----------
+    name: Of the recording.
+    dvl, reference, attitude, rates: (N,) s and (N, k).
+    frame: Of the reference.
+    dvl_std, reference_std: m/s that messages claim, (3,) or of each sample (N, 3); None where they do not.
+    axes: As gnss_axes.
+    first_ns: Stamp of the DVL's first sample.
+
+    """
+    events, once = set_back(*dvl)
+    if not once.all():
+        dvl, dvl_std = (dvl[0][once], dvl[1][once]), dvl_std if dvl_std is None or dvl_std.ndim == 1 else dvl_std[once]
+    time, velocity = dvl
+    seconds = float(time[-1] - time[0]) if len(time) > 1 else 0.0
+    rate = min(SETTINGS.max_stream_rate, max(SETTINGS.max_points / max(seconds, 1.0), SLOWEST_AVERAGE_HZ))
+    repeats = int((velocity[1:] == velocity[:-1]).all(axis=1).sum())
+
+    def clean(stream: tuple[Array, Array] | None, std: Array | None = None) -> Curve | None:
+        if stream is None or len(stream[0]) < 2:
+            return None
+        return _claiming(stream, std).without_spikes()
+
+    def curve(stream: tuple[Array, Array] | None, std: Array | None = None, rate: float = rate) -> Curve | None:
+        found = clean(stream, std)
+        return None if found is None else found.averaged(rate)
+
+    if attitude is not None:
+        attitude = attitude[0], _alike_in_sign(attitude[1])
+    without_spikes = clean(dvl, dvl_std)
+    spikes = 0 if without_spikes is None else len(time) - len(without_spikes.time)
+    dvl_curve = None if without_spikes is None else without_spikes.averaged(rate)
+    del without_spikes
+    of_dvl = SLOWEST_AVERAGE_HZ if dvl_curve is None else PER_DVL_SAMPLE / dvl_curve.interval
+    reference_curve = curve(reference, reference_std, min(rate, max(of_dvl, SLOWEST_AVERAGE_HZ)))
+    if dvl_curve is None or reference_curve is None:
+        raise InputError(f"{name}: fewer than two samples of DVL or reference")
+    return RecordedStreams(
+        name, dvl_curve, reference_curve, frame, curve(attitude), curve(rates), _rms(dvl_std), _rms(reference_std),
+        _measured_axes(reference[1], _usual(reference_std), axes), repeats, len(time), spikes, first_ns,
+        set_back=events,
+    )  # fmt: skip
+
+
+def _usual(std: Array | None) -> Array | None:
+    """(3,) median of claims (3,) or (N, 3)."""
+    return std if std is None or std.ndim == 1 else np.asarray(np.median(std, axis=0))
+
+
+def _rms(std: Array | None) -> Array | None:
+    """(3,) RMS of claims (3,) or (N, 3), without those that say that nothing was measured."""
+    usual = _usual(std)
+    if std is None or usual is None or std.ndim == 1:
+        return std
+    known = std < SETTINGS.unmeasured_std
+    squares = np.where(known, std, 0.0) ** 2
+    rms = np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1))
+    return np.where(usual < SETTINGS.unmeasured_std, rms, usual)
+
+
+def _claiming(stream: tuple[Array, Array], std: Array | None) -> Curve:
+    """A stream with what its messages claim, (3,) or (N, 3); who says -1 or nothing claims what is usual."""
+    usual = _usual(std)
+    if std is None or usual is None or std.ndim == 1:
+        return Curve(*stream, std)
+    finite = np.where(np.isfinite(usual), usual, SETTINGS.unmeasured_std)
+    claims = np.where(np.isfinite(std) & (std**2 >= SMALLEST_VARIANCE), std, finite)
+    return Curve(*stream, usual, claims=np.minimum(claims, SETTINGS.unmeasured_std))
+
+
+def _alike_in_sign(quaternions: Array) -> Array:
+    turned = np.sign(np.einsum("ni,ni->n", quaternions[1:], quaternions[:-1]))
+    signs = np.cumprod(np.concatenate([[1.0], np.where(turned == 0.0, 1.0, turned)]))
+    return quaternions * signs[:, None]
+
+
+def _measured_axes(velocity: Array, std: Array | None, axes: str) -> tuple[bool, bool, bool]:
+    if axes != "auto":
+        return True, True, axes == "xyz"
+    measured = np.ones(3, dtype=bool) if std is None else std < SETTINGS.unmeasured_std
+    measured[2] &= bool(velocity[:, 2].any())
+    return bool(measured[0]), bool(measured[1]), bool(measured[2])
+
+
+# ------------------------------------------------------------------ from bags
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """Recordings and what the user should know of the data."""
+
+    recordings: tuple[RecordedStreams, ...]
+    notes: tuple[str, ...]
+
+
+def load_recordings(
+    source: Opened | Sequence[Path], parameters: Parameters, topics: Topics, *, forget: bool = False
+) -> Loaded:
+    """The recordings of every bag. Raises InputError, also for a bag without a reference velocity.
+
+    forget: let go of the messages of each, once its samples are taken (`Recording.forget`).
+    """
+    paths = source.paths if isinstance(source, Opened) else source
+    if len(set(paths)) < len(paths):
+        raise InputError(f"{', '.join(map(str, paths))}: a bag is named twice")
+    opened = source if isinstance(source, Opened) else open_recording(source, topics, parameters)
+    recordings: list[RecordedStreams] = []
+    notes: list[str] = []
+    known: list[Recorded] = []
+    for name, path, one in zip(recording_names(paths), paths, opened.each, strict=True):
+        streams, own = _read(path, one, parameters, topics)
+        if len(paths) > 1:
+            dvl = one.recorded(topics.found_in(one.types).dvl, parameters)
+        if forget:
+            one.forget()
+        blocks = [*streams]
+        del streams  # `_recording` lets go of each as soon as it can
+        registration = one.registration(topics, parameters)
+        recordings.append(replace(_recording(name, blocks, parameters, own), registration=registration))
+        if len(paths) > 1:
+            for other, its_path in zip(known, paths, strict=False):
+                if hold_the_same(dvl, other):
+                    raise InputError(
+                        f"{its_path}, {path}: hold the same samples, so neither is held out; name one of them"
+                    )
+            known.append(dvl)
+        notes += own if len(paths) == 1 else [f"{path}: {note}" for note in own]
+    return Loaded(tuple(recordings), tuple(notes))
+
+
+def recording_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each bag that no other has: its own, with its folder's where two are called the same."""
+    full = [path.resolve() for path in paths]
+    names = [_without_suffix(path.name) for path in full]
+    shared = Counter(names)
+    names = [f"{p.parent.name}-{name}" if shared[name] > 1 else name for p, name in zip(full, names, strict=True)]
+    shared = Counter(names)
+    return [f"{name}-{i + 1}" if shared[name] > 1 else name for i, name in enumerate(names)]
+
+
+def _without_suffix(name: str) -> str:
+    return next((name.removesuffix(end) for end in SUFFIXES if name.endswith(end)), name)
+
+
+def _read(path: Path, opened: Opened, parameters: Parameters, topics: Topics) -> tuple[Streams, list[str]]:
+    """All samples of a recording, and what the user should know of them."""
+    found: list[Reason] = []
+    chosen = topics.found_in(opened.types)
+    check_topics(opened, chosen, found)
+    decoder = MessageDecoder(opened.of_types(chosen, parameters))
+    streams = opened.streams(chosen, decoder)
+    usable = streams.reference.values[streams.reference.refused == 0]
+    usable = usable[np.isfinite(usable).all(axis=1)]
+    unfit = _unfit_positions(path, opened.types.get(chosen.gnss, ""), chosen.gnss, usable)
+    if unfit and not len(usable):
+        raise InputError(unfit[0])
+    if not len(streams.reference):
+        raise InputError(
+            f"{path}: no reference velocity to compare the DVL with: no messages on {topics.gnss}; set --gnss-topic"
+        )
+    found += missing_imu(opened, chosen, decoder.frame_of_reference)
+    return streams, [*opened.notes, *unfit, *map(str, found), *map(str, decoder.problems.values())]
+
+
+def _unfit_positions(path: Path, msgtype: str, topic: str, velocities: Array) -> list[str]:
+    """What to do with positions whose velocities (N, 3) m/s are too noisy to be compared; nothing about others."""
+    kind = VELOCITY_TYPES.get(msgtype)
+    is_noisy = not len(velocities) or math.sqrt(white_noise(velocities)) > NOISY_MPS
+    if kind is None or kind.position is None or not is_noisy:
+        return []
+    return [
+        f"{path}: the positions on {topic} are too noisy, or too seldom, for the velocities that a diagnosis compares "
+        "with the DVL's; dvl-calib replay calibrates with them (model D1)"
+    ]
+
+
+def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, notes: list[str]) -> RecordedStreams:
+    """blocks: of DVL, reference and IMU, which it takes out of the list."""
+    clocks = Clocks.of(parameters)
+    given = blocks.pop(0)
+    dvl = _in_order(_valid(given, parameters), parameters, notes)
+    if not len(dvl):
+        lost = Counter(given.reasons[code - 1] for code in given.refused.tolist() if code)
+        listing = ", ".join(f"{count} {reason}" for reason, count in lost.items()) or "all invalid"
+        raise InputError(f"{name}: no valid DVL sample of {len(given)}: {listing}")
+    first_ns = int(dvl.stamps_ns[0])
+    given = blocks.pop(0)
+    reference = _in_order(_valid(given, parameters), parameters, notes)
+    if not len(reference):
+        raise InputError(f"{name}: no valid reference velocity of {len(given)}; see gnss_frame, max_speed")
+    code = int(reference.frames[0])
+    reference = _part(reference, reference.frames == code)
+    dvl = _without_zeros(dvl, reference, notes)
+    velocity, std, frame = reference.values, _std(reference.covariances), FRAMES[code]
+    if frame is VelocityFrame.NED:
+        velocity, std, frame = velocity @ ENU_FROM_NED.T, None if std is None else std[:, [1, 0, 2]], VelocityFrame.ENU
+    if frame is VelocityFrame.ENU:
+        velocity = velocity - np.array([*parameters.reference_velocity_offset, 0.0])
+    given = blocks.pop(0)
+    imu = _in_order(_part(given, given.refused == 0), parameters, notes)
+    del given
+    length = np.linalg.norm(imu.orientation, axis=1)
+    oriented = _part(imu, np.asarray((length > 0.5) & (length < 2.0)))
+    rated = _part(imu, np.asarray(np.isfinite(imu.angular_velocity).all(axis=1)))
+    if frame is VelocityFrame.ENU and len(oriented) < 2:
+        raise InputError(
+            f"{name}: the reference is in an earth frame and there is no attitude to turn it into the body; "
+            "set --imu-topic, or record sensor_msgs/Imu with orientation"
+        )
+    at = clocks.dvl(dvl.stamps_ns, first_ns)
+    imu_ns = clocks.imu_ns
+    dvl_stream, dvl_std = _claimed_stream(at, dvl.values, _std(dvl.covariances), first_ns)
+    reference_stream, std = _claimed_stream(reference.stamps_ns - clocks.reference_ns, velocity, std, first_ns)
+    recording = make_recording(
+        name,
+        dvl_stream,
+        reference_stream,
+        frame=frame,
+        attitude=_stream(oriented.stamps_ns - imu_ns, oriented.orientation, first_ns) if len(oriented) > 1 else None,
+        rates=_stream(rated.stamps_ns - imu_ns, rated.angular_velocity, first_ns) if len(rated) > 1 else None,
+        dvl_std=dvl_std,
+        reference_std=std,
+        axes=parameters.gnss_axes,
+        first_ns=first_ns,
+    )
+    if twice := len(dvl_stream[0]) - recording.received:
+        when = " and ".join(f"{event.after:.0f} s" for event in recording.set_back)
+        notes.append(f"dvl: its clock was set back at {when}; {twice} samples of what it stamped twice are left out")
+    return recording
+
+
+def _stream(stamps_ns: NDArray[np.int64], values: Array, first_ns: int) -> tuple[Array, Array]:
+    time = 1e-9 * (stamps_ns - first_ns)
+    later = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0.0])  # a jump taken off may cross two
+    return (time, values) if later.all() else (time[later], values[later])
+
+
+def _claimed_stream(
+    stamps_ns: NDArray[np.int64], values: Array, std: Array | None, first_ns: int
+) -> tuple[tuple[Array, Array], Array | None]:
+    """`_stream` with the claims (N, 3) of its samples."""
+    stream = _stream(stamps_ns, values, first_ns)
+    return stream, None if std is None else _stream(stamps_ns, std, first_ns)[1]
+
+
+def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
+    """Rows that are samples, finite, no faster than max_speed, without a negative variance but for -1."""
+    speed = np.linalg.norm(block.values, axis=1)
+    valid = (block.refused == 0) & np.isfinite(speed) & (speed <= parameters.max_speed)
+    if block.stream is Stream.DVL:
+        negative = np.array([bool((np.diag(c) < 0.0).any()) for c in block.covariances.distinct] + [False])
+        valid &= ~negative[block.covariances.index]
+    return _part(block, valid)
+
+
+def _part(block: SampleBlock, at: NDArray[np.bool_]) -> SampleBlock:
+    """Rows of a mask (N,); no copy of them where these are all."""
+    return block if at.all() else block.part(at)
+
+
+def zeros_while_moving(dvl: SampleBlock, reference: SampleBlock) -> NDArray[np.bool_]:
+    """(N,) DVL rows of exactly zero while the reference, nearest in time, moves: dropouts, not velocities."""
+    zero = (dvl.values == 0.0).all(axis=1)
+    if not zero.any() or not len(reference):
+        return zero & False
+    nearest = np.clip(np.searchsorted(reference.stamps_ns, dvl.stamps_ns), 0, len(reference) - 1)
+    return np.asarray(zero & (np.linalg.norm(reference.values[nearest], axis=1) > MOVING_MPS))
+
+
+def _without_zeros(dvl: SampleBlock, reference: SampleBlock, notes: list[str]) -> SampleBlock:
+    lost = zeros_while_moving(dvl, reference)
+    if not lost.any() or lost.all():
+        return dvl
+    notes.append(f"dvl: {np.count_nonzero(lost)} samples are exactly zero while the vehicle moves: taken for dropouts")
+    return dvl.part(~lost)
+
+
+def _in_order(block: SampleBlock, parameters: Parameters, notes: list[str]) -> SampleBlock:
+    """Rows of the longest stretch without a restart, in strictly increasing order of stamps."""
+    stamps = block.stamps_ns
+    jump_ns = round(parameters.max_time_jump * SECOND_NS)
+    stray = np.zeros(len(stamps), dtype=bool)
+    if len(stamps) > 2:
+        before, after = stamps[1:-1] - stamps[:-2], stamps[2:] - stamps[1:-1]
+        far = (np.abs(before) > jump_ns) & (np.abs(after) > jump_ns) & (np.sign(before) != np.sign(after))
+        stray[1:-1] = far & (np.abs(stamps[2:] - stamps[:-2]) <= jump_ns)
+    kept = np.flatnonzero(~stray)
+    parts = np.split(kept, np.flatnonzero(np.diff(stamps[kept]) < -jump_ns) + 1)
+    longest = max(parts, key=len)
+    if len(parts) > 1:
+        notes.append(
+            f"{block.stream.value}: stamps went back {len(parts) - 1} times; the longest stretch between is diagnosed"
+        )
+    if len(longest) == len(stamps) and bool((np.diff(stamps) > 0).all()):
+        return block
+    order = longest[np.argsort(stamps[longest], kind="stable")]
+    fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])[: len(order)]
+    return block.part(order[fresh])
+
+
+def _std(covariances: Covariances) -> Array | None:
+    """(N, 3) standard deviation per axis that messages claim; infinite where -1 or more; None where not given."""
+    if not len(covariances.index) or (covariances.index < 0).any():
+        return None
+    variance = np.diagonal(covariances.distinct, axis1=1, axis2=2)[covariances.index]
+    variance = np.where(variance < 0.0, np.inf, variance)
+    return None if (np.median(variance, axis=0) < SMALLEST_VARIANCE).any() else np.asarray(np.sqrt(variance))

@@ -1,0 +1,191 @@
+"""A recording as a hypothesis has it, and the derivatives of its residual."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.frames import Array, skew
+from ...effects.base import ActsOn, Effect, EffectInput, EffectParameter, EffectWithMemory
+from ...effects.composition import Injection, traces
+from .hypothesis import Hypothesis, Values, amplitudes
+from .stream_curve import Curve
+from .time_grid import PASSES
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A recording through a hypothesis, at F times. motion: of the reference point. at_dvl: of the DVL. measured:
+    (F, 3) m/s smoothed DVL velocity, its frame. error: (F, 3) e, body frame.
+    angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
+    dvl_stamps, reference_stamps: (F,) s that these give the same times. projection: (F, A, 3) or (1, A, 3) from the
+    body frame to the axes that are compared. change, closely, as_it_is: make `rate_of_change`, `close` and
+    `close_as_it_is`.
+    """
+
+    motion: EffectInput
+    at_dvl: EffectInput
+    measured: Array
+    error: Array
+    angles: Array
+    body_from_measured: Array
+    dvl_stamps: Array
+    reference_stamps: Array
+    projection: Array
+    change: Callable[[], Array] = field(repr=False)
+    closely: Callable[[], tuple[Seen, NDArray[np.intp]] | None] = field(repr=False)
+    as_it_is: Callable[[], tuple[EffectInput, NDArray[np.intp]] | None] = field(repr=False)
+
+    @cached_property
+    def rate_of_change(self) -> Array:
+        """(F, 3) m/s² of the smoothed DVL velocity, which few ask for."""
+        return self.change()
+
+    @cached_property
+    def close(self) -> tuple[Seen, NDArray[np.intp] | slice]:
+        """The same without effects that have a memory, at times so close that these miss nothing, and which are its."""
+        return self.closely() or (self, slice(None))
+
+    @cached_property
+    def close_as_it_is(self) -> tuple[EffectInput, NDArray[np.intp] | slice]:
+        """The motion of `close` not smoothed: smoothed, it would lack what a filter takes off."""
+        return self.as_it_is() or (self.motion, slice(None))
+
+    def on_reference(self, injections: Sequence[Injection]) -> Array:
+        """(F, 3) m/s, traces on REFERENCE, body frame."""
+        lagging = [each for each in injections if isinstance(each.effect, EffectWithMemory)]
+        if not lagging or self.close_as_it_is[0] is self.motion:
+            return traces(injections, self.motion, ActsOn.REFERENCE)
+        close, own = self.close_as_it_is
+        found = traces([each for each in injections if each not in lagging], self.motion, ActsOn.REFERENCE)
+        return np.asarray(found + traces(lagging, close, ActsOn.REFERENCE)[own])
+
+    def compared(self, body: Array) -> Array:
+        """(F, 3) or (F, 3, p) of the body frame along the axes that are compared, (F, A) or (F, A, p)."""
+        return self.projection @ body if body.ndim > 2 else rotate_vectors(self.projection, body)
+
+
+def measured_velocity(curve: Curve, at: Array, at_samples: bool) -> tuple[Array, Array]:
+    """(F, 3) velocity and smoothed velocity."""
+
+    def made() -> tuple[Array, Array]:
+        smooth = curve.smooth
+        raw = curve if at_samples else curve.quiet
+        smoothed = smooth(at)
+        return smoothed if raw is smooth else raw(at), smoothed
+
+    measured: tuple[Array, Array] = curve.kept.at(f"measured, {at_samples}", at, made)
+    return measured
+
+
+def velocity_change(curve: Curve, at: Array) -> Array:
+    """(F, 3) m/s² of a velocity."""
+    clipped = np.clip(at, curve.time[0], curve.time[-1])
+    return np.asarray(curve.kept.at("change", at, lambda: curve.derivative(clipped)))
+
+
+def undo_effects(
+    injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn, turned: Array | None
+) -> tuple[EffectInput, Array]:
+    """The motion before the effects of one stage have acted on it, and what they have added (F, 3), or (3,) nothing.
+
+    Where an effect is not small against the motion, as of a spike of 7 m/s, a pass may lead further off than the one
+    before; it is not taken there.
+    """
+    here = [each for each in injections if each.effect.acts_on is acts_on]
+    if not here:
+        return motion, np.zeros(3)
+    after, added = motion.velocity_body, np.zeros_like(motion.velocity_body)
+    moved_before = np.full(len(after), np.inf)
+    for _ in range(PASSES):
+        before, added = added, traces(here, motion, acts_on)
+        added = added if turned is None else rotate_vectors(turned, added)
+        if not any(isinstance(each.effect, Effect) and each.effect.of_velocity for each in here):  # that is all
+            return replace(motion, velocity_body=after - added), added
+        if np.array_equal(added, before):
+            break
+        moved = np.linalg.norm(added - before, axis=1)
+        added = np.where((moved <= moved_before)[:, None], added, before)
+        moved_before = np.minimum(moved, moved_before)
+        motion = replace(motion, velocity_body=after - added)
+    return motion, added
+
+
+def lagged_columns(
+    lags: Sequence[tuple[EffectWithMemory, Values]],
+    seen: Seen,
+    close: Seen,
+    own: NDArray[np.intp] | slice,
+    columns: Array,
+) -> Array:
+    """Derivatives (C, 3, p) of the reference point's velocity, m/s, at close times, of which some are a recording's
+    own -> (F, 3, p) of references that follow with a lag, as `_begun`."""
+    if close is seen and len(lags) == 1:
+        ((lag, values),) = lags
+        return lag.follows(seen.motion, columns, values)
+    for lag, values in lags:
+        columns = columns - lag.filtered(close.motion, columns, values)
+    return without_remembered(lags, seen, columns[own])
+
+
+def without_remembered(lags: Sequence[tuple[EffectWithMemory, Values]], seen: Seen, columns: Array) -> Array:
+    """Derivatives (F, 3, p) m/s without what a lag explains of them by what it remembers of before."""
+    for lag, values in lags:
+        columns = columns - lag.of_before(seen.motion, columns, values)
+    return columns
+
+
+def rotate_vectors(matrix: Array, values: Array) -> Array:
+    """(N, 3) values, multiplied by one matrix (3, 3), (1, 3, 3) or by one each (N, 3, 3)."""
+    if matrix.ndim == 2 or len(matrix) == 1:
+        return values @ (matrix if matrix.ndim == 2 else matrix[0]).T
+    return np.asarray(np.einsum("nij,nj->ni", matrix, values))
+
+
+def columns_by_turn(hypothesis: Hypothesis, seen: Seen, measured: Array) -> Array:
+    """(F, 3, 3) d e / d (φ + turns), body frame, of velocities (F, 3) m/s in the DVL's.
+
+    D⁻¹ y with y the unscaled velocity is Exp(θ)ᵀ y, and Exp(θ + δ) = Exp(J δ) Exp(θ) with J the left Jacobian.
+    """
+    matrix = seen.body_from_measured * (1.0 + hypothesis.scale)
+    unscaled, jacobian = measured / (1.0 + hypothesis.scale), _left_jacobian(seen.angles)
+    if matrix.ndim == 2:  # linear in the velocity: one product of matrices in place of many small ones
+        of_axes = (matrix @ skew(np.eye(3)) @ jacobian).reshape(3, 9)
+        return np.asarray((unscaled @ of_axes).reshape(-1, 3, 3))
+    return np.asarray(matrix @ skew(unscaled) @ jacobian)
+
+
+def _left_jacobian(angles: Array) -> Array:
+    """(..., 3, 3) of rotation vectors (..., 3) rad: I + (1 - cos θ) / θ² [θ×] + (θ - sin θ) / θ³ [θ×]²."""
+    square = np.maximum((angles**2).sum(axis=-1), 1e-12)[..., None, None]
+    size = np.sqrt(square)
+    cross = skew(angles)
+    once, twice = (1.0 - np.cos(size)) / square, (size - np.sin(size)) / (square * size)
+    return np.asarray(np.eye(3) + once * cross + twice * (cross @ cross))
+
+
+def trace_columns(effect: Effect, motion: EffectInput, values: Values) -> Array:
+    """(F, 3, p) d e / d parameters of an effect of its trace on a motion, in the frame of that."""
+    specs = amplitudes(effect)
+    if all(spec.linear for spec in specs):
+        none = {**values, **{spec.name: 0.0 for spec in specs}}
+        slopes = [effect.trace(motion, {**none, spec.name: 1.0}) for spec in specs]
+        own = {spec.name for spec in effect.parameters}
+        if any(value for name, value in none.items() if name not in own):  # a height that is known and not fitted
+            still = effect.trace(motion, none)
+            slopes = [slope - still for slope in slopes]
+    else:
+        slopes = [central_difference(spec, values, lambda at: effect.trace(motion, at)) for spec in specs]
+    return -np.stack(slopes, axis=2)
+
+
+def central_difference(spec: EffectParameter, values: Values, of: Callable[[Values], Array]) -> Array:
+    """d of / d parameter, by central differences, within its bounds."""
+    step = 0.05 * spec.typical
+    low, high = max(values[spec.name] - step, spec.low), min(values[spec.name] + step, spec.high)
+    slope: Array = (of({**values, spec.name: high}) - of({**values, spec.name: low})) / (high - low)
+    return slope

@@ -1,0 +1,132 @@
+"""The times at which the streams of a recording are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.frames import Array
+from ...effects.base import ActsOn
+from ...effects.composition import Injection, late
+from .recorded_streams import RecordedStreams
+from .settings import SETTINGS
+from .stream_curve import FAST_ENOUGH_S
+
+# Passes in which an effect is undone that acts on the very motion it changes: it is small against that motion
+PASSES = 3
+# Seconds between the times of a motion that a filter follows as it was, where it is looked at more seldom than
+# `FAST_ENOUGH_S`: by its slopes at 1 Hz a wave of 5 s is a quarter too small
+CLOSE_S = 0.1
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Where a recording is looked at: at its rougher stream's own samples, which so need no interpolation.
+
+    What is interpolated is as noisy at one phase as at another only if it has next to no noise, and is as it was
+    between its samples only if these are close. clock: that of the rougher stream, DVL_CLOCK or REFERENCE_CLOCK.
+    stamps: (M * per_bin,) s, by that clock. late: s, by a first guess.
+    """
+
+    clock: ActsOn
+    stamps: Array
+    per_bin: int
+    late: float = 0.0
+
+    @property
+    def bin_time(self) -> Array:
+        """(M,) s, middles, as true as the first guess."""
+        return self.stamps.reshape(-1, self.per_bin).mean(axis=1) - self.late
+
+    def averaged(self, values: Array) -> Array:
+        """(F, ...) -> (M, ...)."""
+        total = values[:: self.per_bin].astype(float)
+        for of_bin in range(1, self.per_bin):  # few: faster than a mean along so short an axis
+            total += values[of_bin :: self.per_bin]
+        return total / self.per_bin
+
+    def between(self, time: Array) -> tuple[Array, NDArray[np.intp]] | None:
+        """Times (C,) s among which are those of the samples (F,), with those between, but over gaps; and which are.
+
+        None where these are close enough by themselves, or too many.
+        """
+        if len(time) < 2:
+            return None
+        steps = np.diff(time)
+        usual = float(np.median(steps))
+        parts = min(int(np.ceil(usual / CLOSE_S)), SETTINGS.max_points // len(time))
+        if usual <= FAST_ENOUGH_S or parts < 2:
+            return None
+        of_each = np.where(steps < SETTINGS.max_gap_intervals * usual, parts, 1)
+        own = np.concatenate([[0], np.cumsum(of_each)])
+        return np.interp(np.arange(own[-1] + 1), own, time), own
+
+    def true_time(self, injections: Sequence[Injection]) -> Array:
+        """(F,) s, increasing, at which what is stamped so was measured.
+
+        A leap that is tried where there is none would have samples measured before those that came first; these then
+        follow one another at half the usual time between stamps, until they are as late as the leap has them. A leap
+        that is there leaves its gap in the stamps, not in time.
+        """
+        time = self.stamps
+        for _ in range(PASSES):
+            time = self.stamps - late(injections, self.clock, time)
+        least = self._least
+        return time if (np.diff(time - least) > 0.0).all() else np.maximum.accumulate(time - least) + least
+
+    @cached_property
+    def _least(self) -> Array:
+        """(F,) s, least time since the first sample: asked for by every hypothesis, and the same for all."""
+        steps = np.diff(self.stamps, prepend=self.stamps[:1])
+        return np.asarray(0.5 * np.cumsum(np.minimum(steps, np.median(steps))))
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Lateness, s, of the DVL's and the reference's stamps against the attitude's: a first guess."""
+
+    dvl: float = 0.0
+    reference: float = 0.0
+
+
+# Offsets of hypotheses may lie so far from the first guess without leaving what is known, s
+MARGIN_S = 0.5
+
+
+def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
+    """Choose the times at which all streams of a recording are known, by the rougher of DVL and reference."""
+    settings = SETTINGS
+    by_dvl = float(np.linalg.norm(recording.dvl.roughness)) > float(np.linalg.norm(recording.reference.roughness))
+    base, clock = (recording.dvl, ActsOn.DVL_CLOCK) if by_dvl else (recording.reference, ActsOn.REFERENCE_CLOCK)
+    base_late = offsets.dvl if by_dvl else offsets.reference
+    seconds = max(base.time[-1] - base.time[0], base.interval)
+    width = max(settings.bins_per_interval * base.interval, settings.shortest_bin, seconds / settings.max_bins)
+    per_bin = max(2, round(width / base.interval))
+    streams = (recording.dvl, offsets.dvl), (recording.reference, offsets.reference)
+    others = [(curve, own_late) for curve, own_late in streams if curve is not base]
+    told = np.ones(len(base.time), dtype=bool)
+    for curve, own_late in (*others, *((each, 0.0) for each in (recording.attitude, recording.rates) if each)):
+        told &= curve.tells(base.time - base_late + own_late)
+    stamps = base.time[told]
+    true = stamps - base_late
+    known = np.ones(len(true), dtype=bool)
+    for curve, own_late in others:
+        for at in (base_late - own_late, -MARGIN_S, MARGIN_S):
+            known &= curve.covers(true + own_late + at)
+    if not by_dvl:  # the DVL has nothing of the time that its clock went back over, whatever it is late by
+        for event in recording.set_back:
+            of_dvl, around = true + offsets.dvl, event.by + MARGIN_S
+            known &= (of_dvl < event.before - around) | (of_dvl > event.after + around)
+    for oriented in (recording.attitude, recording.rates):
+        for at in (base_late, -MARGIN_S, MARGIN_S):
+            known &= True if oriented is None else oriented.covers(true + at)
+    breaks = np.flatnonzero(np.diff(stamps) > settings.max_gap_intervals * base.interval) + 1
+    kept = []
+    for part in np.split(np.arange(len(true)), np.unique(np.concatenate([breaks, np.flatnonzero(np.diff(known)) + 1]))):
+        if len(part) and known[part[0]]:
+            kept.append(part[: len(part) // per_bin * per_bin])
+    return Grid(clock, stamps[np.concatenate(kept)] if kept else np.zeros(0), per_bin, base_late)

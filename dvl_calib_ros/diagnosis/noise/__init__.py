@@ -1,0 +1,1 @@
+"""The noise of the residual: level, colour, and least squares whitened by it."""

@@ -1,0 +1,156 @@
+"""How the noise's level follows what messages claim, sample by sample, and the vehicle: louder at speed or in turns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.distributions import chi2_sf
+from ...calibration.numerics.frames import Array
+from ...effects.base import EffectNeeds
+from ..model.claimed_noise import STRETCH_S, Claims, differ, exponents, followed
+from ..model.forward_model import Problem
+from ..model.seen import Seen
+from .noise_model import Noise, white_noise
+
+SIGNIFICANT = 1e-4
+# Rows that are out alone, of which no level is called for
+FEW = 6
+# What a fit takes in of noise depends little on its colour: so often is one found by the other
+TAKEN_ROUNDS = 2
+
+
+@dataclass(frozen=True)
+class Level:
+    """log standard deviation = const + Σ slope · (covariate - mean). p: of all slopes together, p_of: of each."""
+
+    names: tuple[str, ...]
+    slopes: Array
+    p: float
+    p_of: Array
+    values: Array
+
+
+def covariates(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
+    """(M,) each: speed m/s, turn rate rad/s where there is an IMU."""
+    found = {"speed": problem.sampled(seen, lambda motion: motion.speed)}
+    if EffectNeeds.ANGULAR_VELOCITY in problem.available:
+        found["turn_rate"] = problem.sampled(seen, lambda motion: np.linalg.norm(motion.turn_rate, axis=1))
+    return {name: values for name, values in found.items() if np.std(values) > 1e-3 * max(1.0, abs(np.mean(values)))}
+
+
+def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Level | None:
+    """Least squares of log squared innovations (M, A) on the covariates, which no outlier upsets; None without any."""
+    found = covariates(problem, seen)
+    if not found:
+        return None
+    log_square = np.log(np.maximum((innovations**2).mean(axis=1), 1e-12))
+    slopes, covariance, wald = _sloped(list(found.values()), log_square)
+    p, p_of = float(chi2_sf(wald, len(slopes))), chi2_sf(slopes**2 / np.diag(covariance), 1)
+    if p < SIGNIFICANT:
+        common = [each for values in found.values() if np.ptp(each := _common(values)) > 0.0]
+        p_common = float(chi2_sf(_sloped(common, log_square)[2], len(common))) if common else 1.0
+        p = p if p_common < SIGNIFICANT else p_common
+    x = np.column_stack([values - values.mean() for values in found.values()])
+    level = np.exp(np.clip(0.5 * x @ slopes, -2.0, 2.0))
+    return Level(tuple(found), 0.5 * slopes, p, p_of, level)
+
+
+def _sloped(found: Sequence[Array], log_square: Array) -> tuple[Array, Array, float]:
+    """Slopes (c,) of log squares (M,) along c covariates (M,), their covariance, and Wald's statistic of all."""
+    x = np.column_stack([np.ones(len(log_square)), *(values - values.mean() for values in found)])
+    inverse = np.linalg.pinv(x.T @ x)
+    parameters = inverse @ x.T @ log_square
+    left = (log_square - x @ parameters)[:, None] * x
+    covariance = (inverse @ (left.T @ left) @ inverse * len(x) / max(len(x) - x.shape[1], 1))[1:, 1:]  # HC1
+    slopes = parameters[1:]
+    return slopes, covariance, float(slopes @ np.linalg.solve(covariance, slopes))
+
+
+def _common(values: Array) -> Array:
+    """Values (M,) no further out than `FEW` rows are: these few may be quiet by chance, and pull at a slope."""
+    ordered = np.sort(values)
+    few = min(FEW, (len(values) - 1) // 2)
+    return np.clip(values, ordered[few], ordered[-1 - few])
+
+
+def estimated(
+    problem: Problem, seen: Sequence[Seen], left: Array, rotation: Array | None, columns: Array, std: Array
+) -> tuple[Noise, Array]:
+    """The noise that is left (M, A) of a problem's residual, in a frame, with the level that it calls for if it does
+    so clearly; and what is left with its outliers drawn in.
+
+    columns, std: (M, A, p) and (p,) of what is not left, which has taken in some of the noise.
+    """
+    noise = white_noise(left, problem.segments, rotation, problem.interval).refitted(left)
+    for _ in range(TAKEN_ROUNDS):
+        taken = noise.taken_by(columns, std)
+        noise = noise.refitted(noise.robust(left), taken=taken)
+    names, log_claims = claims_of(problem, seen, rotation)
+    if names:
+        innovations = noise.whiten(left).reshape(left.shape)
+        noise = replace(noise, level=noise.level * followed(log_claims, innovations, names, stretches_of(problem)))
+        noise = noise.refitted(noise.robust(left), taken=taken)
+    level = fit_level(problem, seen, noise.whiten(left).reshape(left.shape))
+    if level is not None and level.p < SIGNIFICANT:
+        noise = replace(noise, level=noise.level * level.values[:, None])
+    robust = noise.robust(left)
+    return noise.refitted(robust, taken=taken), robust
+
+
+def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotation: Array | None) -> Claims | None:
+    """How innovations (M, A), of noise at one level, follow claims that differ from sample to sample; None without."""
+    names, log_claims = claims_of(problem, seen, rotation)
+    return exponents(names, log_claims, innovations, stretches_of(problem)) if names else None
+
+
+# ------------------------------------------------------------------ of what is compared
+
+
+def claims_of(problem: Problem, seen: Sequence[Seen], rotation: Array | None) -> tuple[tuple[str, ...], Array]:
+    """Streams whose claims differ, and logarithms (M, A, c) of these in the frame of the noise."""
+    names, columns = [], []
+    for name in ("dvl", "reference"):
+        each = _of_stream(problem, seen, rotation, name)
+        if each is not None and differ(each):
+            names.append(name)
+            columns.append(each)
+    return tuple(names), np.stack(columns, axis=2) if columns else np.zeros((len(problem.time), problem.axes, 0))
+
+
+def _of_stream(problem: Problem, seen: Sequence[Seen], rotation: Array | None, name: str) -> Array | None:
+    """(M, A) log standard deviation; None where a recording has none, or all claim the same."""
+    given = [(each.dvl if name == "dvl" else each.reference).claims for each in problem.recordings]
+    claims = [each for each in given if each is not None and len(each)]
+    if len(claims) < len(given) or all(bool((each == claims[0][0]).all()) for each in claims):
+        return None
+    parts = []
+    start = 0
+    for recording, grid, each, own in zip(problem.recordings, problem.grids, seen, claims, strict=True):
+        curve, stamps = (
+            (recording.dvl, each.dvl_stamps) if name == "dvl" else (recording.reference, each.reference_stamps)
+        )
+        variance = np.stack([np.interp(stamps, curve.time, column) for column in (own**2).T], axis=1)
+        variance = grid.averaged(variance)
+        at = slice(start, start + len(variance))
+        start = at.stop
+        if name == "reference":
+            variance = np.where(recording.measured, variance, 0.0)
+        used = variance[:, variance.any(axis=0)]
+        if np.ptp(used, axis=1).max(initial=0.0) <= 1e-9 * used.max(initial=0.0):  # alike on all axes, so in any frame
+            parts.append(np.repeat(used[:, :1], problem.axes, axis=1))
+            continue
+        to_compared = problem.to_compared(recording, grid.bin_time, of_dvl=name == "dvl")
+        turned = to_compared if rotation is None else rotation[at] @ to_compared
+        parts.append((turned**2 @ variance[:, :, None])[:, :, 0])
+    return np.asarray(0.5 * np.log(np.maximum(np.concatenate(parts), 1e-12)))
+
+
+def stretches_of(problem: Problem) -> NDArray[np.intp]:
+    """(M,) index of the stretch of time of each bin."""
+    index = np.floor(problem.time / STRETCH_S).astype(int)
+    keys = problem.recording_of * (int(np.ptp(index)) + 1) + index - index.min()
+    return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)

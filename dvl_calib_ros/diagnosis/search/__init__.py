@@ -1,0 +1,1 @@
+"""The search for effects: candidates, selection, elimination, identifiability."""

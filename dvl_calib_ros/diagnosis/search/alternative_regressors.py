@@ -1,0 +1,97 @@
+"""A dictionary of what a vehicle's error could follow: functions of its motion, or of time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...calibration.numerics.frames import Array
+from ...effects.recursion import recursion
+from ..model.forward_model import Problem
+from ..model.seen import Seen
+from ..model.time_grid import Grid
+
+TIME_KNOTS = 7
+SPEED_KNOTS = 7
+STEPS = 11
+# Time constants, s, in which a turn may go on acting
+FADES_S = (4.0, 12.0, 40.0)
+# rad/s from which the vehicle is in a turn, whose side may stay until the next
+TURNING_RADPS = float(np.deg2rad(2.0))
+# Of these one function is enough, and is looked for by itself, or so many: a cosine and its sine
+ALTERNATIVES = {"a step in time": 1, "a band of speeds": 1, "turns before": 1, "heading": 2}
+HEADING_HARMONICS = 4
+
+
+def dictionary(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
+    """Name -> (M, c) functions of motion or time, without unit."""
+    parts = [_of_motion(grid, each) for grid, each in zip(problem.grids, seen, strict=True)]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
+    motion = seen.motion
+    velocity, speed = motion.velocity_body, motion.speed
+    acceleration = np.gradient(velocity[:, 0], motion.time)
+    typical = max(float(np.median(speed)), 0.1)
+    hats = _hats(motion.time, np.linspace(motion.time[0], motion.time[-1], TIME_KNOTS))
+    s = speed / typical
+    found: dict[str, Array] = {
+        "speed": np.column_stack([np.ones_like(s), s, s**2, s**3, np.maximum(s - 1.0, 0.0)]),
+        "a band of speeds": _hats(
+            speed, np.quantile(speed, 0.01) + np.linspace(0.0, 1.0, SPEED_KNOTS) * _spread(speed)
+        ),
+        "acceleration": np.column_stack([acceleration, np.abs(acceleration)]),
+        "sway and heave": np.column_stack([velocity[:, 1:], np.abs(velocity[:, 1:])]),
+        "time": np.column_stack([hats, hats * s[:, None]]),
+        "a step in time": _steps(motion.time, STEPS),
+    }
+    if motion.rotation_enu_from_body is not None:
+        rotation = motion.rotation_enu_from_body
+        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        roll, pitch = rotation[:, 2, 1], -rotation[:, 2, 0]
+        once = np.column_stack([np.cos(yaw), np.sin(yaw)])
+        more = [wave(n * yaw) for n in range(2, HEADING_HARMONICS + 1) for wave in (np.cos, np.sin)]
+        found["heading"] = np.column_stack([once, once * s[:, None], *more])
+        found["tilt"] = np.column_stack([roll, pitch, np.abs(roll), np.abs(pitch), roll * s, pitch * s])
+        steps = np.clip(np.diff(motion.time, prepend=motion.time[0]), 0.0, 10.0)
+        up = np.einsum("ni,ni->n", rotation[:, 2], velocity)
+        found["depth"] = np.cumsum(up * steps)[:, None]
+    if motion.angular_velocity is not None:
+        rate = motion.angular_velocity
+        turning = rate[:, 2]
+        found["turn rate"] = np.column_stack([turning, np.abs(turning), turning * s, np.abs(turning) * s, turning**2])
+        fading = [faded(motion.time, turning, seconds) for seconds in FADES_S]
+        found["turns before"] = np.column_stack([*fading, _side_of_last_turn(turning)])
+        found["roll and pitch rate"] = np.column_stack([rate[:, :2], np.abs(rate[:, :2])])
+    return {name: grid.averaged(values) for name, values in found.items()}
+
+
+def _spread(speed: Array) -> float:
+    return max(float(np.quantile(speed, 0.99) - np.quantile(speed, 0.01)), 1e-3)
+
+
+def _steps(time: Array, count: int) -> Array:
+    """(N, count) functions that step from zero to one at even parts of the time."""
+    at = np.linspace(time[0], time[-1], count + 2)[1:-1]
+    return (time[:, None] >= at).astype(float)
+
+
+def faded(time: Array, values: Array, seconds: float) -> Array:
+    """(N,) what values (N,) were, fading with a time constant."""
+    steps = np.clip(np.diff(time, prepend=time[0]), 0.0, 10.0)
+    decay = np.exp(-steps / seconds)
+    return recursion(decay, (1.0 - decay) * values)
+
+
+def _side_of_last_turn(turn_rate: Array) -> Array:
+    """(N,) 1 after a turn to port, -1 after one to starboard, 0 before the first."""
+    side = np.where(np.abs(turn_rate) > TURNING_RADPS, np.sign(turn_rate), 0.0)
+    last = np.maximum.accumulate(np.where(side != 0.0, np.arange(len(side)), -1))
+    return np.where(last >= 0, side[np.maximum(last, 0)], 0.0)
+
+
+def _hats(values: Array, knots: Array) -> Array:
+    """Piecewise linear functions (N, knots) that are one at one knot and zero at the others."""
+    return np.column_stack([np.interp(values, knots, row) for row in np.eye(len(knots))])

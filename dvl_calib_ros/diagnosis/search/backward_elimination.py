@@ -1,0 +1,289 @@
+"""A fit without those of its effects that the data does not call for, given all others.
+
+What happens twice: a second time tried beside the first, either tried alone, and what is only taken back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cache, partial
+
+import numpy as np
+
+from ...effects.base import Effect
+from ..fit.gauss_newton import Fit, Fitter
+from ..fit.selection_criteria import (
+    WINDOW_STEPS,
+    best_of,
+    blocks_of,
+    finer_steps,
+    fit_without,
+    log_p_in_place,
+    price,
+    robust_p,
+    step_of_times,
+    times_tried,
+)
+from ..model.hypothesis import Hypothesis, is_time_of_run
+from ..model.settings import SETTINGS
+from .arm_clock_ambiguity import DVL_CLOCK, LAG, TWO_CLOCKS, lag_not_taken_back
+from .candidates import KEPT_VARIANTS
+from .clock_jumps import LEAP, gaps, is_shown_by_stamps
+from .unexplained import Unexplained, matters, unexplained
+
+# A clock that explains less than this share of what two leaps do, and makes them cancel, is not late before them
+LITTLE_OF_LEAPS = 0.02
+
+
+def only_called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+    """A fit without those effects that are not called for given all others, or add next to nothing to a strong one."""
+    threshold = float(np.log(SETTINGS.level / n_effects))
+    while fit.effects:
+        base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
+        explained = base.deviance - fit.deviance
+        rests = [(effect, fit_without(fitter, fit, effect)) for effect in fit.effects]
+        drops = {effect.name: rest.deviance - fit.deviance for effect, rest in rests}
+        left = cache(partial(unexplained, fitter, fit))
+        weak = [
+            rest
+            for effect, rest in rests
+            if log_p_in_place(fitter, fit, rest, effect) > threshold
+            or is_taken_back(fitter, fit, effect.name, drops[effect.name], rest)
+            or _makes_leaps_cancel(fit, effect, drops)
+            or _only_smooths(fitter, fit, rest, effect, drops)
+            or (
+                _is_ghost(effect, drops[effect.name], explained, fit.deviance)
+                and not _is_late_before_a_leap(fit, effect)
+                and not _is_all_that_is_left(fitter, rest, left)
+            )
+        ]
+        if not weak:
+            return fit
+        fit = min(weak, key=lambda each: each.deviance)
+    return fit
+
+
+def _makes_leaps_cancel(fit: Fit, effect: Effect, drops: Mapping[str, float]) -> bool:
+    """Whether an effect is a clock, late before two leaps that cancel with it alone, and little of what they explain.
+
+    drops: deviance that each effect explains, by name.
+    """
+    if effect.name != DVL_CLOCK or LEAP not in fit.values or apart_and_undone(fit, LEAP)[1] > TAKEN_BACK_EXACTLY:
+        return False
+    return drops[DVL_CLOCK] < LITTLE_OF_LEAPS * drops[LEAP]
+
+
+def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect, drops: Mapping[str, float]) -> bool:
+    """Whether an effect is a lag that clocks take back, and explains no more than smoothing does. rest: without it.
+
+    The two leave the motion where it is, but for its corners, and take noise off the DVL. That of a slow one is known
+    by its claims, which may be anything up to its roughness. Of a clock that is late without the lag as well, and
+    explains more than this, what it becomes earlier beside it is meant. drops: as for `_makes_leaps_cancel`.
+    """
+    if effect.name != LAG:
+        return False
+    is_late_itself = max((drops[name] for name in TWO_CLOCKS if name in drops), default=0.0) > drops[LAG]
+    if lag_not_taken_back(fit, rest if is_late_itself else None) >= TAKEN_BACK:
+        return False
+    smoothed = [float(each.own_noise @ each.own_noise) for each in (rest, fit)]
+    more = (smoothed[0] - smoothed[1]) * (fitter.problem.rougher_than_claimed**2 - 1.0)
+    return rest.deviance - fit.deviance - more < MUCH
+
+
+def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:
+    """Whether an effect adds next to nothing to what all of them explain; of what bends an arm, nor to the noise."""
+    if drop > SETTINGS.ghost_share * explained:
+        return False
+    return not effect.bends_arm or drop < SETTINGS.ghost_of_noise * left
+
+
+def _is_all_that_is_left(fitter: Fitter, rest: Fit, left: Callable[[], Unexplained]) -> bool:
+    """Whether a fit without one of its effects (rest) leaves what matters, and with it nothing. left: then.
+
+    What an inexact strong effect leaves has the shape of no other: one takes in a part of it at most.
+    """
+    return matters(fitter.problem, rest, unexplained(fitter, rest)) and not left().found
+
+
+def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:
+    """Whether an effect is that the DVL's clock is late before it leaps, by as much as nothing of the leap could be.
+
+    It tells of the time before the leap alone, which may be short, and so of little of what all of them explain.
+    """
+    if effect.name != DVL_CLOCK or LEAP not in fit.values:
+        return False
+    late, leap = fit.values[effect.name], fit.values[LEAP]
+    return any(
+        abs(own["seconds"]) > TAKEN_BACK * max(abs(each["seconds"]), abs(each.get("again_seconds", 0.0)))
+        for own, each in zip(late, leap, strict=True)
+    )
+
+
+def without_nothing(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+    """A fit without those effects that explain, under the noise as it is known now, no more than chance does.
+
+    At one speed a quadratic scale and the scale go anywhere together, and what noise of the DVL that makes is all they
+    explain.
+    """
+    while fit.effects:
+        rests = [
+            (rest := fit_without(fitter, fit, effect), log_p_in_place(fitter, fit, rest, effect))
+            for effect in fit.effects
+        ]
+        worst, log_p = max(rests, key=lambda each: each[1])
+        if log_p < -float(np.log(n_effects)):
+            return fit
+        fit = worst
+    return fit
+
+
+def only_borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+    """A fit without effects that the scatter of the blocks does not bear out, whatever the noise's colour."""
+    block = blocks_of(fitter.problem)
+    while fit.effects:
+        p_values = {effect.name: robust_p(fit, effect, block) for effect in fit.effects}
+        worst = max(p_values, key=lambda name: p_values[name])
+        if p_values[worst] < SETTINGS.robust_level:
+            return fit
+        fit = fit_without(fitter, fit, next(effect for effect in fit.effects if effect.name == worst))
+    return fit
+
+
+def once_where_borne_out(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
+    """A fit in which what happens twice happens once, where the scatter of the blocks does not bear out the other."""
+    block = blocks_of(fitter.problem)
+    for effect in fit.effects:
+        own = {spec.name for spec in effect.parameters}
+        if not effect.again or not effect.again.keys() <= own:
+            continue
+        doubtful = {
+            each.spec.name
+            for each in fit.hypothesis.parameters_of(effect)
+            if robust_p(fit, effect, block, each.spec.name) >= SETTINGS.robust_level
+        }
+        starts = either_alone(fit, effects[effect.name], every[effect.name], clear=own - doubtful)
+        found = [fitter.refined(fitter.fit(start, fit.noise), finer_steps(fitter.problem)) for start in starts]
+        return min(found, key=lambda each: each.deviance, default=fit)
+    return fit
+
+
+# Standard deviations from which on a second time that something happens stands without being tried without
+CLEAR = 6.0
+# What is taken back but for this share of it, or within a step of the grid, may be anything that is there for a while
+TAKEN_BACK = 0.25
+# (taken back exactly: but for this one), where it explains less than this much or an unknown cause in its place more
+TAKEN_BACK_EXACTLY, MUCH = 0.05, 150.0
+
+
+def happening_again(
+    fitter: Fitter, fits: Sequence[Fit], every: Mapping[str, Effect], effects: Mapping[str, Effect]
+) -> list[Fit]:
+    """Of what may happen twice, the best fit in which it happens once with a second time, where that promises to be
+    worth it, and the best in which it happens twice with either alone, where the other is small.
+
+    every: effects with what they are the second time. Several recordings share their times, which two of a day do not.
+    """
+    found: list[Fit] = []
+    if len(fitter.problem.recordings) > 1:
+        return found
+    for name, whole in every.items():
+        own = [fit for fit in fits if whole.again and name in fit.values]
+        if not own:
+            continue
+        best = best_of(own, effects)
+        if whole.again.keys() <= best.values[name][0].keys():
+            starts = either_alone(best, effects[name], whole)
+        else:
+            n = len(best.seen)
+            once, twice = (price(each, len(effects), n, times_tried(each)) for each in (effects[name], whole))
+            limit = best.deviance + once - twice
+            starts = _a_second_time(fitter, best, whole, limit)
+        tried = [fitter.fit(start, best.noise) for start in starts]
+        found += [fit for fit in tried if not is_taken_back(fitter, fit, name, best.deviance - fit.deviance)]
+    return found
+
+
+def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> list[Hypothesis]:
+    """The likeliest starts with a second time, one straight step about a fit, in the order of time, that are to leave
+    less deviance than a limit."""
+    others = [effect for effect in fit.effects if effect.name != whole.name]
+    (again,) = (spec.name for spec in whole.parameters if spec.name in whole.again and is_time_of_run(spec))
+    seconds = max(recording.seconds for recording in fitter.problem.recordings)
+    left = fit.deviance - fitter.straight_on(fit, fit.hypothesis)[0]
+    tried = []
+    times = np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist()
+    if whole.name == LEAP:
+        times += [at for at, _ in gaps(fitter, fit)]
+    for at in times:
+        values = tuple({**whole.defaults, **each, again: at} for each in fit.values[whole.name])
+        start = fit.hypothesis.with_effects([*others, whole], len(values), {whole.name: values})
+        misfit, start = fitter.straight_on(fit, start)
+        if misfit + left > limit:
+            continue
+        if at < values[0][whole.again[again]]:
+            names = {**whole.again, **{first: second for second, first in whole.again.items()}}
+            values = tuple({names[key]: value for key, value in each.items()} for each in start.values[whole.name])
+            start = start.with_effects(start.effects, len(values), {whole.name: values})
+        tried.append((misfit, start))
+    return [start for _, start in sorted(tried, key=lambda each: each[0])[:KEPT_VARIANTS]]
+
+
+def either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] | None = None) -> list[Hypothesis]:
+    """What happens twice in a fit, as the first alone and as the second, each where the other is not clear.
+
+    clear: names of the parameters that are; by default those many standard deviations large.
+    """
+    if clear is None:
+        std = np.sqrt(np.diag(fit.system.covariance()))
+        clear = {
+            each.spec.name
+            for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
+            if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > CLEAR * own
+        }
+    clear = {name for name in clear if not any(is_time_of_run(s) for s in whole.parameters if s.name == name)}
+    others = [effect for effect in fit.effects if effect.name != whole.name]
+    back = {first: second for second, first in whole.again.items()}
+    starts = []
+    for kept, out in (({first: first for first in back}, set(whole.again)), (back, set(back))):
+        if not out & clear:
+            values = tuple({first: each[name] for first, name in kept.items()} for each in fit.values[whole.name])
+            starts.append(fit.hypothesis.with_effects([*others, once], len(values), {whole.name: values}))
+    return starts
+
+
+def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | None = None) -> bool:
+    """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording.
+
+    drop: deviance that it explains. What explains much may be undone where an unknown cause in its place (rest: without
+    it) explains less. That is asked of what explains more than such causes do unseen only if it is undone exactly. A
+    clock that is set back and then put right shows that by its stamps.
+    """
+    apart, share = apart_and_undone(fit, name)
+    if apart < step_of_times(fitter.problem):
+        return True
+    if share >= TAKEN_BACK or (name == LEAP and is_shown_by_stamps(fitter, fit)):
+        return False
+    if drop < MUCH:
+        return True
+    if rest is None or (drop > SETTINGS.instead_of and share >= TAKEN_BACK_EXACTLY):
+        return False
+    other = unexplained(fitter, rest)
+    return other.clear_energy - other.price > drop
+
+
+def apart_and_undone(fit: Fit, name: str) -> tuple[float, float]:
+    """How far (s) the second time that something happens in a fit is from the first, and what share is not undone by
+    it, of the larger; the most of all recordings. Infinite where it cannot happen twice."""
+    effect = next(each for each in fit.effects if each.name == name)
+    own = {spec.name: spec for spec in effect.parameters}
+    if not effect.again or not effect.again.keys() <= own.keys():
+        return np.inf, np.inf
+    apart, share = [], []
+    for second, first in effect.again.items():
+        for values in fit.values[name]:
+            if is_time_of_run(own[second]):
+                apart.append(values[second] - values[first])
+            else:
+                largest = max(abs(values[first]), abs(values[second]), 1e-12)
+                share.append(abs(values[first] + values[second]) / largest)
+    return max(apart), max(share)

@@ -1,0 +1,323 @@
+"""What is worth fitting, about a fit: combinations of effects by straight lines, and what says the same otherwise.
+
+About a fit, every effect's derivatives make one Gram matrix, in which all combinations of up to three effects are small
+least squares problems.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...calibration.numerics.frames import Array
+from ...effects.base import Effect
+from ..fit.gauss_newton import PRIOR_IN_TYPICAL, Fit, Fitter, prior_std
+from ..fit.selection_criteria import price, step_of_times, windows
+from ..model.forward_model import Problem
+from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, no_effect
+from ..model.settings import SETTINGS
+from ..noise.noise_model import Noise
+from ..noise.whitened_least_squares import WhitenedLeastSquares
+from .arm_clock_ambiguity import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
+from .clock_jumps import LEAP
+
+# Effects from which combinations of three are made; proposals fitted in one round, and how much worse than the best
+SHORTLIST, FITTED, NOT_WORTH_IT = 12, 7, 40.0
+# Of these, places of what adds most: beside seconds of a clock all others explain more by themselves than a drift adds
+ADDING_MOST = 4
+# How many times of the run are kept of an effect that comes and goes
+KEPT_VARIANTS = 2
+# Standard deviation of noise over that of its innovations, from which on it has a memory to speak of
+WITH_A_MEMORY = 1.2
+# Share of its squares, up to which what is left is noise of another kind
+MOST_OF_NOISE = 0.5
+
+
+@dataclass(frozen=True)
+class Variant:
+    """An effect with its times of the run. tried: how many there are of its kind."""
+
+    effect: Effect
+    values: tuple[Values, ...]
+    columns: Array
+    tried: float
+
+    @property
+    def p(self) -> int:
+        """Number of columns."""
+        return self.columns.shape[2]
+
+    @property
+    def comes_and_goes(self) -> bool:
+        """Whether it is there for a part of the run only."""
+        times = [spec.name for spec in self.effect.parameters if is_time_of_run(spec)]
+        return any(each[name] != self.effect.defaults[name] for each in self.values for name in times)
+
+
+@dataclass(frozen=True)
+class StraightLines:
+    """Everything that can be combined, in one Gram matrix. blocks: columns of each variant."""
+
+    variants: list[Variant]
+    blocks: list[NDArray[np.intp]]
+    system: WhitenedLeastSquares
+
+    def drop(self, chosen: Sequence[int]) -> float:
+        """Misfit that a combination leaves."""
+        part = self.system.part(np.concatenate([np.arange(6), *(self.blocks[index] for index in chosen)]))
+        return part.misfit(part.solution())
+
+
+def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """Hypotheses worth fitting, by their straight lines about a fit; the fit's own among them."""
+    table, worth = _worth(fitter, fit, effects)
+    own = tuple(range(len(fit.effects)))
+    return [
+        *(combined(fitter, fit, table, chosen) for chosen in (worth if own in worth else [*worth, own])),
+        *told_by_other_clocks(fitter, fit, effects),
+        *_told_by_a_lag(fit, effects),
+    ]
+
+
+def coming_and_going(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """The best with effects that come and go, as they would be if the noise were white.
+
+    Noise with a memory takes in what a wrong time leaves, and of times on a grid the least wrong ones are no better.
+    Only such as are the most of it: of noise that has a memory by itself they would always explain some.
+    """
+    if max(arma.ratio for arma in fit.noise.axes) < WITH_A_MEMORY:
+        return []
+    fit = replace(fit, noise=fit.noise.white)
+    table, worth = _worth(fitter, fit, effects)
+    own = len(fit.effects)
+    most = MOST_OF_NOISE * table.drop(range(own))
+    come = [
+        chosen
+        for chosen in worth
+        if any(i >= own and table.variants[i].comes_and_goes for i in chosen) and table.drop(chosen) < most
+    ]
+    return [combined(fitter, fit, table, chosen) for chosen in come[:KEPT_VARIANTS]]
+
+
+def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[StraightLines, list[tuple[int, ...]]]:
+    """The straight lines about a fit, and which variants of them are worth fitting together, the best first."""
+    table = straight_lines(fitter, fit, effects)
+    n = len(fitter.problem.recordings)
+    cost = [price(v.effect, len(effects), n, v.tried) for v in table.variants]
+    own = list(range(len(fit.effects)))
+    usable = _shortlisted(table, own, cost)
+    scored: list[tuple[float, tuple[int, ...]]] = []
+    for size in range(SETTINGS.max_effects):
+        for chosen in itertools.combinations(usable, size):
+            names = {table.variants[index].effect.name for index in chosen}
+            if len(names) == size:
+                scored.append((table.drop(chosen) + sum(cost[index] for index in chosen), chosen))
+    scored.sort()
+    for _, chosen in scored[:3]:  # and one more on top of the best
+        names = {table.variants[index].effect.name for index in chosen}
+        scored += [
+            (table.drop((*chosen, index)) + sum(cost[i] for i in (*chosen, index)), (*chosen, index))
+            for index in usable
+            if table.variants[index].effect.name not in names and len(chosen) < SETTINGS.max_effects
+        ]
+    scored.sort()
+    scored = [each for each in scored if _is_told_by_two_clocks(table, each[1])]
+    worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
+    if not any(_is_possible(table, chosen) for chosen in worth):  # lines are straight no more: the likely is tried too
+        worth += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
+    return table, worth
+
+
+def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Variant]:
+    """Of every effect that is not in the fit, its columns about the fit, at every window that is tried."""
+    problem, present = fitter.problem, {effect.name for effect in fit.effects}
+    n = len(problem.recordings)
+    seconds = max(recording.seconds for recording in problem.recordings)
+    found = []
+    for effect in effects.values():
+        if effect.name in present:
+            continue
+        parts = windows(effect, seconds)
+        for part in parts:
+            values = (effect.defaults | part,) * n
+            columns = problem.columns(fit.hypothesis, fit.seen, effect, values)
+            tried = 1.0 if len(parts) == 1 else 2.0 if part is parts[0] and len(part) > 1 else 2.0 * len(parts)
+            found.append(Variant(effect, values, columns, tried))
+    return found
+
+
+def straight_lines(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> StraightLines:
+    """The effects of a fit, first and in its order, and every other at every time that is tried."""
+    problem, noise, hypothesis = fitter.problem, fit.noise, fit.hypothesis
+    own: list[Variant] = []
+    at = 6
+    for effect in fit.effects:
+        p = len(hypothesis.parameters_of(effect))
+        own.append(Variant(effect, hypothesis.values[effect.name], fit.columns[:, :, at : at + p], 1.0))
+        at += p
+    variants = [*own, *variants_about(fitter, fit, effects)]
+    # the residual as it would be without the fit's effects, as far as straight lines tell
+    vector = hypothesis.vector()
+    defaults = [0.0] * 6 + [each.spec.default for each in hypothesis.parameters()]
+    target = -(fit.residual - fit.columns @ (vector - np.array(defaults)))
+    blocks, start = [], 6
+    for variant in variants:
+        blocks.append(np.arange(start, start + variant.p))
+        start += variant.p
+    columns = np.concatenate([fit.columns[:, :, :6], *(variant.columns for variant in variants)], axis=2)
+    n = len(problem.recordings)
+    std = np.concatenate([prior_std(no_effect()), *(_std(variant.effect, variant.p, n) for variant in variants)])
+    system = WhitenedLeastSquares(_gram(problem, noise, columns, target), std, np.zeros_like(std))
+    return StraightLines(variants, blocks, system)
+
+
+def _gram(problem: Problem, noise: Noise, columns: Array, target: Array) -> Array:
+    """(n + 1, n + 1) of whitened columns (M, A, n) and target (M, A): the sum of those of each recording, in which what
+    is the day's of all others is zero."""
+    total = np.zeros((columns.shape[2] + 1,) * 2)
+    for rows in problem.rows_of:
+        own, of_it = columns[rows], noise.part(rows)
+        has = np.asarray(own.any(axis=(0, 1)))
+        if not has.any():
+            has[:] = True
+        white = of_it.whiten(own if has.all() else own[:, :, has])
+        here, none = np.flatnonzero(np.append(has, True)), np.zeros(white.shape[1])
+        total[np.ix_(here, here)] += WhitenedLeastSquares.of(white, of_it.whiten(target[rows]), none, none).gram
+    return total
+
+
+def _std(effect: Effect, p: int, n_recordings: int) -> Array:
+    sizes = [PRIOR_IN_TYPICAL * s.typical for s in effect.parameters if not is_time_of_run(s)]
+    return np.array(sizes * (p // len(sizes)))
+
+
+def _shortlisted(table: StraightLines, own: Sequence[int], cost: Sequence[float]) -> list[int]:
+    """Variants that promise most, alone or on top of the fit's own; all of the fit's own."""
+    alone, none = table.drop(own), table.drop([])
+    gains: dict[int, float] = {}
+    adds: dict[int, float] = {}
+    for index in range(len(table.variants)):
+        if index in own:
+            continue
+        by_itself = none - table.drop([index]) - cost[index]
+        adds[index] = alone - table.drop([*own, index]) - cost[index]
+        instead = max(
+            (table.drop([i for i in own if i != out]) - table.drop([*(i for i in own if i != out), index]) - cost[index]
+             for out in own),
+            default=-np.inf,
+        )  # fmt: skip
+        # of what explains much by itself, strong effects make all look alike: what it adds counts more
+        gains[index] = max(adds[index], 0.1 * instead, 0.01 * by_itself)
+    kept: list[int] = []
+    of_effect: dict[str, int] = {}
+    most = sorted((i for i in adds if adds[i] > 0.0), key=lambda i: -adds[i])
+    for places, ranked in ((ADDING_MOST, most), (SHORTLIST, sorted(gains, key=lambda i: -gains[i]))):
+        for index in ranked:
+            name = table.variants[index].effect.name
+            if index not in kept and of_effect.get(name, 0) < KEPT_VARIANTS and len(kept) < places:
+                kept.append(index)
+                of_effect[name] = of_effect.get(name, 0) + 1
+    return [*own, *kept]
+
+
+def combined(fitter: Fitter, fit: Fit, table: StraightLines, chosen: Sequence[int]) -> Hypothesis:
+    """A combination with the values that the table gives it to start from; effects of the fit start at theirs."""
+    part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
+    solution = part.solution()[6:]
+    n = len(fitter.problem.recordings)
+    start: dict[str, tuple[Values, ...]] = {}
+    at = 0
+    for index in chosen:
+        variant = table.variants[index]
+        step = solution[at : at + variant.p]
+        at += variant.p
+        if variant.effect in fit.effects:
+            start[variant.effect.name] = variant.values
+            continue
+        empty = no_effect().with_effects([variant.effect], n, {variant.effect.name: variant.values})
+        moved = empty.moved(np.concatenate([np.zeros(6), step]))
+        start[variant.effect.name] = moved.values[variant.effect.name]
+    effects = [table.variants[index].effect for index in chosen]
+    return fit.hypothesis.with_effects(effects, n, start)
+
+
+def _is_possible(table: StraightLines, chosen: Sequence[int]) -> bool:
+    """Whether straight lines put every parameter of a combination within its bounds."""
+    part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
+    variants = [table.variants[index] for index in chosen]
+    specs = [
+        spec
+        for variant in variants
+        for spec in amplitudes(variant.effect) * (variant.p // len(amplitudes(variant.effect)))
+    ]
+    return all(spec.low < x < spec.high for spec, x in zip(specs, part.solution()[6:].tolist(), strict=True))
+
+
+def _is_told_by_two_clocks(table: StraightLines, chosen: Sequence[int]) -> bool:
+    """Of three clocks only two differences matter: what any two say is told by those of DVL and reference."""
+    names = {table.variants[index].effect.name for index in chosen}
+    return ATTITUDE_CLOCK not in names or len(names & set(CLOCKS)) == 1
+
+
+def told_by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """The fit's offsets said by fewer clocks, and by all that can say them: for large ones no straight line would.
+
+    A leap at the beginning is a DVL's clock that is late throughout.
+    """
+    n, values = len(fit.seen), fit.values
+    said = (*CLOCKS, LEAP) if leaps_at_the_beginning(fitter, fit) else CLOCKS
+    if not set(said) & set(values):
+        return []
+    dvl, reference, attitude = (
+        np.array([each["seconds"] for each in values[name]]) if name in values else np.zeros(n) for name in CLOCKS
+    )
+    dvl, reference = dvl - attitude, reference - attitude
+    if LEAP in said:
+        dvl = dvl + [each["seconds"] for each in values[LEAP]]
+    rest = [effect for effect in fit.effects if effect.name not in said]
+    told = [
+        {ATTITUDE_CLOCK: -0.5 * (dvl + reference)}, {DVL_CLOCK: dvl - reference}, {REFERENCE_CLOCK: reference - dvl},
+        {DVL_CLOCK: dvl, REFERENCE_CLOCK: reference},
+    ]  # fmt: skip
+    found = []
+    for one in told:
+        if set(one) <= set(effects) and len(rest) + len(one) <= SETTINGS.max_effects:
+            start: dict[str, tuple[Values, ...]] = _at_other_times(fit, rest, dvl + attitude - one.get(DVL_CLOCK, 0.0))
+            start |= {name: tuple({"seconds": float(s)} for s in seconds) for name, seconds in one.items()}
+            found.append(fit.hypothesis.with_effects([*rest, *(effects[name] for name in one)], n, start))
+    return found
+
+
+def _at_other_times(fit: Fit, effects: Sequence[Effect], later: Array) -> dict[str, tuple[Values, ...]]:
+    """Values of effects that come and go, all that happens being later by so many seconds (of each recording)."""
+    found: dict[str, tuple[Values, ...]] = {}
+    for effect in effects:
+        times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
+        per = zip(fit.values[effect.name], later.tolist(), strict=True)
+        if times:  # what is there from the beginning goes on being so
+            found[effect.name] = tuple(
+                {**each, **{name: max(each[name] + by, 0.0) if each[name] else 0.0 for name in times}}
+                for each, by in per
+            )
+    return found
+
+
+def _told_by_a_lag(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """The fit with a lag of the reference for its delay, or the other way round."""
+    rest = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
+    return [
+        fit.hypothesis.with_effects([*rest, *(effects[name] for name in start)], len(fit.seen), start)
+        for start in lags_and_delays(fit, effects)
+    ]
+
+
+def leaps_at_the_beginning(fitter: Fitter, fit: Fit) -> bool:
+    """Whether there is one leap, and before the first of the times that are tried for it."""
+    leaps = fit.values.get(LEAP, ())
+    first = step_of_times(fitter.problem)
+    twice = any(np.isfinite(leap.get("again_at_s", np.inf)) for leap in leaps)
+    return bool(leaps) and not twice and all(leap["at_s"] < first for leap in leaps)

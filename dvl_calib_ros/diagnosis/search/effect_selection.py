@@ -1,0 +1,380 @@
+"""Which effects the data calls for.
+
+Columns propose: about the best fit so far, every effect's derivatives make one Gram matrix, in which all combinations
+of up to three effects are small least squares problems. The composed model decides: the best proposals are fitted in
+it until they stand still, and compared by what they explain less what so many parameters explain by chance. About the
+winner it is asked again, with the noise that is left by everything together: so that no effect is taken for noise.
+
+A heading that is wrong, where several recordings of one vehicle disagree in yaw.
+
+A constant error of a heading is not told from the DVL's mounting: the same heading navigates. One that swings once or
+twice around with the heading (magnetised iron, and iron that takes on the earth's field) or drifts looks like a
+mounting that moves, or that has moved between recordings on other headings. A compass does that every day and a
+mounting hardly ever, so it is named first: but where the same heading on another day contradicts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import numpy as np
+
+from ...calibration.numerics.frames import Array
+from ...effects.base import Effect
+from ..fit.gauss_newton import Fit, Fitter
+from ..fit.selection_criteria import best_of, criterion, finer_steps, price_of_a_time
+from ..model.forward_model import Problem, make_problem
+from ..model.hypothesis import Hypothesis, Values, is_time_of_run, no_effect
+from ..model.recorded_streams import RecordedStreams
+from ..model.settings import SETTINGS
+from ..noise.noise_level import estimated
+from ..noise.noise_model import Noise, white_noise
+from ..noise.whitened_least_squares import WhitenedLeastSquares
+from .arm_clock_ambiguity import ARM, TWO_CLOCKS, OpenArm, guessed_arm
+from .backward_elimination import (
+    happening_again,
+    is_taken_back,
+    once_where_borne_out,
+    only_borne_out,
+    only_called_for,
+    without_nothing,
+)
+from .candidates import coming_and_going, leaps_at_the_beginning, proposed, told_by_other_clocks, variants_about
+from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, leaping, told_by_stamps
+from .identifiability import Selected, tell_apart
+from .initial_guess import FirstGuess, first_guess, guess_beside
+from .observable_parameters import shown_parts, unshown_parts, without_faint
+from .slow_stream_outliers import without_contradicted
+from .unexplained import unexplained
+
+# What a vehicle with a gap has most often; the first fit starts with all of these
+START = (ARM, "dvl_time_offset", "reference_time_offset")
+ROUNDS = 4
+# Fits with outliers drawn in about the one before, from the first guess on
+ROBUST_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class EffectSelection:
+    """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
+    fitter; guesses per recording; the effects there were, with what of each is shown. opened: at one speed.
+    moved: by part of the lever arm, by how much (m) it is another where another clock explains the data as well.
+    """
+
+    selected: tuple[Selected, ...]
+    base: Fit
+    fit: Fit
+    fitter: Fitter
+    guesses: tuple[FirstGuess, ...]
+    testable: Mapping[str, Effect]
+    opened: OpenArm | None = None
+    moved: Mapping[str, float] = field(default_factory=dict)
+
+    def without(self, names: Collection[str]) -> EffectSelection:
+        """Without some effects, the others fitted anew."""
+        kept = [effect for effect in self.fit.effects if effect.name not in names]
+        hypothesis = self.fit.hypothesis.with_effects(kept, len(self.fit.seen), {})
+        selected = tuple(each for each in self.selected if each.effect.name not in names)
+        return replace(self, selected=selected, fit=self.fitter.fit(hypothesis, self.fit.noise))
+
+    def withdrawn(self) -> EffectSelection:
+        """Without any effect."""
+        return replace(self, selected=(), fit=self.base, opened=None, moved={})
+
+
+def started(
+    recordings: Sequence[RecordedStreams],
+    rotation_dvl_from_body: Array,
+    lever_arm: Array,
+    effects: Mapping[str, Effect],
+) -> tuple[Problem, Hypothesis, tuple[FirstGuess, ...], dict[str, Effect]]:
+    """The problem about the first guess of each recording, a hypothesis with what it holds, the guesses, and effects
+    with what of each is shown."""
+    guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
+    problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
+    every, effects = effects, shown_parts({name: effect.once for name, effect in effects.items()}, problem)
+    problem = replace(problem, unshown=unshown_parts(every, effects))
+    found: dict[str, tuple[Values, ...]] = {
+        ARM: (guessed_arm(guesses, effects),) * len(guesses),
+        "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
+        "reference_time_offset": tuple({"seconds": guess.offsets.reference} for guess in guesses),
+    }
+    present = [effects[name] for name in START if name in effects]
+    phi = problem.shown_turns @ np.median([guess.phi for guess in guesses], axis=0)
+    start = no_effect(phi).with_effects(present, len(guesses), found)
+    return problem, start, guesses, effects
+
+
+def select(
+    recordings: Sequence[RecordedStreams],
+    rotation_dvl_from_body: Array,
+    lever_arm: Array,
+    effects: Mapping[str, Effect],
+) -> EffectSelection:
+    """Select among testable effects."""
+    heading = effects.get(HEADING)
+    effects = every = {name: effect.usual for name, effect in effects.items()}  # what is not shown is no noise either
+    problem, start, guesses, effects = started(recordings, rotation_dvl_from_body, lever_arm, effects)
+    fitter, fit = _first_fit(problem, start)
+    kept = without_contradicted(problem, fit.hypothesis)
+    if kept is not None:
+        problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
+        problem = replace(problem, unshown=fitter.problem.unshown)
+        fitter, fit = _first_fit(problem, fit.hypothesis)
+    fitter, fit = _about(fitter, fit, every)
+    far = fitter.bursts(fit)
+    if far.any():
+        problem = problem.without(far)
+        fitter, fit = _about(*_first_fit(problem, fit.hypothesis), every)
+    best = fit
+    seen_before: set[frozenset[str]] = set()
+    for _ in range(ROUNDS):
+        candidates = [*proposed(fitter, fit, effects), *with_two_cycles(fitter, fit, heading)]
+        fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
+        leapt = [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
+        fits += [each for each in leapt if not is_taken_back(fitter, each, LEAP, fit.deviance - each.deviance)]
+        fits += happening_again(fitter, fits, every, effects)
+        finer = finer_steps(problem)
+        for hypothesis in coming_and_going(fitter, fit, effects):
+            as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
+            fits.append(fitter.fit(as_white.hypothesis, fit.noise))
+        fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
+        best = fitter.refined_as_white(fitter.refined(best_of(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
+        best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))
+        best = only_called_for(fitter, best, len(effects))
+        fitter, fit = _leapt_where_stamps_say_so(*_about(fitter, best, every), every, effects)
+        names = frozenset(effect.name for effect in fit.effects)
+        if names in seen_before:
+            break
+        seen_before.add(names)
+    fit = only_borne_out(fitter, only_called_for(fitter, fit, len(effects)), len(effects))
+    fit = in_gaps(fitter, once_where_borne_out(fitter, fit, every, effects))
+    fit = _by_fewer_clocks(fitter, fit, effects)
+    fitter, fit = _about(fitter, fit, every)
+    fit = without_nothing(fitter, fit, len(effects))
+    fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
+    fit, alike = heading_first(fitter, fit, heading)
+    guesses = _beside_moving_clocks(fitter, fit, guesses)
+    told = tell_apart(fitter, fit, guesses, effects, alike)
+    base = fitter.fit_kept(told.fit.hypothesis.with_effects([], len(recordings), {}), told.fit.noise)
+    return EffectSelection(told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved)
+
+
+def _beside_moving_clocks(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess]) -> tuple[FirstGuess, ...]:
+    """Guesses of recordings whose DVL's clock leaps or drifts in a fit once more, with that taken off."""
+    problem, found = fitter.problem, list(guesses)
+    for number, recording in enumerate(problem.recordings):
+        moved = [each for each in fit.hypothesis.injections(number) if each.effect.name in MOVING_CLOCK]
+        if moved:
+            again = guess_beside(recording, moved, problem.rotation_dvl_from_body, problem.lever_arm)
+            found[number] = again or found[number]
+    return tuple(found)
+
+
+def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
+    """Robust fit of the first hypothesis, with white noise as large as the best fit so far leaves."""
+    fitter = Fitter(problem)
+    _, residual = fitter.evaluated(start)
+    fit = fitter.fit(start, white_noise(residual, problem.segments, None, problem.interval))
+    for _ in range(ROBUST_ROUNDS):
+        raw = fit.residual + fitter.outliers
+        noise = white_noise(raw, problem.segments, None, problem.interval)
+        fitter = Fitter(problem, raw - noise.robust(raw))
+        fit = fitter.fit(fit.hypothesis, noise)
+    return fitter, fit
+
+
+def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit]:
+    """A fit once more with the noise that everything together leaves, and outliers about that."""
+    problem = fitter.problem
+    columns = _always_there(fitter, fit, effects)
+    noise = fit.noise
+    raw = fit.residual + fitter.outliers
+    size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
+    columns = columns / size
+    own = [
+        np.concatenate([each / size - columns, (residual - raw)[:, :, None]], axis=2)
+        for each, residual in _shaken(fitter, fit, effects)
+    ]
+    for _ in range(2):
+        explained, std = _explained(noise, columns, raw - fitter.outliers, own)
+        left = raw - explained
+        noise, robust = min(
+            (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in _frames(problem)),
+            key=lambda each: each[0].deviance(each[1]),
+        )
+        fitter = Fitter(problem, left - robust)
+    return fitter, fitter.fit(fit.hypothesis, noise)
+
+
+def _always_there(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Array:
+    """(M, A, p) columns of a fit, and of every other effect that is there from the beginning to the end."""
+    others = {name: effect for name, effect in effects.items() if not any(map(is_time_of_run, effect.parameters))}
+    return np.concatenate([fit.columns, *(each.columns for each in variants_about(fitter, fit, others))], axis=2)
+
+
+def _shaken(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator[tuple[Array, Array]]:
+    """The same columns (M, A, p), and the residual (M, A), with made-up noise in one velocity and then in the other."""
+    for problem in fitter.problem.shaken:
+        other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
+        again = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
+        yield _always_there(other, again, effects), problem.residual(seen)
+
+
+def _frames(problem: Problem) -> list[Array | None]:
+    return [None] if problem.earth_from_compared is None else [problem.earth_from_compared, None]
+
+
+def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Array]) -> tuple[Array, Array]:
+    """(M, A) what all columns of unit size explain of a residual, with a ridge that keeps those apart that are alike;
+    and that ridge, (p,).
+
+    own: (M, A, p + 1) each, what the velocities' own noise makes in columns and residual, which is taken off: they
+    would explain that of the residual by that in them, and what then is left is slower than any noise.
+    """
+    white = noise.whiten(columns)
+    ridge = np.full(columns.shape[2], 10.0 * np.sqrt(float((noise.whiten(residual) ** 2).sum())) / np.sqrt(len(white)))
+    system = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge))
+    of_noise = sum((joined.T @ joined for joined in map(noise.whiten, own)), np.zeros_like(system.gram))
+    return np.asarray(columns @ system.solution_without(of_noise)), ridge
+
+
+def _leapt_where_stamps_say_so(
+    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
+) -> tuple[Fitter, Fit]:
+    """A fit, or the same with the leaps that the stamps show, each with the noise about it, by their likelihoods.
+
+    Under the noise about a fit without it, what a leap leaves is noise.
+    """
+    fits = [fitter.fit(hypothesis, fit.noise) for hypothesis in told_by_stamps(fitter, fit, effects, every)]
+    if not fits:
+        return fitter, fit
+    leapt = _about(fitter, best_of(fits, effects), every)
+    likely, other = (each.noise.deviance(each.residual) for each in (leapt[1], fit))
+    prices = [criterion(each, len(effects)) - each.deviance for each in (leapt[1], fit)]
+    return leapt if likely + prices[0] < other + prices[1] else (fitter, fit)
+
+
+def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
+    """A fit with two clocks, or the same told by one of the three: what else it holds was only tried with the two."""
+    if not set(TWO_CLOCKS) <= set(fit.values) and not leaps_at_the_beginning(fitter, fit):
+        return fit
+    others = [
+        fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in told_by_other_clocks(fitter, fit, effects)
+    ]
+    if others and leaps_at_the_beginning(fitter, fit):  # a clock that is late throughout has no time to choose
+        throughout = best_of(others, effects)
+        if throughout.deviance < fit.deviance + price_of_a_time(effects[LEAP], len(effects)):
+            return throughout
+    return best_of([fit, *others], effects)
+
+
+def _with_what_is_shown_of_the_arm(
+    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
+) -> tuple[Fitter, Fit, Mapping[str, Effect]]:
+    """A fit with that part of the lever arm that it shows, and the effects with no more than that of it.
+
+    every: effects with all that they have; effects: with what columns alone show.
+    """
+    arm = without_faint(fitter.problem, fit)
+    if arm is not None:
+        effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
+        values = tuple(dict(each) for each in fit.values[ARM])  # what is not said of it is held where it is
+        hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
+        fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
+    whole = _with_all_of_the_arm(fitter, fit, every, effects)
+    return (fitter, fit, effects) if whole is None else (*whole, {**effects, ARM: every[ARM]})
+
+
+def _with_all_of_the_arm(
+    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
+) -> tuple[Fitter, Fit] | None:
+    """A fit with the whole lever arm, where that part which is not shown is so large that it is what is left, with the
+    noise about that; else None.
+
+    every: effects with all that they have; effects: with what is shown.
+    """
+    if ARM not in fit.values or effects[ARM].parameters == every[ARM].parameters or not unexplained(fitter, fit).found:
+        return None
+    values = tuple(every[ARM].defaults | dict(each) for each in fit.values[ARM])
+    others = [effect for effect in fit.effects if effect.name != ARM]
+    hypothesis = fit.hypothesis.with_effects([*others, every[ARM]], len(fit.seen), {ARM: values})
+    whole = fitter.fit(hypothesis, fit.noise)
+    if criterion(whole, len(every)) >= criterion(fit, len(every)) or without_faint(fitter.problem, whole) is not None:
+        return None
+    about = _about(fitter, whole, every)
+    return None if unexplained(*about).found else about
+
+
+__all__ = ["EffectSelection", "Selected", "select"]
+
+
+HEADING, MOVED, DRIFT = "heading_error", "mounting_moved", "misalignment_drift"
+# What turns DVL and reference against each other by the heading, by the recording or by the time
+BY_YAW = frozenset({HEADING, MOVED, DRIFT, "water_lock"})
+OF_DRIFT = "rad_per_hour"
+# Deviance that two cycles of a heading must promise to explain, as straight lines tell it, to be fitted
+PROMISING = 20.0
+
+
+def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hypothesis]:
+    """What a fit holds that turns DVL and reference against each other, by a heading of two cycles instead: the same
+    in all recordings, and another in each. Where it holds no such thing, if that promises to explain something.
+
+    heading: with all that is rarer of it; None where it cannot be tested. None of it for a single recording.
+    """
+    if heading is None or len(fit.seen) < 2:
+        return []
+    found = [_instead(fit, BY_YAW, each) for each in _two_cycles(heading)]
+    if BY_YAW & fit.values.keys():
+        return found
+    straight = [fitter.straight_on(fit, each) for each in (fit.hypothesis, *found)]
+    return [each for misfit, each in straight[1:] if misfit < straight[0][0] - PROMISING]
+
+
+def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit, dict[str, str]]:
+    """A fit in which a heading stands for a mounting that moves, if that explains the data as well, and by name what
+    may stand for what is in it."""
+    if heading is None or len(fit.seen) < 2:
+        return fit, {}
+    alike: dict[str, str] = {}
+    if DRIFT in fit.values:
+        own = next((_names(each) for each in fit.effects if each.name == HEADING), frozenset())
+        drifting = heading.without(_names(heading) - own - {OF_DRIFT})
+        found = fitter.fit_kept(_instead(fit, {DRIFT, HEADING}, drifting), fit.noise)
+        if found.deviance < fit.deviance + SETTINGS.indistinguishable:
+            fit = found
+            alike[HEADING] = DRIFT
+    if MOVED in fit.values:
+        of_vehicle, of_day = (
+            fitter.fit_kept(_instead(fit, {MOVED, HEADING}, each), fit.noise) for each in _two_cycles(heading)
+        )
+        if of_vehicle.deviance < fit.deviance + SETTINGS.indistinguishable:
+            return of_vehicle, {HEADING: MOVED}
+        if of_day.deviance < fit.deviance + SETTINGS.indistinguishable:
+            alike[MOVED] = HEADING
+    return fit, alike
+
+
+def _two_cycles(heading: Effect) -> tuple[Effect, Effect]:
+    """The same in all recordings, and another in each."""
+    of_day = heading.without({OF_DRIFT})
+    return of_day.of_the_vehicle, of_day
+
+
+def _names(effect: Effect) -> frozenset[str]:
+    return frozenset(spec.name for spec in effect.parameters)
+
+
+def _instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
+    """The hypothesis of a fit with a heading in place of effects by name."""
+    n = len(fit.seen)
+    none = {name: value for name, value in heading.defaults.items() if name in _names(heading)}
+    own: tuple[Values, ...] = fit.values.get(HEADING, (none,) * n)
+    start = tuple({name: each.get(name, value) for name, value in none.items()} for each in own)
+    if not heading.of_the_day:
+        start = ({name: sum(each[name] for each in start) / n for name in none},) * n
+    rest = [effect for effect in fit.effects if effect.name not in names]
+    return fit.hypothesis.with_effects([*rest, heading], n, {HEADING: start})

@@ -1,0 +1,166 @@
+"""How sure each effect of a fit is, and which others could stand in for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ...calibration.registration.registration import IN_TIME_STD_S
+from ...effects.base import Effect
+from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
+from ..fit.selection_criteria import blocks_of, fit_without, log_p_in_place, log_p_value, robust_p, times_tried
+from ..model.hypothesis import Hypothesis
+from ..model.settings import SETTINGS
+from .arm_clock_ambiguity import (
+    ARM,
+    CLOCKS,
+    LAG,
+    REFERENCE_CLOCK,
+    TWO_CLOCKS,
+    OpenArm,
+    is_open,
+    moved_arm,
+    moved_lag,
+    opened_arm,
+    with_arm,
+    with_clocks,
+)
+from .candidates import combined, straight_lines
+from .initial_guess import FirstGuess
+
+# A clock is late for sure from so many σ of what registration leaves open
+LATER = 2.0
+
+
+@dataclass(frozen=True)
+class Selected:
+    """An effect that the data calls for. log_p: with all others in; equivalent: names that could stand in for it;
+    rivals: with these in its place."""
+
+    effect: Effect
+    log_p: float
+    equivalent: tuple[str, ...]
+    rivals: tuple[Hypothesis, ...] = field(default=(), repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class ToldApart:
+    """What is said of the effects of a fit: they, strongest first, and the fit with the clocks that are as likely.
+
+    opened, moved: as `EffectSelection` has them.
+    """
+
+    selected: tuple[Selected, ...]
+    fit: Fit
+    opened: OpenArm | None
+    moved: Mapping[str, float]
+
+
+def tell_apart(
+    fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], alike: Mapping[str, str]
+) -> ToldApart:
+    """What is said of each effect of a fit. alike: by name of an effect, another that the fit has it as likely for."""
+    called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
+    selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
+    opened = opened_arm(guesses) if ARM in fit.values else None
+    if is_open(guesses):
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened)
+    selected = [_or_else(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
+    rivals = [one for each in selected if opened is not None and each.effect.name in CLOCKS for one in each.rivals]
+    freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), opened)
+    clocks = tuple(effect.name for effect in (freed or fit).effects if effect not in fit.effects)
+    if freed is None:
+        clocks = tuple(name for name in TWO_CLOCKS if name not in fit.values)
+    if clocks:
+        selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
+    if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
+        opened = replace(opened, late=IN_TIME_STD_S)  # only the two together are known
+    if opened is not None:  # what tells a lag from a delay is less than what lies between samples
+        selected = [
+            _or_else(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
+            for each in selected
+        ]
+    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
+    if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
+        selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
+    return ToldApart(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
+
+
+def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
+    """Test an effect given all others, and every other effect in its place.
+
+    One with more parameters that fits as well could be the cause, however much less likely its numbers make it; one
+    that fits worse could be if it needs fewer, or chooses no time: a leap at the best of nine times was known, where
+    the clock drifted.
+    """
+    rest = fit_without(fitter, fit, effect)
+    log_p = log_p_in_place(fitter, fit, rest, effect)
+    drop = rest.deviance - fit.deviance
+    table = straight_lines(fitter, rest, effects)
+    n = len(fit.seen)
+    own = list(range(len(rest.effects)))
+    found: list[tuple[float, str, Hypothesis]] = []
+    best_by_name: dict[str, int] = {}
+    drops = {i: table.drop(own) - table.drop([*own, i]) for i in range(len(own), len(table.variants))}
+    for index in sorted(drops, key=lambda i: -drops[i]):
+        best_by_name.setdefault(table.variants[index].effect.name, index)
+    straight = drops.get(best_by_name.get(effect.name, -1), drop)
+    for name, index in best_by_name.items():
+        if name == effect.name or drops[index] < 0.7 * min(straight, drop) - 4.0 * SETTINGS.indistinguishable:
+            continue
+        rival = fitter.fit_kept(combined(fitter, rest, table, [*own, index]), fit.noise)
+        behind = rival.deviance - fit.deviance
+        fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
+        chosen = float(np.log(times_tried(effect) / times_tried(effects[name])))
+        if behind < SETTINGS.indistinguishable + max(0.0, 2.0 * (fewer + chosen)):
+            found.append((behind, name, rival.hypothesis))
+    found.sort(key=lambda each: each[:2])
+    return Selected(effect, log_p, tuple(name for _, name, _ in found), tuple(each for *_, each in found))
+
+
+def _clock_or_arm(
+    fitter: Fitter,
+    fit: Fit,
+    selected: list[Selected],
+    n_effects: int,
+    called_for: Sequence[Effect],
+    opened: OpenArm | None,
+) -> list[Selected]:
+    """Lever arm and clock as one where each would do without the other.
+
+    called_for: what the data calls for; a further clock that only stands beside the arm is named where it is shown.
+    opened: as `opened_arm` has it; a clock of the reference that is no later than that is not shown.
+    """
+    threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
+
+    late = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
+    is_late = opened is None or max(late, default=0.0) >= LATER * opened.late
+
+    def is_shown(each: Selected) -> bool:
+        if each.effect.name == REFERENCE_CLOCK and not is_late:
+            return False
+        return each.log_p <= threshold and robust_p(fit, each.effect, block) < SETTINGS.robust_level
+
+    own = {each.effect.name: each for each in selected}
+    arm, clocks = own.get(ARM), [own[name] for name in TWO_CLOCKS if name in own]
+    if arm is None or not clocks:
+        return selected
+    clock = min(clocks, key=lambda each: each.log_p)
+    beside = [each for each in clocks if each is not clock and each.effect not in called_for and not is_shown(each)]
+    selected = [each for each in selected if each not in beside]
+    if is_shown(arm) and is_shown(clock):
+        return selected
+    one, other = (arm, clock) if is_shown(arm) else (clock, arm)
+    rest = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
+    without = fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
+    log_p = log_p_value(fit.gain_over(without), fit.dof - without.dof)
+    equivalent = dict.fromkeys((other.effect.name, *one.equivalent))
+    return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
+
+
+def _or_else(selected: Selected, names: Sequence[str]) -> Selected:
+    """An effect for which others could stand in as well."""
+    others = (name for name in (*names, *selected.equivalent) if name != selected.effect.name)
+    return replace(selected, equivalent=tuple(dict.fromkeys(others)))

@@ -1,0 +1,100 @@
+"""What a diagnosis starts from: how the instruments of a recording stand to each other, as `register` finds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ...calibration.numerics.frames import Array, turn_between
+from ...calibration.numerics.samples import VelocityFrame
+from ...calibration.registration.motion_streams import MotionStreams, make_motion
+from ...calibration.registration.registration import Registration, register
+from ...calibration.registration.unregistrable_clocks import far_clocks
+from ...calibration.streams.interpolation import ImuColumns
+from ...effects.base import ActsOn, EffectNeeds
+from ...effects.composition import Injection, late
+from ...errors import InputError
+from ..model.recorded_streams import RecordedStreams
+from ..model.stream_curve import Curve
+from ..model.time_grid import Offsets
+
+# Passes in which the true time of a late stamp is found
+_PASSES = 3
+
+
+@dataclass(frozen=True)
+class FirstGuess:
+    """Of one recording. offsets: of clocks. lever_arm: (3,) m, beyond what is known of it. phi: (3,) rad.
+
+    registration: where these are from, None without one.
+    """
+
+    offsets: Offsets
+    lever_arm: Array
+    phi: Array
+    registration: Registration | None = None
+
+
+def check_clocks(recording: RecordedStreams, rotation_dvl_from_body: Array) -> None:
+    """Raise InputError if stamps are too far apart for anything to be found.
+
+    Parameters
+    ----------
+    recording: What is to be compared.
+    rotation_dvl_from_body: (3, 3), the nominal mounting.
+
+    """
+    if recording.registration is not None:
+        return  # they are not
+    motion = _motion(recording)
+    far = None if motion is None else far_clocks(motion, rotation_dvl_from_body)
+    if far is not None:
+        raise InputError(f"{recording.name}: {far.reason.sentence}")
+
+
+def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever_arm: Array) -> FirstGuess:
+    """Delays, lever arm and mounting of one recording; none where it cannot be registered."""
+    found = recording.registration
+    if found is None and (motion := _motion(recording)) is not None:
+        found = register(motion, rotation_dvl_from_body.T, lever_arm)
+    if found is None:
+        return FirstGuess(Offsets(), np.zeros(3), np.zeros(3))
+    phi = turn_between(rotation_dvl_from_body, found.rotation_body_from_dvl.T)
+    return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi, found)
+
+
+def guess_beside(
+    recording: RecordedStreams, moved: Sequence[Injection], rotation_dvl_from_body: Array, lever_arm: Array
+) -> FirstGuess | None:
+    """The guess of a recording whose DVL's clock moves as was found: what is open about that clock as it moves is not
+    about one that stands. moved: leaps and drifts of it. None where its samples then are in no order."""
+    curve = recording.dvl
+    time = curve.time
+    for _ in range(_PASSES):
+        time = curve.time - late(moved, ActsOn.DVL_CLOCK, time)
+    if not (np.diff(time) > 0.0).all():
+        return None
+    dvl = Curve(time, curve.values, curve.claimed, claims=curve.claims)
+    return first_guess(replace(recording, dvl=dvl, registration=None), rotation_dvl_from_body, lever_arm)
+
+
+def _motion(recording: RecordedStreams) -> MotionStreams | None:
+    attitude, dvl, reference = recording.attitude, recording.dvl, recording.reference
+    times = np.zeros(0) if attitude is None else attitude.time
+    quaternions = np.zeros((0, 4)) if attitude is None else attitude.values
+    rates = np.full((len(times), 3), np.nan)
+    if len(times) > 1 and EffectNeeds.ANGULAR_VELOCITY in recording.available:
+        rates = recording.angular_velocity(times)
+    elif recording.rates is not None:
+        times, rates = recording.rates.time, recording.rates.values
+        quaternions = np.full((len(times), 4), np.nan)
+    length = np.sqrt((quaternions * quaternions).sum(axis=1, keepdims=True))
+    return make_motion(
+        (dvl.time, dvl.values),
+        (reference.time, reference.values),
+        recording.frame is not VelocityFrame.BODY,
+        recording.measured,
+        ImuColumns(times, quaternions / length, rates),
+    )

@@ -1,0 +1,95 @@
+"""What of effects a reference that is horizontal shows, by the columns of their parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ...calibration.numerics.frames import Array
+from ...effects.base import Effect
+from ..fit.gauss_newton import Fit
+from ..model.forward_model import Problem
+from ..model.hypothesis import Values, amplitudes, is_time_of_run, no_effect
+from ..model.seen import Seen
+from .arm_clock_ambiguity import ARM
+
+# A parameter of its typical size that does less to what is compared than this share of what its effect's best-shown one
+# does, or of a usual bias (m/s), is left out, for what a model lacks does as much. A boat that rolls at 0.2°/s shows no
+# height of its DVL, an AUV at sea does at 1°/s; one that keeps level no bias upwards, nor roll and pitch of a mounting.
+SHOWN_FROM, USUAL_MPS = 0.2, 0.02
+# A part of the lever arm is looked for where so much of it (m) would do as much, since metres left out turn all the
+# rest: an AUV that rolls at 0.5°/s. It stands if it is so many times what a model lacks makes of it
+ARM_FROM_M, FAINT = 0.6, 2.0
+
+
+def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
+    """Effects without the parameters that references which do not measure the vertical do not show."""
+    if problem.measured[2]:
+        return dict(effects)
+    seen = problem.all_seen(no_effect())
+    return {name: _shown_part(each, problem, seen) for name, each in effects.items()}
+
+
+def unshown_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect]) -> tuple[Effect, ...]:
+    """What is not shown of effects: who has what is shown of one has the other parts as well."""
+    left_out = (effect.without({spec.name for spec in shown[name].parameters}) for name, effect in effects.items())
+    return tuple(effect for effect in left_out if effect.parameters)
+
+
+def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:
+    specs = amplitudes(effect)
+    columns = problem.columns(no_effect(), seen, effect, somewhere(effect, problem))
+    squares = (columns**2).sum(axis=1).mean(axis=0)
+    of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of days the one that shows most
+    sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
+    least = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
+    out = {spec.name for spec, size in zip(specs, sizes.tolist(), strict=True) if size < least}
+    if effect.name == ARM:
+        by_metre = zip(specs, np.sqrt(of_each).tolist(), strict=True)
+        out &= {spec.name for spec, size in by_metre if ARM_FROM_M * size < SHOWN_FROM * USUAL_MPS}
+    return effect.without(out)
+
+
+def without_faint(problem: Problem, fit: Fit) -> Effect | None:
+    """The lever arm without what of it is no larger than what a model lacks makes (2 σ); None where all of it is."""
+    known = _known_to(problem, fit)
+    faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < FAINT * std}
+    (arm,) = (effect for effect in fit.effects if effect.name == ARM) if faint else (None,)
+    return arm and arm.without(faint)
+
+
+def with_shown(problem: Problem, fit: Fit, covariance: Array) -> Array:
+    """A covariance (6 + p, 6 + p) of a fit, its lever arm known no better than by what a model lacks."""
+    found, known = covariance.copy(), _known_to(problem, fit)
+    for number, each in enumerate(fit.hypothesis.parameters(), start=6):
+        if each.effect.name == ARM:
+            found[number, number] += known.get(each.spec.name, 0.0) ** 2
+    return found
+
+
+def _known_to(problem: Problem, fit: Fit) -> dict[str, float]:
+    """What a model lacks makes of a lever arm, m, by its parts of which a usual size would not be shown."""
+    if problem.measured[2] or ARM not in fit.values:
+        return {}
+    sizes = np.sqrt((fit.columns[:, :, 6:] ** 2).sum(axis=1).mean(axis=0)).tolist()
+    own = [
+        (each.spec, size)
+        for each, size in zip(fit.hypothesis.parameters(), sizes, strict=True)
+        if each.effect.name == ARM
+    ]
+    least = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
+    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < least}
+
+
+def somewhere(effect: Effect, problem: Problem) -> list[Values]:
+    """Defaults, with what comes in the midst of the run where no time is given."""
+    values: list[Values] = []
+    for recording in problem.recordings:
+        times = {
+            spec.name: 0.5 * recording.seconds
+            for spec in effect.parameters
+            if is_time_of_run(spec) and not any(is_time_of_run(o) for o in effect.parameters if o is not spec)
+        }
+        values.append(effect.defaults | times)
+    return values
