@@ -4,31 +4,14 @@ The public interface, which is `api`: what the commands do, as functions, and wh
 when it is asked for, since the command line must not wait for NumPy to print its help.
 """
 
-from .version import __version__
+from .version import __version__ as __version__
 
 TYPE_CHECKING = False  # as in typing, which takes longer than all else here
 if TYPE_CHECKING:
-    from .api import (
-        Calibration,
-        InputError,
-        Mounting,
-        ParameterError,
-        Parameters,
-        Scenario,
-        apply,
-        compare,
-        diagnose,
-        doctor,
-        evaluate,
-        export,
-        fleet,
-        import_files,
-        instrument_settings,
-        replay,
-        report,
-        salvage,
-        simulate,
-    )
+    from .api import Calibration, InputError, Mounting, ParameterError, Parameters, Scenario
+    from .api.analyse import diagnose, evaluate, simulate
+    from .api.calibrate import compare, doctor, fleet, replay
+    from .api.convert import apply, export, import_files, instrument_settings, report, salvage
 
 __all__ = [
     "Calibration",

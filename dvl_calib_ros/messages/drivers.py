@@ -92,7 +92,7 @@ class VelocityType:
     well, which takes a type without lists. points_down: its axes
     are forward-right-down unless its frame says otherwise. rules: of a DVL, the first that is broken counts.
     is_reference, is_dvl: whether velocities of the reference and of DVLs come in this type. position: how positions are
-    read, of which velocities are made (fixes.py), None of a type of velocities. reference_frame: the axes of a
+    read, of which velocities are made (positions.py), None of a type of velocities. reference_frame: the axes of a
     reference in this type, whatever its frame_id says, None if that says it. adapted: a message without header as all
     else reads it; None: as it is. definitions: for bags that embed none, the versions of it that are about. install:
     how to get its package, where ROS does not bring it.
@@ -478,7 +478,7 @@ _TYPES: dict[str, VelocityType] = {
     )
 }
 _WRITTEN = tuple(_TYPES.values())
-VELOCITY_TYPES: Mapping[str, VelocityType] = _TYPES  # grows by those that are recognised (opening.py)
+VELOCITY_TYPES: Mapping[str, VelocityType] = _TYPES  # grows by those that are recognised (type_recognition.py)
 # for bags that do not say how messages are laid out
 KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
     name: each.definitions for name, each in VELOCITY_TYPES.items() if each.definitions

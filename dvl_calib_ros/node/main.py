@@ -109,10 +109,6 @@ def _refused(error: Exception | str) -> int:
     return 2
 
 
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 # Of `mallopt` (3). Set, they stay what they are: glibc raises them otherwise with the largest array that is given back.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 # Arrays of at least so many bytes have memory of their own: what comes with each message is smaller.
@@ -126,3 +122,7 @@ def give_back_at_once() -> bool:
     except (AttributeError, OSError, TypeError):  # no glibc
         return False
     return all(mallopt(what, LARGE) for what in (_MMAP_THRESHOLD, _TRIM_THRESHOLD))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,1 @@
-"""What was found of a DVL, as the settings of other simulators: one description, one writer for each of them."""
+"""Settings of other simulators, written from what was found of a DVL."""

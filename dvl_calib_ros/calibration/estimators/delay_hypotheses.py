@@ -7,7 +7,7 @@ than another, and the delay's standard deviation stays that of the prior.
 
 Noise that is larger than claimed, or correlated, would make evidence and covariance overconfident: evidence is
 divided by the best hypothesis' own mean squared innovation, and standard deviations grow to what blocks of time
-show (time_blocks.py). (Long, because what a hypothesis knows, of heave and over the end of a day, is one thing.)
+show (block_covariance.py). (Long, because what a hypothesis knows, of heave and over the end of a day, is one thing.)
 """
 
 from __future__ import annotations

@@ -47,7 +47,7 @@ FIRST_LOOK_S, GROWN = 60.0, 1.2
 # From a look's stamp until its outcome takes effect, in stamps.
 SOLVED_WITHIN_NS = 1_000_000_000
 # Velocities made of positions are of no use beyond NOISY_MPS, and there are none of fixes further apart than so many
-# windows (fixes.py).
+# windows (positions.py).
 LONGEST_WINDOWS = 3.0
 
 

@@ -79,7 +79,7 @@ class DelayedRows:
         )
 
     def heave(self, used: Mask) -> Array:
-        """Sum over those used (J,) of (H, z) (K, 13) of what holds of heave in the mean, see heave.py."""
+        """Sum over those used (J,) of (H, z) (K, 13) of what holds of heave in the mean, see vertical_motion.py."""
         velocity, slope, _, turning, lever, _ = self.motion
         k, n = velocity.shape[1:]
         share = used.astype(float)

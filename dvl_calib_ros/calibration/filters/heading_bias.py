@@ -3,7 +3,7 @@
 Yaw is found against the IMU's heading. A constant error of that is harmless, as the same IMU navigates; one that
 changes is not: a compass deviates by one and two cycles of the heading, a gyro drifts. A DVL has a bias, which at one
 speed is a misalignment and a scale, and at another another. What blocks of time tell of their coefficients is told with
-what they tell of the mounting (block_terms.py). On one heading a deviation and yaw are the same to the data, as are at
+what they tell of the mounting (heading_bias.py). On one heading a deviation and yaw are the same to the data, as are at
 one speed a bias and roll, pitch or yaw and scale: σ of these holds both. On reciprocal headings one cycle of a
 deviation averages out; several speeds show a bias. How large coefficients of the heading are is said by
 `heading_deviation_std`, until headings show it to be more or less (empirical Bayes); of the bias by `dvl_bias_std`.

@@ -1,0 +1,183 @@
+"""Diagnose recordings, simulate them, and run the published validation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace as with_values
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..calibration.models import BY_VELOCITY
+from ..calibration.models.parameters import Parameters
+from ..diagnosis.answer.results import Diagnosis
+from ..errors import InputError
+from ..simulation.scenario import Scenario
+from .arguments import Bags, StrPath, as_paths, discovered_in
+
+if TYPE_CHECKING:
+    from ..evaluation.cross_check import CrossCheck
+    from ..evaluation.results import Evaluation
+    from ..unpaired.results import UnpairedComparison
+    from ..unpaired.simulator_rounds import ClosedGap
+
+
+def diagnose(
+    bags: Bags,
+    *,
+    simulator: Bags | None = None,
+    rounds: int | None = None,
+    keep: StrPath | None = None,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    **parameters: Any,
+) -> Diagnosis | UnpairedComparison | ClosedGap:
+    """Find what a simulation lacks beside recorded bags of one vehicle, as ``dvl-calib diagnose``.
+
+    Parameters
+    ----------
+    bags
+        As of `replay`.
+    simulator
+        Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
+    rounds
+        With simulator: so many times at most its DVL is put right, simulated on its motion and compared again, 1 .. 9.
+    keep
+        With rounds: a folder, which must not exist, that keeps each round's DVL (round_1.json, for `export`) and bag.
+    dvl_topic, gnss_topic, imu_topic
+        As of `replay`.
+    params
+        As of `replay`.
+    **parameters
+        As of `replay`.
+
+    Returns
+    -------
+    Diagnosis, UnpairedComparison or ClosedGap
+        ``verdict``, ``effects`` with 95 % intervals, ``noise``, and what could not be told. The second with simulator;
+        the third, with rounds, has one for each of its ``rounds`` and says which is ``best``.
+
+    Raises
+    ------
+    InputError, ParameterError
+        As `replay`.
+    """
+    topics = (dvl_topic, gnss_topic, imu_topic)
+    sides = [
+        discovered_in(as_paths(each), topics, params, {"min_speed": 0.0} | parameters)
+        for each in ([bags] if simulator is None else [bags, simulator])
+    ]
+    if simulator is not None:
+        from ..unpaired.both_sides import RecordedSide
+        from ..unpaired.simulator_rounds import against
+
+        real, made = (RecordedSide(recording, found.parameters, found.topics) for recording, found in sides)
+        return against(real, made, rounds, None if keep is None else Path(keep))
+    if rounds is not None or keep is not None:
+        raise InputError("rounds, keep: only with simulator")
+    from ..diagnosis.diagnose import diagnose as run
+
+    ((recording, discovery),) = sides
+    return run(recording, discovery.diagnosed, discovery.topics)
+
+
+def simulate(
+    bag: StrPath,
+    scenario: Scenario | None = None,
+    *,
+    effects: Mapping[str, Mapping[str, float]] | None = None,
+    **scenario_fields: Any,
+) -> Path:
+    """Write a simulated bag, as ``dvl-calib simulate``.
+
+    Parameters
+    ----------
+    bag
+        Folder to write; must not exist.
+    scenario
+        What to simulate; by default ten minutes along a box.
+    effects
+        By name, each with its parameters, such as ``{"lever_arm": {"x_m": 0.5}}``.
+    **scenario_fields
+        Fields of `Scenario` instead, such as ``seconds=120.0, trajectory="free"``.
+
+    Returns
+    -------
+    Path
+        The bag.
+
+    Raises
+    ------
+    InputError
+        If the bag exists, or cannot be written; for an effect or parameter that there is not.
+    """
+    from ..bags.writer import Compression, Storage
+    from ..simulation.injection import injection_of
+    from ..simulation.scenario import write_bag
+
+    if scenario is not None and scenario_fields:
+        raise InputError("simulate: give a scenario or fields of one, not both")
+    target, made = Path(bag), scenario or Scenario(**scenario_fields)
+    if effects is not None:
+        if not isinstance(effects, Mapping):
+            raise InputError("simulate: effects are by name, such as {'lever_arm': {'x_m': 0.5}}")
+        made = with_values(made, effects=tuple(injection_of(name, given) for name, given in effects.items()))
+    write_bag(made, target, Storage.MCAP, Compression.NONE, with_truth=True)
+    return target
+
+
+def evaluate(
+    paths: Bags | None = None,
+    *,
+    models: Sequence[str] | None = None,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    **parameters: Any,
+) -> Evaluation | CrossCheck:
+    """Evaluate the models, as ``dvl-calib evaluate``.
+
+    Parameters
+    ----------
+    paths
+        A folder of trajectories for the published procedure, None for the project's own trajectories, or two bags and
+        more, of which each calibrates and all others verify.
+    models
+        Names; all by default.
+    dvl_topic, gnss_topic, imu_topic
+        Of bags; those of `dvl-calib simulate` where not named.
+    **parameters
+        Any of the node's parameters, in SI units.
+
+    Returns
+    -------
+    Evaluation or CrossCheck
+        Velocity errors by model and set of trajectories; of bags, by the bag that calibrated and the one that verified.
+
+    Raises
+    ------
+    InputError, ParameterError
+        For trajectories or bags that cannot be read, and for a model or parameter that there is not.
+
+    References
+    ----------
+    Avg.VRMSE and the procedure are those of Yampolsky and Klein; see the page Evaluation.
+    """
+    from ..evaluation.cross_check import cross_check
+    from ..evaluation.validation_study import DEFAULTS, EVALUATED
+    from ..evaluation.validation_study import evaluate as run
+    from ..parallel import Workers
+    from ..recordings.topics import Topics
+
+    found = [] if paths is None else as_paths(paths)
+    named = {"dvl": dvl_topic, "gnss": gnss_topic, "imu": imu_topic}
+    topics = Topics(**{stream: topic for stream, topic in named.items() if topic is not None})
+    known = BY_VELOCITY if len(found) > 1 else EVALUATED
+    names = known if models is None else tuple(models)
+    for name in names:
+        if name not in known:
+            raise InputError(f"models: {name!r} is none of {', '.join(known)}")
+    if len(found) > 1:
+        return cross_check(found, Parameters.from_mapping(parameters), names, topics, Workers())
+    return run(found[0] if found else None, Parameters.from_mapping({**DEFAULTS, **parameters}), models=names)

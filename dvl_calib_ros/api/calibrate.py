@@ -1,0 +1,227 @@
+"""Calibrate with recordings: examine, replay, compare, fleets."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..discovery.discover import Given
+from ..errors import InputError
+from ..examination.examine import Examination
+from .arguments import Bags, StrPath, as_paths, discovered_in, parameters_from
+from .calibrated import Calibration
+
+if TYPE_CHECKING:
+    from ..calibration.comparison.mounting_change import Comparison
+    from ..fleet_catalogue.update import Fleet
+
+
+def replay(
+    bags: Bags,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    history: bool = True,
+    merge: bool = False,
+    **parameters: Any,
+) -> Calibration:
+    """Calibrate with recorded bags, as ``dvl-calib replay`` does.
+
+    Parameters
+    ----------
+    bags
+        A rosbag2 folder, a .mcap or .db3 file, or several of them, which are read as one.
+    dvl_topic, gnss_topic, imu_topic
+        Topics; found by type, name and content where not named. gnss_topic, imu_topic: "none" does without.
+    params
+        A ROS 2 parameter file.
+    history
+        Keep the run over time, for `Calibration.plot`, `to_pandas` and `report`.
+    merge
+        Take several bags together even if the mounting moved between them.
+    **parameters
+        Any of the node's parameters, in SI units, such as ``mounting_rpy=(0, 0, 0.785)``.
+
+    Returns
+    -------
+    Calibration
+        ``mounting`` with σ, ``verdict`` with its reasons, and `Calibration.correct`, ``save``, ``plot``, ``report``.
+
+    Raises
+    ------
+    InputError, ParameterError
+        For what is no bag, has no DVL, or cannot be a parameter.
+
+    References
+    ----------
+    The models M1 to M7 are those of Yampolsky and Klein, Information-Aided DVL Calibration; see the page Models.
+    """
+    from ..bag_replay.checked_replay import checked_replay
+
+    paths = as_paths(bags)
+    recording, discovery = discovered_in(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
+    replayed = checked_replay(
+        recording,
+        discovery.parameters,
+        discovery.topics,
+        merge=merge,
+        with_history=history,
+        mounting_is_guessed=bool(discovery.mounting_because),
+    )
+    return Calibration(replayed, discovery.with_mounting(replayed.result.parameters["mounting_rpy"]), tuple(paths))
+
+
+def compare(
+    *results: StrPath | Calibration,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    **parameters: Any,
+) -> Comparison:
+    """Compare calibrations of one DVL, as ``dvl-calib compare``: has the mounting moved?
+
+    Parameters
+    ----------
+    *results
+        Result files, bags, or what `replay` gave; two or more. A bag is calibrated first.
+    dvl_topic, gnss_topic, imu_topic
+        Of bags, as of `replay`.
+    params
+        Of bags, as of `replay`.
+    **parameters
+        Of bags, as of `replay`.
+
+    Returns
+    -------
+    Comparison
+        ``word``: same, suspicious or moved, and all behind it; `calibration.comparison_words` has its `reasons`.
+
+    Raises
+    ------
+    InputError
+        For what is no result file, holds no sample, is one of the others, or has nothing in common with them.
+    """
+    from ..bag_replay.checked_replay import calibrated
+    from ..bag_replay.replay import extrinsics_of_replay
+    from ..bags.files import is_bag
+    from ..calibration.comparison.mounting_change import check_distinct
+    from ..calibration.comparison.mounting_change import compare as run
+    from ..files.mounting import load_extrinsics
+
+    found = []
+    for given in results:
+        if isinstance(given, Calibration):
+            name = ", ".join(map(str, given.bags))
+            extrinsics = extrinsics_of_replay(given.replayed, name)
+            if extrinsics is None:
+                raise InputError(f"{name}: no sample of it could be used to calibrate; leave it out")
+            found.append(extrinsics)
+        elif is_bag(Path(given)):
+            topics = (dvl_topic, gnss_topic, imu_topic)
+            recording, discovery = discovered_in([Path(given)], topics, params, parameters)
+            found.append(calibrated(recording, discovery.parameters, discovery.topics, str(given)).extrinsics)
+        else:
+            found.append(load_extrinsics(Path(given), str(given)))
+    check_distinct(found)
+    return run(found)
+
+
+def fleet(
+    places: Bags,
+    out: StrPath,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    vehicle_from: str | None = None,
+    jobs: int = 0,
+    dask: str = "",
+    **parameters: Any,
+) -> Fleet:
+    """Calibrate all recordings below some places into a catalogue, as ``dvl-calib fleet``.
+
+    Parameters
+    ----------
+    places
+        Folders, files, or URLs that fsspec opens, such as ``s3://bucket/dives``; one or several.
+    out
+        Folder of the catalogue; what is done there and unchanged is not done again.
+    dvl_topic, gnss_topic, imu_topic
+        As of `replay`, for all recordings.
+    params
+        As of `replay`.
+    vehicle_from
+        A regular expression whose first group in a recording's path is the vehicle; by default the first folder below
+        a place.
+    jobs
+        Processes; 0: one per core, 1: this one.
+    dask
+        Address of a Dask scheduler to work on instead.
+    **parameters
+        As of `replay`.
+
+    Returns
+    -------
+    Fleet
+        ``vehicles`` with where each mounting moved, ``persons``: the recordings that need one; ``out`` has
+        ``rows/*.parquet`` and ``index.html``.
+
+    Raises
+    ------
+    InputError, ParameterError
+        For a place that is none or holds no recording, for a catalogue that cannot be written, and without pyarrow.
+        What is wrong with a recording is its row.
+    """
+    from ..fleet_catalogue.update import run_fleet
+    from ..parallel import Workers
+    from ..present.page import write_report
+
+    merged, names = parameters_from(params, parameters)
+    asked = [str(each) for each in ([places] if isinstance(places, str | os.PathLike) else places)]
+    given = Given(dvl_topic, gnss_topic, imu_topic, names)
+    found = run_fleet(asked, Path(out), merged, given, Workers(jobs, dask), vehicle_from)
+    write_report(found.page, found)
+    return found
+
+
+def doctor(
+    bags: Bags,
+    *,
+    dvl_topic: str | None = None,
+    gnss_topic: str | None = None,
+    imu_topic: str | None = None,
+    params: StrPath | None = None,
+    **parameters: Any,
+) -> Examination:
+    """Say what is in recordings, what is wrong with them, and whether they can calibrate, as ``dvl-calib doctor``.
+
+    Parameters
+    ----------
+    bags
+        As of `replay`.
+    dvl_topic, gnss_topic, imu_topic
+        As of `replay`.
+    params
+        As of `replay`.
+    **parameters
+        As of `replay`.
+
+    Returns
+    -------
+    Examination
+        ``verdict``: yes, partly or no; ``findings``, and what the motion ``shown`` is good for, with σ to expect.
+
+    Raises
+    ------
+    InputError, ParameterError
+        As `replay`.
+    """
+    from ..examination.examine import examine
+
+    merged, names = parameters_from(params, parameters)
+    return examine(as_paths(bags), merged, Given(dvl_topic, gnss_topic, imu_topic, names))
