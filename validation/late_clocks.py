@@ -19,7 +19,7 @@ import dvl_calib_ros as dc
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.registration.registration import is_beyond_doubt
 from dvl_calib_ros.diagnosis.answer.results import Diagnosis
-from dvl_calib_ros.discovery.discover import Discovery
+from dvl_calib_ros.discovery.discovery import Discovery
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag

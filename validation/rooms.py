@@ -9,53 +9,99 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
 PACKAGE = Path(__file__).resolve().parents[1] / "dvl_calib_ros"
-_BASE = ("errors",)
-_CORE = (*_BASE, "verdict", "calibration")
+# Packages whose folders are rooms of their own, beside the modules that stand in the package itself
+DIVIDED = ("calibration", "diagnosis")
+_BASE = ("errors", "version", "verdict")
+_NUMERICS = ("verdict", "calibration.numerics", "calibration.models", "calibration.streams")
+_JUDGED = (*_NUMERICS, "calibration.filters", "calibration.results", "calibration.checks")
+_CALIBRATION = (
+    "calibration.numerics", "calibration.models", "calibration.streams", "calibration.filters",
+    "calibration.registration", "calibration.results", "calibration.comparison", "calibration.checks",
+    "calibration.assessment", "calibration.estimators", "calibration",
+)  # fmt: skip
+_CORE = (*_BASE, *_CALIBRATION)
 _READ = (*_CORE, "bags", "messages", "recordings")
-# Rooms from the ground up: packages and modules of ours, and which of those before it each may import. docs/develop.md
+_DIAGNOSED = ("errors", "verdict", *_CALIBRATION[:-1], "effects")
+_DIAGNOSIS = ("diagnosis.model", "diagnosis.noise", "diagnosis.fit", "diagnosis.search", "diagnosis.answer")
+# Rooms from the ground up: folders and modules of ours, and which of those before it each may import.
+# docs/architecture.md has a paragraph on each.
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "errors": (),
-    "streams": (),
-    "parallel": _BASE,
-    "disk": _BASE,
+    "version": (),
+    "standard_streams": (),
+    "parallel": ("errors",),
     "verdict": (),
-    "calibration": (*_BASE, "verdict"),
-    "effects": _CORE,
-    "bags": (*_BASE, "disk"),
+    "calibration.numerics": (),
+    "calibration.models": ("errors", "calibration.numerics"),
+    "calibration.streams": ("calibration.numerics", "calibration.models"),
+    "calibration.filters": _NUMERICS,
+    "calibration.registration": _NUMERICS,
+    "calibration.results": (*_NUMERICS, "calibration.filters"),
+    "calibration.comparison": ("errors", "verdict", "calibration.numerics", "calibration.results"),
+    "calibration.checks": _JUDGED[:-1],
+    "calibration.assessment": _JUDGED,
+    "calibration.estimators": (*_JUDGED, "calibration.registration", "calibration.assessment"),
+    "calibration": ("verdict", *_CALIBRATION[:-1]),
+    "effects": ("errors", "calibration.numerics", "calibration.registration"),
+    "disk": ("errors",),
+    "bags": ("errors", "disk"),
     "messages": (*_CORE, "bags"),
-    "files": (*_CORE, "disk", "bags", "messages"),
     "recordings": (*_CORE, "bags", "messages"),
+    "files": (*_CORE, "disk", "messages"),
+    "logs": (*_CORE, "bags", "messages"),
+    "instruments": (*_CORE, "files"),
     "discovery": (*_READ, "files"),
     "examination": (*_READ, "discovery"),
-    "replay": (*_READ, "files"),
-    "fleet": (*_READ, "parallel", "disk", "files", "discovery", "replay"),
-    "diagnosis": (*_READ, "effects"),
-    "export": (*_CORE, "disk", "files", "effects"),
-    "simulation": (*_READ, "effects", "export"),
-    "unpaired": (*_READ, "disk", "effects", "diagnosis", "export", "simulation"),
-    "evaluation": (*_READ, "parallel", "files", "replay", "simulation"),
+    "bag_replay": (*_READ, "files"),
+    "fleet_catalogue": (*_READ, "parallel", "disk", "files", "discovery", "bag_replay"),
+    "diagnosis.model": (*_DIAGNOSED, "messages", "recordings"),
+    "diagnosis.noise": (*_DIAGNOSED, "diagnosis.model"),
+    "diagnosis.fit": (*_DIAGNOSED, "diagnosis.model", "diagnosis.noise"),
+    "diagnosis.search": (*_DIAGNOSED, "diagnosis.model", "diagnosis.noise", "diagnosis.fit"),
+    "diagnosis.answer": (*_DIAGNOSED, "bags", "messages", *_DIAGNOSIS[:-1]),
+    "diagnosis": (*_DIAGNOSED, "recordings", *_DIAGNOSIS),
+    "simulator_export": (*_CORE, "disk", "files", "effects"),
+    "simulation": (*_READ, "effects", "simulator_export"),
+    "unpaired": (*_READ, "disk", "effects", *_DIAGNOSIS, "diagnosis", "simulator_export", "simulation"),
+    "evaluation": (*_READ, "parallel", "logs", "bag_replay", "simulation"),
     "present": (
-        *_READ, "disk", "files", "effects", "discovery", "examination", "replay", "fleet", "diagnosis", "unpaired",
-        "evaluation",
+        *_READ, "disk", "files", "effects", "examination", "bag_replay", "fleet_catalogue", "diagnosis.search",
+        "diagnosis.answer", "unpaired", "evaluation",
     ),
-    "node": (*_READ, "streams", "disk", "files", "discovery", "simulation"),
+    "node": (*_READ, "standard_streams", "disk", "files", "discovery", "simulation"),
     "demo": (*_READ, "files", "node"),
     "api": (
-        *_READ, "parallel", "disk", "files", "discovery", "examination", "replay", "fleet", "diagnosis", "unpaired",
-        "export", "simulation", "evaluation", "present",
+        *_READ, "parallel", "disk", "files", "logs", "instruments", "discovery", "examination", "bag_replay",
+        "fleet_catalogue", *_DIAGNOSIS, "diagnosis", "unpaired", "simulator_export", "simulation", "evaluation",
+        "present",
     ),
     "cli": (
-        *_READ, "streams", "parallel", "disk", "files", "effects", "discovery", "examination", "replay", "fleet",
-        "diagnosis", "unpaired", "export", "simulation", "evaluation", "present", "node", "demo",
+        *_READ, "standard_streams", "parallel", "disk", "files", "logs", "instruments", "effects", "discovery",
+        "examination", "bag_replay", "fleet_catalogue", *_DIAGNOSIS, "diagnosis", "unpaired", "simulator_export",
+        "simulation", "evaluation", "present", "node", "demo",
     ),
-    "__init__": ("api",),
+    "__init__": ("version", "api"),
 }  # fmt: skip
 
 
 def room_of(path: Path) -> str:
-    """The room that a file of the package is in."""
-    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+    """Return the room of a file of the package."""
+    return _room(path.relative_to(PACKAGE).with_suffix("").parts)
+
+
+def _room(parts: tuple[str, ...]) -> str:
+    """Return the room of a module, by its parts below the package."""
+    divides = parts[0] in DIVIDED and len(parts) > 1
+    return ".".join(parts[:2]) if divides and not _file(parts[:2]).is_file() else parts[0]
+
+
+def _file(parts: tuple[str, ...]) -> Path:
+    return PACKAGE.joinpath(*parts[:-1], f"{parts[-1]}.py")
 
 
 def modules() -> Iterator[Path]:
@@ -84,18 +130,47 @@ def _look(text: str) -> _Text:
     return _Text(len(code), tuple(imports))
 
 
-def imported_by(path: Path) -> set[str]:
-    """Other rooms that a file imports, also within functions and for types alone."""
+def modules_imported_by(path: Path) -> set[tuple[str, ...]]:
+    """Return the modules that a file imports, by their parts below the package, also in functions and for types."""
     inside = path.relative_to(PACKAGE).parent.parts
     found = set()
     for level, module, names in _look(path.read_text()).imports:
-        full = [*inside[: len(inside) - (level - 1)], *filter(None, module.split("."))]
-        found |= {full[0]} if full else {name for name in names if name != "__version__"}
-    return found - {room_of(path)}
+        base = (*inside[: len(inside) - (level - 1)], *filter(None, module.split(".")))
+        for name in names:
+            full = (*base, name)
+            is_module = not base or _file(full).is_file() or PACKAGE.joinpath(*full).is_dir()
+            found.add(full if is_module else base)
+    return found
+
+
+def imported_by(path: Path) -> set[str]:
+    """Return the other rooms that a file imports."""
+    return {_room(parts) for parts in modules_imported_by(path)} - {room_of(path)}
+
+
+def module_circles() -> list[list[str]]:
+    """Return the groups of modules that import each other, also in functions and for types."""
+    graph: dict[str, set[str]] = {}
+    for path in modules():
+        name = _module_name(path.relative_to(PACKAGE).with_suffix("").parts)
+        graph[name] = {_module_name(parts) for parts in modules_imported_by(path)} - {name}
+    rows = {name: number for number, name in enumerate(graph)}
+    pairs = [(rows[name], rows[other]) for name, others in graph.items() for other in others if other in rows]
+    matrix = csr_array((np.ones(len(pairs)), np.transpose(pairs)), shape=(len(rows), len(rows)))
+    _, groups = connected_components(matrix, directed=True, connection="strong")
+    together: dict[int, list[str]] = {}
+    for name, group in zip(graph, groups, strict=True):
+        together.setdefault(int(group), []).append(name)
+    return [sorted(names) for names in together.values() if len(names) > 1]
+
+
+def _module_name(parts: tuple[str, ...]) -> str:
+    """Return the dotted name of a module; that of a package is its `__init__`."""
+    return ".".join((*parts, "__init__") if PACKAGE.joinpath(*parts).is_dir() else parts)
 
 
 def arrows() -> dict[tuple[str, str], list[Path]]:
-    """Which room imports which other, and in which files."""
+    """Return which room imports which other, and in which files."""
     found: dict[tuple[str, str], list[Path]] = {}
     for path in modules():
         for room in sorted(imported_by(path)):
@@ -104,7 +179,7 @@ def arrows() -> dict[tuple[str, str], list[Path]]:
 
 
 def arrows_up() -> list[tuple[str, str]]:
-    """Those to a room that is not below, or is unknown."""
+    """Return the arrows to a room that is not below, or is unknown."""
     floor = {room: number for number, room in enumerate(ROOMS)}
     return [(a, b) for a, b in arrows() if floor.get(b, len(floor)) >= floor.get(a, -1)]
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..calibration.models.parameters import Parameters
-from ..discovery.discover import Discovery, Given, discover
+from ..discovery.discover import discover
+from ..discovery.discovery import Discovery, Given
 from ..errors import InputError
 from ..recordings.recording import Recording, open_recording
 
@@ -20,6 +21,7 @@ Bags = StrPath | Sequence[StrPath]
 
 
 def as_path(given: StrPath | None) -> Path | None:
+    """Return a path as such, or None."""
     return None if given is None else Path(given)
 
 
@@ -35,6 +37,7 @@ def storage_and_compression(storage: str, compression: str) -> tuple[Storage, Co
 
 
 def as_paths(bags: Bags) -> list[Path]:
+    """Return one or several recordings as paths. Raises InputError for none."""
     found = [Path(bags)] if isinstance(bags, str | os.PathLike) else [Path(bag) for bag in bags]
     if not found:
         raise InputError("no bag is named; name one at least")
@@ -55,6 +58,7 @@ def discovered_in(
     params: StrPath | None,
     given: Mapping[str, Any],
 ) -> tuple[Recording, Discovery]:
+    """Return what a recording says of itself, with what was named instead of what would be found."""
     parameters, names = parameters_from(params, given)
     dvl, gnss, imu = topics
     recording = open_recording(paths, None, parameters)

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..discovery.discover import Given
+from ..discovery.discovery import Given
 from ..errors import InputError
 from ..examination.examine import Examination
 from .arguments import Bags, StrPath, as_paths, discovered_in, parameters_from

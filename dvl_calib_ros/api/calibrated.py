@@ -15,7 +15,7 @@ from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.results.mounting_quantities import Quantity, quantities
-from ..discovery.discover import Discovery
+from ..discovery.discovery import Discovery
 from ..errors import InputError
 from ..verdict.reasons import Reason
 

@@ -1,7 +1,5 @@
 """The calibration over recorded bags: the same estimator as the node's, fed from files.
 
-(Long, because what is asked of a bag before it is replayed, and said of it after, belongs to the same door.)
-
 A replay as plain data: what `replay --json` writes, but for what discovery says.
 """
 

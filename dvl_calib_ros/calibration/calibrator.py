@@ -4,39 +4,33 @@
                                         └─► Selection: is there GNSS, which model is the one
 
 The node, the replay and the evaluation all use this class. The node feeds it sample by sample, recordings come as
-columns; that, and block_size, change nothing but the speed. (Long, because it is the one door of the core, and each
-question that is asked of it is a method.)
+columns; that, and block_size, change nothing but the speed.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
 from .assessment.dead_reckoning import Navigation
-from .assessment.manoeuvre_planner import RecentMotion
+from .assessment.manoeuvre_planner import RecentMotion, recent_motion
 from .assessment.model_selection import Selection
 from .assessor import Estimates, FurtherEstimators, Judge
 from .estimators.estimator import Estimator, EstimatorSetup, LinearEstimator, Worker, kind_of
-from .filters.build_observations import Observer
+from .filters.build_observations import Observer, RowsSeen, own_copy
 from .filters.filter_bank import Group, groups_of
 from .filters.heading_diversity import EVERY_NS, Headings
 from .filters.state_history import Counts, Numbers, StateTrace
 from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
-from .models.base import Observations
 from .models.parameter_spec import ParameterError
 from .models.parameters import IAC, Parameters
-from .numerics.frames import Array, Vector, rotation_from_quaternion
+from .numerics.frames import Array, Vector
 from .numerics.kalman import GaussianState
 from .numerics.samples import (
-    FRAME_CODES,
     AlignedBlock,
     DvlSample,
     ImuSample,
@@ -47,7 +41,6 @@ from .numerics.samples import (
     Stamps,
     Stream,
     Streams,
-    VelocityFrame,
 )
 from .registration.clock_domains import StreamClocks
 from .registration.registration import Registration
@@ -55,6 +48,7 @@ from .results.results import Day, Estimate, Result, Verification
 from .results.thinned_recording import Terms, ThinnedRecording
 from .streams.aligner import Aligner, counted
 from .streams.position_velocities import are_positions, check_model
+from .streams.stream_order import parts_by_day
 
 # DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
@@ -68,22 +62,8 @@ _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
     Needs.ATTITUDE: lambda block: block.oriented,
     Needs.REFERENCE: lambda block: block.paired,
 }
-
 # Imported now, for no live message waits for an import.
 _KINDS = {model.name: kind_of(model) for model in MODELS.values() if model.estimator}
-
-
-class _RowsSeen(NamedTuple):
-    """Rows first .. decided - 1 as models with some needs see them: those that have these, with their numbers.
-
-    observations: None where no row has them.
-    """
-
-    first: int
-    decided: int
-    block: AlignedBlock
-    numbers: Numbers
-    observations: Observations | None
 
 
 class Calibrator:
@@ -174,7 +154,7 @@ class Calibrator:
         self._judge = Judge(self._estimates)
         self._headings = Headings(self.parameters)
         self._n_headings = 0  # rows that it has had
-        self._seen: dict[Needs, _RowsSeen] = {}
+        self._seen: dict[Needs, RowsSeen] = {}
         self._doubted: tuple[tuple[object, ...], Sequence[Reason]] | None = None
         if self._trace is not None:
             self._trace.start(self._groups)
@@ -291,7 +271,7 @@ class Calibrator:
         if not is_judged and decided - first < self._rows_held:
             return
         self._n_headings = decided
-        for start, end, is_new_day in self._by_days(first, decided):
+        for start, end, is_new_day in parts_by_day(self._aligner.day_rows, first, decided):
             if is_new_day:
                 self._headings.end_day()
             seen = self._observed(Needs.ATTITUDE, start, end)
@@ -302,17 +282,6 @@ class Calibrator:
             if shown_ns is not None:
                 wait_ns = aligner.lag_ns + round(self.parameters.imu_timeout * 1e9) + EVERY_NS
                 self._selection.headings_show_the_current(shown_ns + wait_ns, self._headings.trimmed)
-
-    def _by_days(self, first: int, end: int) -> Iterator[tuple[int, int, bool]]:
-        """Rows first .. end - 1 parted where days begin: the first and the end of each part, and whether a day does."""
-        days = self._aligner.day_rows
-        if not days or days[-1] < first or days[0] >= end:  # as nearly always
-            yield first, end, False
-            return
-        own = [day for day in days if first <= day < end]
-        cuts = sorted({first, *own, end})
-        for start, stop in pairwise(cuts):
-            yield start, stop, start in own
 
     def _on_evidence(self, model: Model, from_ns: int) -> None:
         """Let the selection, and the trace, know what an estimator says by now."""
@@ -337,7 +306,7 @@ class Calibrator:
         first, group.next_row = group.next_row, decided
         if decided == first:
             return False
-        for start, end, is_new_day in self._by_days(first, decided):
+        for start, end, is_new_day in parts_by_day(self._aligner.day_rows, first, decided):
             if is_new_day:
                 group.end_day()
             self._give(group, start, end)
@@ -365,7 +334,7 @@ class Calibrator:
             Needs.NOTHING: partners.n_judged, Needs.ATTITUDE: partners.n_oriented, Needs.REFERENCE: partners.n_paired,
         }[needs]  # fmt: skip
 
-    def _observed(self, needs: Needs, first: int, decided: int) -> _RowsSeen:
+    def _observed(self, needs: Needs, first: int, decided: int) -> RowsSeen:
         """Rows first .. decided - 1 as models with these needs see them; several groups ask for the same."""
         seen = self._seen.get(needs)
         if seen is None or (seen.first, seen.decided) != (first, decided):
@@ -377,7 +346,7 @@ class Calibrator:
             found = (
                 self._observer.observe(block, needs, self._aligner.partners.prior.sway_heave) if len(block) else None
             )
-            seen = self._seen[needs] = _RowsSeen(first, decided, block, numbers, found)
+            seen = self._seen[needs] = RowsSeen(first, decided, block, numbers, found)
         return seen
 
     def _forget_rows(self) -> None:
@@ -388,7 +357,7 @@ class Calibrator:
         done = done if self._headings.shown else min(done, self._n_headings)
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
-                self._on_rows(_own(rows.block(rows.begin + rows.base, done)))
+                self._on_rows(own_copy(rows.block(rows.begin + rows.base, done)))
             rows.forget_before(done - rows.base)
 
     def finish(self) -> None:
@@ -402,7 +371,7 @@ class Calibrator:
             self._update(group)
         rows = self._aligner.rows
         if self._on_rows is not None and rows.size > rows.begin:
-            self._on_rows(_own(rows.block(rows.begin + rows.base, rows.end)))
+            self._on_rows(own_copy(rows.block(rows.begin + rows.base, rows.end)))
 
     # ------------------------------------------------------------------ output
 
@@ -443,18 +412,7 @@ class Calibrator:
 
     def latest_motion(self) -> RecentMotion | None:
         """How the vehicle moves, by its newest samples; None before the first. Its noise is not known here."""
-        rows, imu, reference = self._aligner.rows, self._aligner.imu, self._aligner.reference
-        if rows.size == rows.begin:
-            return None
-        heading = None
-        if imu.newest_ns is not None and not np.isnan(quaternion := imu.values[imu.size - 1, :4]).any():
-            forward = rotation_from_quaternion(quaternion[None])[0, :, 0]
-            heading = float(np.arctan2(forward[1], forward[0]))
-        in_earth = reference.newest_ns is not None and bool(
-            reference.frames[reference.size - 1] != FRAME_CODES[VelocityFrame.BODY]
-        )
-        speed = float(np.linalg.norm(rows.velocity_dvl[rows.size - 1]))
-        return RecentMotion(speed, heading, in_earth, math.nan)
+        return recent_motion(self._aligner)
 
     @property
     def selection(self) -> Selection:
@@ -640,8 +598,3 @@ class Calibrator:
     def suggestion_so_far(self) -> Reason | None:
         """`suggestion`, live: what a look that is not made anew for every message says."""
         return self._further.suggestion_so_far
-
-
-def _own(block: AlignedBlock) -> AlignedBlock:
-    """A copy that what is added later does not change."""
-    return block.part(np.arange(len(block)))

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from ..calibration.models.parameters import Parameters
-    from ..discovery.discover import Discovery, Given
+    from ..discovery.discovery import Discovery, Given
     from ..node.services import AnsweringNode
     from ..node.shutdown import Ending
     from ..present.document import Document
@@ -73,7 +73,7 @@ def discovered(arguments: argparse.Namespace, recording: Recording, parameters: 
 
 def given(arguments: argparse.Namespace) -> Given:
     """What the options of a command name, which is not looked for. Raises InputError."""
-    from ..discovery.discover import Given
+    from ..discovery.discovery import Given
     from ..files.parameter_files import given_parameters
 
     named = given_parameters(arguments.params, arguments.overrides)

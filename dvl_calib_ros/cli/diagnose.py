@@ -17,7 +17,7 @@ from .common import add_report_option, report_writer
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from ..discovery.discover import Discovery
+    from ..discovery.discovery import Discovery
     from ..unpaired.both_sides import RecordedSide
 
 # At rest a bias shows that looks like scale at speed

@@ -16,7 +16,7 @@ from .common import add_report_option, report_writer
 
 if TYPE_CHECKING:
     from ..bag_replay.replay import Replayed
-    from ..discovery.discover import Discovery
+    from ..discovery.discovery import Discovery
     from ..verdict.reasons import Reason
 
 
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
     from ..present import replay as present
-    from ..present.error_terms import options
+    from ..present.numbers import options
 
     common.print_found(discovery, arguments.bags)
     findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])

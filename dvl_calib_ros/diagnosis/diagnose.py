@@ -1,7 +1,4 @@
-"""The diagnosis: from bags to an answer.
-
-(Long, because the steps of one diagnosis stand in their order.)
-"""
+"""The diagnosis: from bags to an answer."""
 
 from __future__ import annotations
 

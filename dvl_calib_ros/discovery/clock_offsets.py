@@ -14,11 +14,14 @@ from itertools import product
 import numpy as np
 
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.samples import SampleBlock, Stream, Streams
+from ..calibration.numerics.samples import SampleBlock, Stream, Streams, VelocityFrame
+from ..calibration.registration.frame_hypotheses import Reading, Readings
 from ..calibration.registration.gauss_newton import white_noise
-from ..calibration.registration.motion_streams import MotionStreams, motion_of
+from ..calibration.registration.motion_streams import MotionStreams, in_order, make_motion, motion_of
 from ..calibration.registration.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
 from ..calibration.registration.unregistrable_clocks import Far, far_clocks
+from ..calibration.streams.interpolation import ImuColumns
+from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
 from ..recordings.topic_preview import Look, Survey
@@ -188,3 +191,28 @@ def _thinned(look: Look) -> Look:
     step = -(-len(look.stamps_s) // COMPARED)
     rates = None if look.rates is None else look.rates[::step]
     return replace(look, stamps_s=look.stamps_s[::step], values=look.values[::step], rates=rates)
+
+
+def difference_of(dvl: Look, reference: Look) -> float | None:
+    """What no rotation explains of the difference of two velocities, both taken as in the body."""
+    motion = compared_motion(dvl, reference, None)
+    if motion is None:
+        return None
+    found = Readings(motion, np.zeros(3)).agreements([Reading(VelocityFrame.BODY, None, False)], None)
+    return found[0].best_left if found else None
+
+
+def compared_motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStreams | None:
+    """What was looked at, as messages have it; None where there is too little."""
+    columns = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
+    if imu is not None and imu.has_orientation:
+        columns = imu_columns_of(imu)
+    measured = True, True, bool(reference.values[:, 2].any())
+    own, other = (in_order(each.stamps_s, each.values) for each in (dvl, reference))
+    return make_motion(own, other, False, measured, columns)
+
+
+def imu_columns_of(imu: Look) -> ImuColumns:
+    """Return orientation and angular velocity of an IMU's topic as columns."""
+    times, values = in_order(imu.stamps_s, imu.values)
+    return ImuColumns(times, unit_quaternions(values[:, :4]), values[:, 4:7])

@@ -1,14 +1,13 @@
 """What a recording says of itself: topics, mounting, lever arm and frames, so that a calibration needs no options.
 
-What the user gives always stands. What is found is said, with its source; nothing is changed silently. (Long, because
-each thing that is found is said with its source, in one place.)
+What the user gives always stands. What is found is said, with its source; nothing is changed silently.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ import numpy as np
 from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.registration.clock_domains import limit_s
 from ..calibration.registration.frame_hypotheses import (
     CLEARLY,
     FITS,
@@ -30,9 +28,6 @@ from ..calibration.registration.frame_hypotheses import (
     turns_right,
 )
 from ..calibration.registration.gauss_newton import white_noise
-from ..calibration.registration.motion_streams import MotionStreams, in_order, make_motion
-from ..calibration.streams.interpolation import ImuColumns
-from ..calibration.streams.screening import unit_quaternions
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
 from ..messages.drivers import VELOCITY_TYPES
@@ -41,7 +36,17 @@ from ..recordings.topic_preview import Look, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
-from .clock_offsets import FoundClocks, find_clocks, in_time
+from .clock_offsets import compared_motion, difference_of, imu_columns_of, in_time
+from .discovery import (
+    Discovery,
+    Given,
+    as_option,
+    clocks_of_recording,
+    in_degrees,
+    in_metres,
+    in_time_of,
+    mounting_guessed,
+)
 from .gravity import Gravity, believed_heading
 from .transforms import FrameTree, Placed
 
@@ -63,76 +68,6 @@ BETTER = 0.8
 USUAL = (VelocityFrame.ENU, VelocityFrame.BODY, VelocityFrame.NED)
 
 
-@dataclass(frozen=True)
-class Given:
-    """What the user named, which is not looked for: topics (None: not named) and names of parameters."""
-
-    dvl_topic: str | None = None
-    gnss_topic: str | None = None
-    imu_topic: str | None = None
-    parameters: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True)
-class Discovery:
-    """What to calibrate with.
-
-    found: what was found and where, in sentences; notes: what was passed over; contradictions: where the recording's
-    data do not bear out what it declares. values: the parameters that were found, which are in `parameters`. agreement:
-    how well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
-    knows_imu: whether it is known in which axes the IMU measures. mounting_because: why the mounting is what it is,
-    where it is guessed from the data; else ''. clocks_given: the parameters of clocks of which more is taken off in
-    `parameters`, as they were before.
-    """
-
-    topics: Topics
-    parameters: Parameters
-    found: tuple[str, ...] = ()
-    notes: tuple[Reason, ...] = ()
-    contradictions: tuple[Reason, ...] = ()
-    values: Mapping[str, Any] = field(default_factory=dict)
-    agreement: Agreement | None = None
-    reference_frame: VelocityFrame | None = None
-    knows_imu: bool = False
-    clocks: FoundClocks | None = None
-    mounting_because: str = ""
-    clocks_given: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def diagnosed(self) -> Parameters:
-        """The parameters with clocks as they were given: what a calibration takes off them a diagnosis names."""
-        return self.parameters.replace(**self.clocks_given)
-
-    def with_mounting(self, rpy: Sequence[float]) -> Discovery:
-        """The same where a calibration has found a better mounting (rad) than the one that was guessed."""
-        before, roll_pitch_yaw = self.parameters.mounting_rpy, tuple(map(float, rpy))
-        if not self.mounting_because or roll_pitch_yaw == before:
-            return self
-        again = _mounting_guessed(roll_pitch_yaw, self.mounting_because)
-        return replace(
-            self,
-            parameters=self.parameters.replace(mounting_rpy=roll_pitch_yaw),
-            values={**self.values, "mounting_rpy": roll_pitch_yaw},
-            notes=tuple(again if note.code == again.code else note for note in self.notes),
-        )
-
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """What the user should not overlook."""
-        return tuple(each.sentence for each in (*self.contradictions, *self.notes))
-
-    def document(self) -> dict[str, Any]:
-        """Plain data, for JSON: topics, what was found, doubts."""
-        topics = {"dvl": self.topics.dvl, "gnss": self.topics.gnss, "imu": self.topics.imu}
-        return {
-            "topics": topics,
-            "found": list(self.found),
-            "doubts": list(self.doubts),
-            "contradictions": [each.as_dict() for each in self.contradictions],
-            "notes": [each.as_dict() for each in self.notes],
-        }
-
-
 def discover(recording: Recording | Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
     """Look into a recording for what is not given. Raises InputError for named topics that are not there."""
     if not isinstance(recording, Recording):
@@ -141,7 +76,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         raise InputError(f"{recording.where}: the bag is empty, it has no topics; record it again")
     named = given or Given()
     found = _Search(recording.survey, parameters, named, recording.where).run()
-    clocks = _clocks(recording, found, named)
+    clocks = clocks_of_recording(recording, found, named)
     if clocks is None:
         return found
     if clocks.registration.offsets:
@@ -153,7 +88,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         all_named = replace(named, dvl_topic=topics.dvl, gnss_topic=topics.gnss, imu_topic=imu)
         again = _Search(seen, parameters, all_named, recording.where).run()
         if again.values != found.values:
-            found, clocks = again, _clocks(recording, again, named) or clocks
+            found, clocks = again, clocks_of_recording(recording, again, named) or clocks
         else:
             found = again
     return replace(
@@ -164,22 +99,6 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         clocks=clocks,
         clocks_given={n: getattr(parameters, n) for n in clocks.offsets},
     )
-
-
-def _clocks(recording: Recording, found: Discovery, given: Given) -> FoundClocks | None:
-    knows_mounting = "mounting_rpy" in {*found.values, *given.parameters}
-    return find_clocks(recording, found.topics, found.parameters, knows_mounting=knows_mounting, given=given.parameters)
-
-
-def _in_time_of(dvl: Look, other: Look | None, parameters: Parameters) -> Look | None:
-    """By stamps as the DVL's clock would have them, where clocks differ by more than any delay that is looked for.
-
-    Velocities of different times agree in any frame but the right one; what it says of the clocks the replay says.
-    """
-    ahead_s = 0.0 if other is None else other.ahead_s - dvl.ahead_s
-    if other is None or abs(ahead_s) <= limit_s(parameters):
-        return other
-    return replace(other, stamps_s=other.stamps_s - ahead_s)
 
 
 class _Search:
@@ -202,7 +121,7 @@ class _Search:
         looks = self._seen.looks
         dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
         if dvl is not None:
-            self._frames(dvl, *(_in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
+            self._frames(dvl, *(in_time_of(dvl, each, self._parameters) for each in (reference, imu)))
         self._found.insert(0, self._topics_said(topics))
         return Discovery(
             topics,
@@ -222,10 +141,10 @@ class _Search:
     def _topics(self) -> Topics:
         given, default = self._given, Topics()
         dvl = self._named("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._seen, default.dvl, self._where)
-        self._notes += topic_choice.other_dvls(self._seen, dvl, _difference)
+        self._notes += topic_choice.other_dvls(self._seen, dvl, difference_of)
         gnss, imu = default.gnss, default.imu
         if given.gnss_topic is None:
-            chosen, said = topic_choice.choose_reference(self._seen, default.gnss, dvl, _difference)
+            chosen, said = topic_choice.choose_reference(self._seen, default.gnss, dvl, difference_of)
             gnss = chosen or default.gnss
             self._notes += said
         elif given.gnss_topic != topic_choice.NONE:
@@ -300,7 +219,7 @@ class _Search:
             self._place_lever_arm(placed, reference)
         elif reference is not None and not self._gives("lever_arm"):
             self._found.append(
-                f"lever arm {_metres(self._parameters.lever_arm)} m: no transform of {dvl.frame_id!r} says where the "
+                f"lever arm {in_metres(self._parameters.lever_arm)} m: no transform of {dvl.frame_id!r} says where the "
                 "DVL sits; half a metre turns the yaw by tenths of a degree (-p lever_arm:=[x,y,z])"
             )
         self._know_position(placed, reference)
@@ -402,7 +321,7 @@ class _Search:
         if declared is not None and declared.frame is VelocityFrame.BODY:
             return declared.points_down
         if imu is not None and imu_frame is not None and reference.rates is not None:
-            turns = turns_right(reference.stamps_s, reference.rates, _imu_columns(imu), imu_frame)
+            turns = turns_right(reference.stamps_s, reference.rates, imu_columns_of(imu), imu_frame)
             if turns is not None:
                 return turns
         world = frame_named(reference.world, ())  # of the pose: a body in NED is forward-right-down by custom
@@ -461,7 +380,7 @@ class _Search:
         placed: Placed | None,
     ) -> Agreement | None:
         position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
-        motion = _motion(dvl, reference, imu)
+        motion = compared_motion(dvl, reference, imu)
         if motion is None:
             return None
         self._readings = Readings(motion, position)
@@ -559,9 +478,9 @@ class _Search:
                     level_left, _ = self._readings.registered(reading, rotation_from_rpy(level).T)
                     self._mounting_found(level if BETTER * level_left <= turned_left else rpy, agree)
         elif chosen.left > FITS and chosen.best_left < CLEARLY * chosen.left:
-            given, fits = _degrees(rpy_from_rotation(known)), nominal_rpy(found)
+            given, fits = in_degrees(rpy_from_rotation(known)), nominal_rpy(found)
             self._contradictions.append(
-                finding("MOUNTING_CONTRADICTED", given=given, found=_degrees(fits), option=_option(fits))
+                finding("MOUNTING_CONTRADICTED", given=given, found=in_degrees(fits), option=as_option(fits))
             )
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
@@ -605,14 +524,14 @@ class _Search:
         if np.allclose(rpy, 0.0, atol=1e-9) and frame.world == "enu":
             return
         self._values |= {"imu_rpy": rpy, "imu_frame": frame.world}
-        self._found.append(f"the IMU's data are taken {frame.says}: imu_rpy {_degrees(rpy)}, imu_frame {frame.world}")
+        self._found.append(f"the IMU's data are taken {frame.says}: imu_rpy {in_degrees(rpy)}, imu_frame {frame.world}")
 
     def _mounting_found(self, rpy: tuple[float, float, float], why: str) -> None:
         if not any(rpy):
             return
         self._values["mounting_rpy"] = rpy
         self._mounting_because = why
-        self._notes.append(_mounting_guessed(rpy, why))
+        self._notes.append(mounting_guessed(rpy, why))
 
     def _mounting_from_motion(self, dvl: Look, turned: bool) -> None:
         """Without a reference: a vehicle goes ahead, which is what the models without GNSS go by as well."""
@@ -635,22 +554,16 @@ class _Search:
 
     def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
         given_mounting = self._gives("mounting_rpy")
-        said = [] if given_mounting else [f"mounting {_degrees(rpy_from_rotation(placed.rotation))}"]
+        said = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]
         if not self._gives("lever_arm"):
             position = placed.position
             if reference is not None:
                 position = position - self._reference_position(reference)
             if np.abs(position).max() <= 100.0:  # the parameter's range; more is a transform in another unit
                 self._values["lever_arm"] = tuple((position + 0.0).tolist())
-                said.append(f"lever arm {_metres(position)} m")
+                said.append(f"lever arm {in_metres(position)} m")
         if said:
             self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
-
-
-def _mounting_guessed(rpy: Sequence[float], why: str) -> Reason:
-    # of a level vehicle, a heading that counts from elsewhere looks the same
-    also = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
-    return finding("MOUNTING_GUESSED", mounting=_degrees(rpy), why=why, option=_option(rpy), also=also)
 
 
 def _decided(found: Sequence[Agreement], wanted: Reading, declared: bool) -> Agreement | None:
@@ -670,39 +583,3 @@ def _decided(found: Sequence[Agreement], wanted: Reading, declared: bool) -> Agr
         return best
     alike = [each for each in found if CLEARLY * each.left <= best.left]
     return min(alike, key=lambda each: (USUAL.index(each.reading.reference), found.index(each)))
-
-
-def _difference(dvl: Look, reference: Look) -> float | None:
-    """What no rotation explains of the difference of two velocities, both taken as in the body."""
-    motion = _motion(dvl, reference, None)
-    if motion is None:
-        return None
-    found = Readings(motion, np.zeros(3)).agreements([Reading(VelocityFrame.BODY, None, False)], None)
-    return found[0].best_left if found else None
-
-
-def _motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStreams | None:
-    """What was looked at, as messages have it; None where there is too little."""
-    columns = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
-    if imu is not None and imu.has_orientation:
-        columns = _imu_columns(imu)
-    measured = True, True, bool(reference.values[:, 2].any())
-    own, other = (in_order(each.stamps_s, each.values) for each in (dvl, reference))
-    return make_motion(own, other, False, measured, columns)
-
-
-def _imu_columns(imu: Look) -> ImuColumns:
-    times, values = in_order(imu.stamps_s, imu.values)
-    return ImuColumns(times, unit_quaternions(values[:, :4]), values[:, 4:7])
-
-
-def _degrees(rpy: Iterable[float]) -> str:
-    return " ".join(f"{round(math.degrees(angle), 2) + 0.0:g}°" for angle in rpy)
-
-
-def _metres(position: Iterable[float]) -> str:
-    return " ".join(f"{value + 0.0:.3g}" for value in position)
-
-
-def _option(rpy: Iterable[float]) -> str:
-    return "[" + ",".join(f"{math.degrees(angle):.4g}deg" for angle in rpy) + "]"

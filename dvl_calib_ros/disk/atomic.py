@@ -1,7 +1,4 @@
-"""Files that are always the old or the new one, whole, whatever happens while they are written.
-
-(Long, because the calls of a save, and what each leaves if it is the last, are to be seen in one place.)
-"""
+"""Files that are always the old or the new one, whole, whatever happens while they are written."""
 
 from __future__ import annotations
 

@@ -15,7 +15,8 @@ from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.frame_hypotheses import FITS
 from ..calibration.streams.position_velocities import NOISY_MPS
-from ..discovery.discover import Discovery, Given, discover
+from ..discovery.discover import discover
+from ..discovery.discovery import Discovery, Given
 from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S
 from ..recordings.recording import Recording, open_recording

@@ -1,7 +1,5 @@
 """What a result file says of the mounting, in the forms that others take it in: URDF, TF, robot_localization.
 
-(Long, because what is against a calibration is asked before any of the forms.)
-
 What a result file says of a DVL, in the terms that calibrations are compared in.
 """
 

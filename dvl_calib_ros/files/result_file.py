@@ -1,7 +1,4 @@
-"""The result of a calibration as a YAML file: never lost to a worse one, never believed blindly when read.
-
-(Long, because what is written, kept and believed of a result is one thing.)
-"""
+"""The result of a calibration as a YAML file: never lost to a worse one, never believed blindly when read."""
 
 from __future__ import annotations
 

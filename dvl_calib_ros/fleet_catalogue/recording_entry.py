@@ -20,7 +20,8 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.results.extrinsics import Extrinsics
 from ..calibration.results.mounting_quantities import quantities
 from ..calibration.results.results import Estimate, Result
-from ..discovery.discover import Given, discover
+from ..discovery.discover import discover
+from ..discovery.discovery import Given
 from ..errors import InputError
 from ..recordings.recording import open_recording
 from .recording_search import StoredRecording, as_text

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ..calibration.models.parameters import Parameters
-from ..discovery.discover import Given
+from ..discovery.discovery import Given
 from ..errors import InputError
 from ..files.output_paths import check_outputs
 from ..parallel import Lost, Workers, outcomes_as_done

@@ -3,7 +3,6 @@
 A driver is one entry in `VELOCITY_TYPES`; bags, the node, and the documentation's table go by it. The rules follow the
 definitions and what the drivers do with them: the Water Linked driver (waterlinked_dvl, marine_acoustic_msgs/Dvl) and
 dvl-a50 (dvl_msgs/DVL), which both hand on the sensor's JSON reports (docs.waterlinked.com/dvl/dvl-json-protocol).
-(Long, because it is a table of message types, with the rules of each.)
 
 PX4's odometry, which has neither header nor frame names: its numbers as the other types have them.
 """

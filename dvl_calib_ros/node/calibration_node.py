@@ -1,7 +1,4 @@
-"""The node ``dvl_calibration``: topics, parameters, services and diagnostics around a `Calibrator`.
-
-(Long, because all that the node says and hears is this one class.)
-"""
+"""The node ``dvl_calibration``: topics, parameters, services and diagnostics around a `Calibrator`."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from ..discovery.topic_choice import may_be_dvl
 from ..errors import InputError
 
 if TYPE_CHECKING:
-    from ..discovery.discover import Discovery
+    from ..discovery.discovery import Discovery
     from .topic_recorder import TopicRecorder
 
 # So long is recorded, s; longer, where a topic that has a publisher has not brought so many messages yet: a USBL gives
@@ -136,7 +136,8 @@ class Discovering:
             folder.cleanup()
 
     def _look_through(self, folder: TemporaryDirectory[str], path: Path) -> FoundTopics:
-        from ..discovery.discover import Given, discover
+        from ..discovery.discover import discover
+        from ..discovery.discovery import Given
         from ..recordings.recording import open_recording
 
         given = Given(self._named["dvl"], self._named["gnss"], self._named["imu"], self._given)

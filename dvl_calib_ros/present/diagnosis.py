@@ -1,7 +1,4 @@
-"""What a diagnosis says.
-
-(Long, because it is the order of one page.)
-"""
+"""What a diagnosis says."""
 
 from __future__ import annotations
 

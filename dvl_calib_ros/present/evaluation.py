@@ -1,7 +1,4 @@
-"""What an evaluation says.
-
-(Long, because it is the order of one page.)
-"""
+"""What an evaluation says."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from ..files.parameter_files import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
 from .document import Answer, Columns, Commands, Document, FindingLine, Section, Sentence, bar, table_by
-from .error_terms import options, typed
+from .numbers import options, typed
 
 SHOWN_NOTE = "A full bar is fine (fine_std_misalignment, fine_std_scale); red is not shown, and yellow between."
 ANSWERS = {

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -95,3 +97,17 @@ def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffec
 def fitting_unit(seconds: float) -> tuple[float, str]:
     """Length in s and name of the unit in which people tell such a time."""
     return (1.0, "s") if seconds <= 600.0 else (60.0, "min") if seconds <= 10_800.0 else (3600.0, "h")
+
+
+def typed(command: str, bags: Iterable[Path], *options: object) -> str:
+    """A line to type."""
+    return shlex.join(["dvl-calib", *command.split(), *map(str, bags), *map(str, options)])
+
+
+def options(
+    topics: Iterable[tuple[str, str | None]], overrides: Iterable[str], parameters: Path | None = None
+) -> list[str]:
+    """What names topics (role and name, None for those that are found) and parameters."""
+    words = [] if parameters is None else ["--params", str(parameters)]
+    words += [word for override in overrides for word in ("-p", override)]
+    return words + [word for role, name in topics if name is not None for word in (f"--{role}-topic", name)]

@@ -1,7 +1,4 @@
-"""What a replay says: what to do with the calibration, the mounting found, what it is worth, and what to type next.
-
-(Long, because it is the order of one page.)
-"""
+"""What a replay says: what to do with the calibration, the mounting found, what it is worth, and what to type next."""
 
 from __future__ import annotations
 
@@ -48,8 +45,8 @@ from .document import (
     section,
     table_by,
 )
-from .error_terms import estimate_table, typed
-from .numbers import fitting_unit
+from .error_terms import estimate_table
+from .numbers import fitting_unit, typed
 
 # What the verdict's word asks of the reader.
 ADVICE = {

@@ -1,7 +1,7 @@
 """What can be wrong with data, configuration and network: every warning with its code, its meaning and its remedy.
 
 /diagnostics, the notes of a replay and the table in docs/troubleshooting.md are made from it, so a warning is an entry
-here and a call of `finding` where it is noticed. (Long, because it is a table.)
+here and a call of `finding` where it is noticed.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from io_fixtures import run
 from report_fixtures import comparison, cross_checked, diagnosis, evaluation, replay_page
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.discovery.discover import Given
+from dvl_calib_ros.discovery.discovery import Given
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.present.page import write_report
 

@@ -14,7 +14,8 @@ from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.discovery.discover import Given, discover
+from dvl_calib_ros.discovery.discover import discover
+from dvl_calib_ros.discovery.discovery import Given
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate, write_bag

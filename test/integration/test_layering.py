@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
-from validation import rooms
+from validation import rooms, size
 from validation.__main__ import main
 from validation.layout import layout_functions
 
@@ -55,12 +55,27 @@ def test_no_arrow_of_the_table_goes_up_so_that_there_is_no_circle():
     assert rooms.arrows_up() == []
 
 
+def test_no_two_modules_import_each_other():
+    """Within functions and for types alone as well."""
+    assert rooms.module_circles() == []
+
+
+def test_a_circle_of_modules_is_seen(tmp_path, monkeypatch):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "disk" / "__init__.py").write_text("")
+    (tmp_path / "disk" / "a.py").write_text("if TYPE_CHECKING:\n    from .b import B\n")
+    (tmp_path / "disk" / "b.py").write_text("def f():\n    from . import a\n")
+    monkeypatch.setattr(rooms, "PACKAGE", tmp_path)
+    assert rooms.module_circles() == [["disk.a", "disk.b"]]
+
+
 @pytest.mark.parametrize(
     ("name", "text", "what"),
     [
         ("attic/box.py", "from ..bags import reader", ("attic", "bags")),
         ("bags/new.py", "if TYPE_CHECKING:\n    from ..recordings import look", ("bags", "recordings")),
-        ("calibration/delay/new.py", "def f():\n    from ...bags import reader", ("calibration", "bags")),
+        ("calibration/streams/new.py", "def f():\n    from ...bags import reader", ("calibration.streams", "bags")),
+        ("calibration/streams/a.py", "from ..filters import b", ("calibration.streams", "calibration.filters")),
         ("disk/new.py", "from .. import api", ("disk", "api")),
     ],
 )  # fmt: skip
@@ -77,8 +92,8 @@ def test_an_arrow_up_and_an_unknown_room_are_seen(tmp_path, monkeypatch, name, t
 
 
 def test_no_estimator_is_asked_for_by_its_name_outside_its_own_room():
-    named = [path for path in rooms.modules() if '"G2"' in path.read_text() and path.parent.name != "delay"]
-    assert named == []
+    named = {path.parent.name for path in rooms.modules() if '"G2"' in path.read_text()}
+    assert named <= {"estimators", "models"}
 
 
 def test_the_size_is_printed_with_arrows(capsys):
@@ -91,6 +106,17 @@ def test_the_size_is_printed_with_arrows(capsys):
     assert main(["size", "--json"]) == 0
     counts = json.loads(capsys.readouterr().out)
     assert counts["lines"] == rooms.sizes().total() and counts["arrows_up"] == 0
+
+
+def test_what_has_grown_fails_the_limit(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(size, "LIMITS", tmp_path / "limits.json")
+    assert main(["size", "--store", "--limit"]) == 0
+    stored = json.loads(size.LIMITS.read_text())
+    assert set(stored) == {"lines", "modules", "arrows"} and "too many" not in capsys.readouterr().out
+    for name in stored:
+        size.LIMITS.write_text(json.dumps(stored | {name: stored[name] - 1}))
+        assert main(["size", "--limit"]) == 1
+        assert f"{stored[name]} {name}, {stored[name] - 1} allowed: 1 too many" in capsys.readouterr().out
 
 
 def test_a_result_is_laid_out_by_few_functions_and_none_of_them_is_long():
@@ -129,7 +155,7 @@ def test_no_live_message_waits_for_an_import():
     """The first one alone would for a fifth of a second, and those behind it."""
     script = """
 import sys
-from dvl_calib_ros.calibration import kalman
+from dvl_calib_ros.calibration.numerics import kalman
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample

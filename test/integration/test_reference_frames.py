@@ -15,7 +15,8 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, FLU_FROM_FRD
 from dvl_calib_ros.calibration.numerics.samples import ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.discovery.discover import Given, discover
+from dvl_calib_ros.discovery.discover import discover
+from dvl_calib_ros.discovery.discovery import Given
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal, frame_named
 from dvl_calib_ros.messages.drivers import VELOCITY_TYPES
 

@@ -17,7 +17,8 @@ from dvl_calib_ros.bag_replay.replay import Replayed, replay
 from dvl_calib_ros.calibration.filters.observability import body_angle_std
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rotation_from_rpy
-from dvl_calib_ros.discovery.discover import Discovery, Given, discover
+from dvl_calib_ros.discovery.discover import discover
+from dvl_calib_ros.discovery.discovery import Discovery, Given
 from dvl_calib_ros.errors import InputError
 
 ANSWERED = [name for name, stack in STACKS.items() if not stack.missing]

@@ -16,8 +16,10 @@ from ...verdict.reasons import Reason, finding
 from ..models import MODELS, Model
 from ..models.base import Assumptions, Observations
 from ..models.parameters import Parameters
-from ..numerics.frames import Array, skew
+from ..numerics.frames import Array, rotation_from_quaternion, skew
+from ..numerics.samples import FRAME_CODES, VelocityFrame
 from ..results.results import Estimate
+from ..streams.aligner import Aligner
 
 KM = 1000.0
 # A manoeuvre is tried for so long, s, by samples of so many s; after so many of them nobody drives on.
@@ -214,3 +216,19 @@ def _information(
     weighted = np.linalg.solve(noise[:, :rows, :rows], h) * (weight * seconds)[:, None, None]
     information: Array = np.tensordot(h, weighted, axes=((0, 1), (0, 1)))
     return information
+
+
+def recent_motion(aligner: Aligner) -> RecentMotion | None:
+    """Return how the vehicle moves by its newest samples; None before the first. Its noise is not known here."""
+    rows, imu, reference = aligner.rows, aligner.imu, aligner.reference
+    if rows.size == rows.begin:
+        return None
+    heading = None
+    if imu.newest_ns is not None and not np.isnan(quaternion := imu.values[imu.size - 1, :4]).any():
+        forward = rotation_from_quaternion(quaternion[None])[0, :, 0]
+        heading = float(np.arctan2(forward[1], forward[0]))
+    in_earth = reference.newest_ns is not None and bool(
+        reference.frames[reference.size - 1] != FRAME_CODES[VelocityFrame.BODY]
+    )
+    speed = float(np.linalg.norm(rows.velocity_dvl[rows.size - 1]))
+    return RecentMotion(speed, heading, in_earth, math.nan)

@@ -10,7 +10,7 @@ And where it follows what the DVL's noise was before, the reference is a filter'
 of the DVL and r = s + m of an instrument of its own, r - d = m - n, and noise n that is new with each sample is not
 foretold by any d before it. A filter that keeps h of the noise makes r - d = m - n + h ∗ n, which is. The noise that
 was is what past d did not foretell of d (an autoregression). A smoothed reference lags the motion, and gives the other
-sign. (Long, because all of it is asked of one fit.)
+sign.
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 Every calibration is an estimate with a covariance, of other data than the others'. The difference of two has the sum of
 their covariances; d'S⁻¹d of it is chi-square distributed if nothing changed. Of a series in time the instant is looked
 for that parts it best into before and after, then within either part ("binary segmentation"; Scott and Knott, "A
-cluster analysis method for grouping means in the analysis of variance", 1974). (Long, because what is compared and how
-it is worded stand together.)
+cluster analysis method for grouping means in the analysis of variance", 1974).
 """
 
 from __future__ import annotations

@@ -3,8 +3,7 @@
 A hypothesis of 3 s of delay needs what comes 3 s later, so G2's samples are used when the others' have long been. What
 the aligner holds of a block is copied as soon as all that may belong to it has come or is overdue, and solved: at once,
 or by a worker while the node goes on receiving. Either way the outcome takes effect when the stamps have gone on by
-SOLVED_WITHIN_NS, so that a live run and a replay of its recording agree whatever the machine was doing. (Long, because
-all that the other models' world knows of G2 is asked here.)
+SOLVED_WITHIN_NS, so that a live run and a replay of its recording agree whatever the machine was doing.
 """
 
 from __future__ import annotations

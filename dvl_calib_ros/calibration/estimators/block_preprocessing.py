@@ -6,9 +6,9 @@ A block of time of all streams, copied from what the aligner holds: what G2 is s
 
 Samples of a slow DVL that are far off, left out before they bend the curve that references are held against.
 
-Of a fast stream, neighbours tell a sample that is far off (outliers.py). Between the samples of a slow one a vehicle can
-turn: there neighbours only raise a suspicion, and the references about it decide. Without a sample that is wrong they
-fit much better, with whatever delay they are beside it; without one that is right they do not.
+Of a fast stream, neighbours tell a sample that is far off (outliers.py). Between the samples of a slow one a vehicle
+can turn: there neighbours only raise a suspicion, and the references about it decide. Without a sample that is wrong
+they fit much better, with whatever delay they are beside it; without one that is right they do not.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """G2's blocks of time, solved one after the other: rows, outliers, the bank of delays, and what comes of it.
 
 A block is a copy of what the aligner held, and nobody else touches what is in here meanwhile: so a block can be solved
-beside the thread that feeds the aligner (`filter.DelayFilter` says when its outcome takes effect). (Long, because what
-blocks come to must be the same however many are gathered, so all that decides it is here.)
+beside the thread that feeds the aligner (`filter.DelayFilter` says when its outcome takes effect).
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ than another, and the delay's standard deviation stays that of the prior.
 
 Noise that is larger than claimed, or correlated, would make evidence and covariance overconfident: evidence is
 divided by the best hypothesis' own mean squared innovation, and standard deviations grow to what blocks of time
-show (block_covariance.py). (Long, because what a hypothesis knows, of heave and over the end of a day, is one thing.)
+show (block_covariance.py).
 """
 
 from __future__ import annotations
@@ -38,18 +38,23 @@ from ..numerics.frames import Array, product
 from ..numerics.kalman import GaussianState
 from ..numerics.robust import median
 from ..numerics.samples import Index, Mask
-from .normal_equations import innovation_squared, told_by
+from .normal_equations import (
+    CELL_STD_S,
+    ExpectedBlocks,
+    conditioned,
+    likely_hypotheses,
+    merged_mixture,
+    not_observed,
+    prior_by_delay,
+    told_by,
+)
 from .observation_rows import DELAYS_S, OF_DAY, STEP_S, STEPS, DelayedRows
 from .posterior_types import After, BlockRows, DayState, Ended, Hypotheses, Known, Likely, Posterior, Sums, Told, parts
 
-# Each hypothesis believes its own delay to this, s: neighbours overlap, so together they hold any delay between them.
-CELL_STD_S = 0.2
 # A gate compares with the innovations of so many of the newest samples, once there are ENOUGH.
 RECENT, ENOUGH = 256, 20
 # Median of chi-square with three degrees of freedom.
 MEDIAN_NIS = 2.366
-# Hypotheses with a smaller share of the best one's probability are left out of the mixture.
-SMALLEST_SHARE = 1e-9
 # Hypotheses that are less likely by so much more, in logarithms, have lost for the rest of the day.
 LOST = 100.0
 # A state is shown by the data if these alone, with priors of all else wider by this, have halved its prior σ.
@@ -104,8 +109,8 @@ class DelayBank:
         """What hypotheses start from by the prior alone, of the errors and as the filter has it."""
         prior = self.prior
         self.compared: Index = STEPS
-        self._start = _around_each_delay(to_correction(prior, self._roll))
-        self._prior_on_errors = PriorOnErrors(self._start, _around_each_delay(prior), self._roll)
+        self._start = prior_by_delay(to_correction(prior, self._roll))
+        self._prior_on_errors = PriorOnErrors(self._start, prior_by_delay(prior), self._roll)
         # of a delay's deviation from the prior's mean
         variance = prior.p[DELAY, DELAY] + CELL_STD_S**2
         self._log_prior = -0.5 * (DELAYS_S - prior.x[DELAY]) ** 2 / variance
@@ -148,7 +153,7 @@ class DelayBank:
         inflation, shown = self._shown_now(best, found)
         folds = [None] if self._folds is None else [None, *range(FOLDS)]
         known = [self._held(self._solve(fold), log_share) for fold in folds]
-        begins = [_around_each_delay(with_states_of(each, self._unknown, OF_DAY)).information for each in known]
+        begins = [prior_by_delay(with_states_of(each, self._unknown, OF_DAY)).information for each in known]
         total = all_told(found.information, found.vector, self.blocks, self._of_heave(slice(None)))
         source = np.full(len(DELAYS_S), best)
         # what can fail has not, and from here on all changes together
@@ -210,7 +215,7 @@ class DelayBank:
 
     def _taken(self, blocks: Sequence[BlockRows]) -> list[After]:
         """`add`. Raises numpy.linalg.LinAlgError, and is as before, where numbers of several blocks run away."""
-        expected = _Expected(self, blocks)
+        expected = ExpectedBlocks(self, blocks)
         if not expected.is_finite:
             if len(blocks) > 1:
                 raise np.linalg.LinAlgError("what a block tells is not finite")
@@ -406,7 +411,7 @@ class DelayBank:
         """What is known as of now, to be `found`. heave: its rows by now, if not all that there are."""
         found, log_share = self._shares()
         best = int(np.argmax(log_share))
-        kept, share = _likely(log_share)
+        kept, share = likely_hypotheses(log_share)
         likely = GaussianState(found.x[kept], found.p[kept])
         place = int(np.searchsorted(kept, best))
         seen = None if self._process_rate is not None else self._seen(likely, kept, place, heave)
@@ -471,7 +476,7 @@ class DelayBank:
         ]
 
     def _posterior(self, found: Likely, errors: GaussianState) -> Posterior:
-        state = _one(errors, self.delays_s[found.kept], found.share)
+        state = merged_mixture(errors, self.delays_s[found.kept], found.share)
         raised = state.raised(found.inflation).turned(self._up, found.drifted)
         p = state.p
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
@@ -479,7 +484,7 @@ class DelayBank:
         rest = np.maximum(np.diag(p)[:3] - by_lever_arm, 1e-12)
         turned = np.abs(turns).max(axis=0)
         # of what is not shown nothing is claimed
-        unclaimed = _without(found.shown, _BEYOND)
+        unclaimed = not_observed(found.shown, _BEYOND)
         of_bias = found.of_bias.where(~np.isin(np.arange(N_STATE), unclaimed))
         claimed = with_states_of(raised, self.prior, unclaimed)
         return Posterior(claimed, found.shown, found.inflation, turned, by_lever_arm / rest, found.heading, of_bias)
@@ -491,7 +496,7 @@ class DelayBank:
         days = []
         for ended, (x, p) in zip(self._ended, states, strict=True):
             raised = GaussianState(x, p).raised(ended.inflation)
-            claimed = with_states_of(raised, self._unknown, _without(ended.shown, OF_DAY))
+            claimed = with_states_of(raised, self._unknown, not_observed(ended.shown, OF_DAY))
             days.append(DayState(claimed, ended.shown))
         return days
 
@@ -512,12 +517,12 @@ class DelayBank:
             last = self._mixture(found, log_share)
             before = self._on_days_before(last, self._held(found, log_share), 1 + fold) if self._ended else []
             states = [
-                with_states_of(state, unknown, _without(np.where(is_of_day, ended.shown, shown), _BEYOND))
+                with_states_of(state, unknown, not_observed(np.where(is_of_day, ended.shown, shown), _BEYOND))
                 for state, ended in zip(before, self._ended, strict=True)
             ]
             if not shown[BEYOND].any():  # and the rest by it, as of a model that takes lever arm and delay as known
-                last = _given(last, _BEYOND, self.prior.x[BEYOND])
-            folds.append([*states, with_states_of(last, known, _without(shown, _BEYOND))])
+                last = conditioned(last, _BEYOND, self.prior.x[BEYOND])
+            folds.append([*states, with_states_of(last, known, not_observed(shown, _BEYOND))])
         return folds
 
     def _on_days_before(self, last: GaussianState, held: GaussianState, fold: int) -> list[GaussianState]:
@@ -557,14 +562,14 @@ class DelayBank:
 
     def _mixture(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """All hypotheses as one, in the errors."""
-        kept, share = _likely(log_share)
+        kept, share = likely_hypotheses(log_share)
         errors = self._prior_on_errors.part(kept).to_errors(GaussianState(found.x[kept], found.p[kept]))
-        return _one(errors, self.delays_s[kept], share)
+        return merged_mixture(errors, self.delays_s[kept], share)
 
     def _held(self, found: Hypotheses, log_share: Array) -> GaussianState:
         """`_mixture` as the filter has the states."""
-        kept, share = _likely(log_share)
-        return _one(GaussianState(found.x[kept], found.p[kept]), self.delays_s[kept], share)
+        kept, share = likely_hypotheses(log_share)
+        return merged_mixture(GaussianState(found.x[kept], found.p[kept]), self.delays_s[kept], share)
 
     def _shown_now(self, best: int, found: Hypotheses) -> tuple[Array, Mask]:
         """By how much blocks of time raise σ of each state (n,), and which (n,) the data show."""
@@ -589,100 +594,3 @@ class DelayBank:
         std = np.sqrt(np.where(variance > 0.0, variance, np.inf)) * inflation
         shown: Mask = (std <= SHOWN_SHARE * self._unknown_std) | known_before
         return shown
-
-
-class _Expected:
-    """What blocks of rows make of a bank, found before it takes them.
-
-    Which rows are used depends on the state before their block, and that on which rows were used before. So all are
-    expected to be used at first; the states by that say which are, and again, until nothing changes: every time one
-    block more is settled, and nearly always all of them are.
-
-    use (J,), nis (J,), told, steps: of each block. heave: rows of heave with theirs; rows: what they were by then.
-    """
-
-    def __init__(self, bank: DelayBank, blocks: Sequence[BlockRows]) -> None:
-        self._bank, self._blocks = bank, blocks
-        self.use: list[Mask] = [np.ones(len(each.rows), dtype=bool) for each in blocks]
-        self.nis: list[Array] = [np.zeros(len(each.rows)) for each in blocks]
-        self.steps: list[tuple[Sums, Hypotheses]] = []
-        found: dict[int, Told] = {}
-        settled, last = 0, len(blocks) - 1
-        while True:
-            for number in range(last):
-                if number not in found:
-                    found[number] = bank.told_by(blocks[number], self.use[number])
-            self.told = [found[number] for number in range(last)]
-            self.is_finite = all(each.is_finite for each in self.told)
-            if not self.is_finite:
-                return
-            self.heave = bank.heave.copy() if last else bank.heave
-            self.rows = [self._heave_after(number) for number in range(last)]
-            # of the one that was settled last other rows are used than the time before
-            first = max(settled - 1, 0)
-            start = self.steps[first - 1][0] if first else bank.sums
-            self.steps = self.steps[:first] + bank.steps(start, self.told[first:], self.rows[first:])
-            for number in range(settled, last + 1):
-                before = self.steps[number - 1][1] if number else bank.hypotheses
-                state = GaussianState(before.x, before.p)
-                self.nis[number] = innovation_squared(state, blocks[number].rows).min(axis=0)
-            used = bank.gated_by(self.nis)
-            wrong = [number for number in range(last + 1) if (used[number] != self.use[number]).any()]
-            self.use = used
-            if not wrong or wrong[0] == last:
-                break
-            settled = wrong[0] + 1
-            for number in wrong:
-                found.pop(number, None)
-        self.told.append(bank.told_by(blocks[last], self.use[last]))
-        self.is_finite = self.told[last].is_finite
-        if self.is_finite:
-            start = self.steps[-1][0] if last else bank.sums
-            self.rows.append(self._heave_after(last))
-            self.steps += bank.steps(start, self.told[last:], self.rows[last:])
-
-    def _heave_after(self, number: int) -> HeaveSums:
-        rows, stamps_ns, _ = self._blocks[number]
-        self.heave.add_sums(stamps_ns, rows.heave, self.use[number])
-        return self.heave.sums()
-
-
-def _given(state: GaussianState, which: Index, values: Array) -> GaussianState:
-    """A state x (n,), P (n, n) where some of it (u,) is known."""
-    gain = np.linalg.solve(state.p[np.ix_(which, which)], state.p[which]).T
-    return GaussianState(state.x + gain @ (values - state.x[which]), state.p - gain @ state.p[which])
-
-
-def _without(shown: Mask, of: Index) -> Index:
-    """Those `of` the states that are not shown (n,)."""
-    return of[~shown[of]]
-
-
-def _likely(log_share: Array) -> tuple[Index, Array]:
-    """Which hypotheses are in the mixture, and the share of each."""
-    share = np.exp(log_share - log_share.max())
-    share[share < SMALLEST_SHARE] = 0.0
-    kept = np.flatnonzero(share)
-    return kept, share[kept] / share[kept].sum()
-
-
-def _one(states: GaussianState, delays_s: Array, share: Array) -> GaussianState:
-    """Hypotheses x (M, n), P (M, n, n) with their delays (M,) as one; its delay is the whole."""
-    x = states.x.copy()
-    x[:, DELAY] += delays_s
-    mean = share @ x
-    apart = x - mean
-    p = np.einsum("k,kij->ij", share, states.p) + np.einsum("k,ki,kj->ij", share, apart, apart)
-    return GaussianState(mean, 0.5 * (p + p.T))
-
-
-def _around_each_delay(prior: GaussianState) -> GaussianState:
-    """The prior of each hypothesis, x (K, n), P (K, n, n): as if the delay had been measured to be its own.
-
-    So the mixture of all is the prior, and each is linear where it stands.
-    """
-    gain = prior.p[:, DELAY] / (prior.p[DELAY, DELAY] + CELL_STD_S**2)
-    p = prior.p - np.outer(gain, prior.p[DELAY])
-    x = prior.x + (DELAYS_S - prior.x[DELAY])[:, None] * gain
-    x[:, DELAY] -= DELAYS_S
-    return GaussianState(x, np.broadcast_to(p, (len(DELAYS_S), *p.shape)).copy())

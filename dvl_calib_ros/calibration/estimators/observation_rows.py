@@ -3,7 +3,6 @@
 The DVL measures, at the true time s, v(s) + ω(s) × l of the body, and stamps it s + τ. Of a reference sample at s, body
 velocity and angular velocity are those of s whatever τ is, with its noise in it once; only the DVL's velocity is read
 at s + τ, where it is 20 times less noisy than GNSS. So hypotheses of τ are told apart by the same reference noise.
-(Long, because each stream is read between its samples in a way of its own.)
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..models import Needs
@@ -9,6 +11,7 @@ from ..models.base import Assumptions, Observations, Unmeasured
 from ..models.parameters import Parameters
 from ..numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion, skew
 from ..numerics.samples import FRAME_CODES, AlignedBlock, Codes, VelocityFrame
+from .state_history import Numbers
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 _BITS = np.array([1, 2, 4], dtype=np.uint8)
@@ -92,3 +95,21 @@ def _reference_in_body(block: AlignedBlock) -> tuple[Array | None, Array | None]
     earth = rotation[:, :, :2] * (frames != _BODY)[:, None, None]
     is_ned = frames == _NED
     return np.where(is_ned[:, None, None], rotation @ ENU_FROM_NED, rotation) if is_ned.any() else rotation, earth
+
+
+class RowsSeen(NamedTuple):
+    """Rows first .. decided - 1 as models with some needs see them: those that have these, with their numbers.
+
+    observations: None where no row has them.
+    """
+
+    first: int
+    decided: int
+    block: AlignedBlock
+    numbers: Numbers
+    observations: Observations | None
+
+
+def own_copy(block: AlignedBlock) -> AlignedBlock:
+    """A copy that what is added later does not change."""
+    return block.part(np.arange(len(block)))

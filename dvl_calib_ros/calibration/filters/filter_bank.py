@@ -2,8 +2,7 @@
 
 So switching models by hand or automatically is a change of what is read, never of what is computed, and the state
 after a switch is that of having run the model from the start. When a model is updated is a matter of speed alone:
-those of one `Group` are stacked and updated together, by blocks of any length. (Long, because numbers that run away are
-caught wherever a group's states are used.)
+those of one `Group` are stacked and updated together, by blocks of any length.
 
 Blocks of time of filters that go on sample by sample, and what they say: σ, heading and bias.
 """

@@ -1,7 +1,7 @@
 """Every parameter, once: name, default, type, unit, range and description.
 
 From this schema come the node's declarations and descriptors, the validation of YAML files offline, the table in the
-docs/reference.md and `config/calibration.yaml`. All in SI units and radians. (Long, because it is a table.)
+docs/reference.md and `config/calibration.yaml`. All in SI units and radians.
 """
 
 from __future__ import annotations

@@ -8,8 +8,7 @@ Two ways to the same numbers (equal to 1e-10, proved in test_kalman.py):
 `recursion` is the filter: one predict and update per sample, covariance in Joseph form.
 `batch` uses that with Φ = I and Q = 0 the filter is prior-regularised weighted least squares for every k at once: the
 information of the first k samples is a running sum. Vectorised over time it is some thirty times faster than a filter
-in Python, and the state after any sample comes with it. (Long, because two ways to the same numbers stand in one place,
-with the small dense algebra of one of them.)
+in Python, and the state after any sample comes with it.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 A live sample is a tuple of plain floats, not arrays: it is built and read once, at up to kHz rates, and a float costs a
 tenth of an array element there. A recording's samples come as a `SampleBlock`, one row per message. Stamps are
-integer nanoseconds; a float second would lose the nanoseconds of 2026. (Long, because all that others share with the
-core stands here.)
+integer nanoseconds; a float second would lose the nanoseconds of 2026.
 """
 
 from __future__ import annotations

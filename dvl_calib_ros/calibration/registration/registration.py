@@ -2,7 +2,6 @@
 
 From all delays within a minute (`coarse`), by least squares about the likeliest (`fine`). The IMU's clock is the time
 base: whose attitude turns the reference into the body. Who starts from an answer, who warns and who corrects asks here.
-(Long, because what is found and what is said of it are one answer.)
 """
 
 from __future__ import annotations

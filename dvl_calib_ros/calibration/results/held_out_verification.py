@@ -1,8 +1,9 @@
 """Hold-out verification: a calibration is judged on samples that it did not use.
 
-For each fold of a run (cross_validation.py) the models are solved again without it, and their correction is tried on it against
-the reference velocity, so that every sample with a reference is judged once, by an estimate that has not seen it. Two
-things are those of the whole run: which samples the gate lets pass, and the random walk, which is taken as none.
+For each fold of a run (filters/cross_validation.py) the models are solved again without it, and their correction is
+tried on it against the reference velocity, so that every sample with a reference is judged once, by an estimate that
+has not seen it. Two things are those of the whole run: which samples the gate lets pass, and the random walk,
+which is taken as none.
 """
 
 from __future__ import annotations

@@ -4,10 +4,10 @@
     IMU ──────► valid? ─► in order? ─► track ──► attitude, rates of the row
     reference ► valid? ─► in order? ─► track ──────────────► reference of the row
 
-A row waits for attitude, and then for its reference, no longer than they can still come (stream_order.py), in order; models
-that need neither do not wait. Rows are judged, oriented and paired by columns (pairing.py): of a recording those of a
-stretch (batch_alignment.py), live those that a message decides. Whether a message is valid and in order is asked of one by
-itself (live_alignment.py) or of a column; test_alignment.py holds both equal.
+A row waits for attitude, and then for its reference, no longer than they can still come (stream_order.py), in order;
+models that need neither do not wait. Rows are judged, oriented and paired by columns (pairing.py): of a recording
+those of a stretch (batch_alignment.py), live those that a message decides. Whether a message is valid and in order is
+asked of one by itself (live_alignment.py) or of a column; test_alignment.py holds both equal.
 
 Where the messages of a calibration went.
 """

@@ -13,8 +13,9 @@ that are replayed together it is known.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from enum import Enum
+from itertools import pairwise
 from typing import ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -313,3 +314,16 @@ class NewDays:
             return True
         before = bisect_right(self._recordings_ns, stamp_ns - interval_ns)
         return bisect_right(self._recordings_ns, stamp_ns) > before
+
+
+def parts_by_day(days: Sequence[int], first: int, end: int) -> Iterator[tuple[int, int, bool]]:
+    """Yield first row, end and whether a day begins, of the parts of rows first .. end - 1.
+
+    days: rows with which days begin, in order.
+    """
+    if not days or days[-1] < first or days[0] >= end:  # as nearly always
+        yield first, end, False
+        return
+    own = [day for day in days if first <= day < end]
+    for start, stop in pairwise(sorted({first, *own, end})):
+        yield start, stop, start in own

@@ -1,7 +1,4 @@
-"""Fits of hypotheses in the composed model, by Gauss-Newton until they stand still.
-
-(Long, because what a fit is, how it is reached and what its intervals hold belong together.)
-"""
+"""Fits of hypotheses in the composed model, by Gauss-Newton until they stand still."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ rotation that I + [φ×] stands for. Nothing is paired: every stream is a curve 
 change of argument, and e is averaged over bins of two intervals of the slower stream (`DiagnosisSettings`).
 
 Regressors are made of the smoothed DVL velocity, whose noise is small; those made from the reference would pull
-estimates towards zero (errors in variables). (Long, because the model and its derivatives stand side by side.)
+estimates towards zero (errors in variables).
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """What a diagnosis looks at: of each recording the streams as they are, each with stamps of its own.
 
-(Long, because every way from messages to a recording is here.)
-
 Where the DVL's clock was set back, by its stamps alone: some were given twice, or what came then was thrown away.
 """
 

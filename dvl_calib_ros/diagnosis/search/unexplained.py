@@ -1,8 +1,7 @@
 """What is left after the best combination of effects: does it still follow the vehicle's motion, or time?
 
 A dictionary of what a vehicle's error could follow, each with a free vector in the body frame. Noise of the sky does
-not know the vehicle's motion, so what follows it is systematic, whatever its cause. (Long, because all that is looked
-for shares one test and one price.)
+not know the vehicle's motion, so what follows it is systematic, whatever its cause.
 """
 
 from __future__ import annotations

@@ -1,0 +1,127 @@
+"""What discovery gives: topics, parameters and frames to calibrate with, and what was passed over."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.samples import VelocityFrame
+from ..calibration.registration.clock_domains import limit_s
+from ..calibration.registration.frame_hypotheses import Agreement
+from ..recordings.recording import Recording
+from ..recordings.topic_preview import Look
+from ..recordings.topics import Topics
+from ..verdict.reasons import Reason, finding
+from .clock_offsets import FoundClocks, find_clocks
+
+
+@dataclass(frozen=True)
+class Given:
+    """What the user named, which is not looked for: topics (None: not named) and names of parameters."""
+
+    dvl_topic: str | None = None
+    gnss_topic: str | None = None
+    imu_topic: str | None = None
+    parameters: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """What to calibrate with.
+
+    found: what was found and where, in sentences; notes: what was passed over; contradictions: where the recording's
+    data do not bear out what it declares. values: the parameters that were found, which are in `parameters`. agreement:
+    how well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
+    knows_imu: whether it is known in which axes the IMU measures. mounting_because: why the mounting is what it is,
+    where it is guessed from the data; else ''. clocks_given: the parameters of clocks of which more is taken off in
+    `parameters`, as they were before.
+    """
+
+    topics: Topics
+    parameters: Parameters
+    found: tuple[str, ...] = ()
+    notes: tuple[Reason, ...] = ()
+    contradictions: tuple[Reason, ...] = ()
+    values: Mapping[str, Any] = field(default_factory=dict)
+    agreement: Agreement | None = None
+    reference_frame: VelocityFrame | None = None
+    knows_imu: bool = False
+    clocks: FoundClocks | None = None
+    mounting_because: str = ""
+    clocks_given: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def diagnosed(self) -> Parameters:
+        """The parameters with clocks as they were given: what a calibration takes off them a diagnosis names."""
+        return self.parameters.replace(**self.clocks_given)
+
+    def with_mounting(self, rpy: Sequence[float]) -> Discovery:
+        """The same where a calibration has found a better mounting (rad) than the one that was guessed."""
+        before, roll_pitch_yaw = self.parameters.mounting_rpy, tuple(map(float, rpy))
+        if not self.mounting_because or roll_pitch_yaw == before:
+            return self
+        again = mounting_guessed(roll_pitch_yaw, self.mounting_because)
+        return replace(
+            self,
+            parameters=self.parameters.replace(mounting_rpy=roll_pitch_yaw),
+            values={**self.values, "mounting_rpy": roll_pitch_yaw},
+            notes=tuple(again if note.code == again.code else note for note in self.notes),
+        )
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the user should not overlook."""
+        return tuple(each.sentence for each in (*self.contradictions, *self.notes))
+
+    def document(self) -> dict[str, Any]:
+        """Plain data, for JSON: topics, what was found, doubts."""
+        topics = {"dvl": self.topics.dvl, "gnss": self.topics.gnss, "imu": self.topics.imu}
+        return {
+            "topics": topics,
+            "found": list(self.found),
+            "doubts": list(self.doubts),
+            "contradictions": [each.as_dict() for each in self.contradictions],
+            "notes": [each.as_dict() for each in self.notes],
+        }
+
+
+def mounting_guessed(rpy: Sequence[float], why: str) -> Reason:
+    """Return the reason that says that a mounting (rad) is guessed from the data."""
+    # of a level vehicle, a heading that counts from elsewhere looks the same
+    also = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
+    return finding("MOUNTING_GUESSED", mounting=in_degrees(rpy), why=why, option=as_option(rpy), also=also)
+
+
+def in_degrees(rpy: Iterable[float]) -> str:
+    """Return roll, pitch, yaw (rad) as text in degrees."""
+    return " ".join(f"{round(math.degrees(angle), 2) + 0.0:g}°" for angle in rpy)
+
+
+def in_metres(position: Iterable[float]) -> str:
+    """Return a position (m) as text."""
+    return " ".join(f"{value + 0.0:.3g}" for value in position)
+
+
+def as_option(rpy: Iterable[float]) -> str:
+    """Return roll, pitch, yaw (rad) as the value of a parameter."""
+    return "[" + ",".join(f"{math.degrees(angle):.4g}deg" for angle in rpy) + "]"
+
+
+def clocks_of_recording(recording: Recording, found: Discovery, given: Given) -> FoundClocks | None:
+    """Return the clock offsets of a recording; None where they cannot be found."""
+    knows_mounting = "mounting_rpy" in {*found.values, *given.parameters}
+    return find_clocks(recording, found.topics, found.parameters, knows_mounting=knows_mounting, given=given.parameters)
+
+
+def in_time_of(dvl: Look, other: Look | None, parameters: Parameters) -> Look | None:
+    """By stamps as the DVL's clock would have them, where clocks differ by more than any delay that is looked for.
+
+    Velocities of different times agree in any frame but the right one; what it says of the clocks the replay says.
+    """
+    ahead_s = 0.0 if other is None else other.ahead_s - dvl.ahead_s
+    if other is None or abs(ahead_s) <= limit_s(parameters):
+        return other
+    return replace(other, stamps_s=other.stamps_s - ahead_s)
