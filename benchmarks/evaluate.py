@@ -21,7 +21,7 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.estimation import SensorData, aligned, heave_joined
 from dvl_calib_ros.evaluation.procedure import Procedure, corrections, run_seed, sensor_data
-from dvl_calib_ros.evaluation.trajectories import load_folder, own_trajectories
+from dvl_calib_ros.evaluation.protocol import load_folder, own_trajectories
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS
 
 from . import DifferentWorkError, Measurement, check_same

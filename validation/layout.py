@@ -19,7 +19,6 @@ OF_NO_RESULT = {
     "terminal_map",
     "figure_data",
     "figure_style",
-    "time_axis",
 }
 PARTS = {
     "Document", "Section", "Item", "Answer", "Sentence", "Table", "Cell", "Number", "Numbers", "Commands", "Facts",

@@ -244,7 +244,7 @@ class Calibration:
         InputError
             If the replay kept no history.
         """
-        from ..present.calibration_figure import calibration_figure
+        from ..present.replay_figures import calibration_figure
 
         if self.replayed.history is None:
             raise InputError("this replay kept no history; replay with history=True")

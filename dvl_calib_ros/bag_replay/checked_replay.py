@@ -26,7 +26,7 @@ from ..calibration.numerics.frames import whole_degrees
 from ..calibration.results.extrinsics import Extrinsics
 from ..calibration.results.held_out_verification import shown_misalignment
 from ..calibration.results.results import Result
-from ..calibration.streams.dropouts import DROPOUT_NS
+from ..calibration.streams.stream_order import DROPOUT_NS
 from ..errors import InputError
 from ..files.mounting import load_extrinsics
 from ..recordings.recording import Recording, open_recording, together

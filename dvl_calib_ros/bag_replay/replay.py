@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.assessment.dead_reckoning import Navigation, navigation_document, objections
+from ..calibration.assessment.dead_reckoning import Navigation, doubts, navigation_document, objections
 from ..calibration.assessment.manoeuvre_planner import drift_left_open
-from ..calibration.assessment.objections import doubts
 from ..calibration.calibrator import Calibrator
 from ..calibration.checks.data_warnings import data_advice, gate_advice, message_advice, reference_advice
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_document

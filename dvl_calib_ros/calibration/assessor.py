@@ -15,9 +15,8 @@ from typing import TypeVar
 import numpy as np
 
 from ..verdict.reasons import Reason
-from .assessment.dead_reckoning import Navigation, dead_reckoned, objections
+from .assessment.dead_reckoning import Navigation, dead_reckoned, doubts, objections
 from .assessment.manoeuvre_planner import drift_left_open
-from .assessment.objections import doubts
 from .estimators.estimator import NEVER, Estimator, Rest
 from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
 from .filters.day_to_day_covariance import day_covariance, offset_covariance

@@ -107,7 +107,7 @@ def _are_bags(paths: list[Path]) -> bool:
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
     from ..errors import InputError
     from ..evaluation.cross_check import cross_check, cross_check_document
-    from ..present import cross_check as present
+    from ..present import evaluation as present
     from ..recordings.topics import Topics
 
     if arguments.csv is not None:

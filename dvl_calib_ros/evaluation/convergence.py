@@ -14,8 +14,8 @@ from ..calibration.numerics.kalman import GaussianState
 from . import protocol
 from .estimation import SensorData, estimate
 from .metrics import BASELINES
+from .protocol import Trajectory
 from .results import ConvergenceCurve, Failure, mean_of_known
-from .trajectories import Trajectory
 
 TIMES_S = (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
 # Noise of the reference, m/s per axis: that of the procedure, and that of a good receiver

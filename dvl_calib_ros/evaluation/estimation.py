@@ -26,8 +26,8 @@ from ..calibration.numerics.frames import Array
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import AlignedBlock, Mask, Stamps, Stream, Streams, no_samples, sample_block
 from ..calibration.streams.aligner import align
+from .protocol import Trajectory
 from .results import Failure
-from .trajectories import Trajectory
 
 T = TypeVar("T", bound=np.generic)
 # stamp of a run's time 0, s since 1970

@@ -17,8 +17,8 @@ from . import protocol
 from .convergence import REFERENCE_STD, TIMES_S, curve_keys, squared_errors
 from .estimation import SensorData, estimate
 from .metrics import BASELINES, RunMoments, heading_spread, vrmse
+from .protocol import Trajectory
 from .results import CalibrationRun, CalibrationSet, Failure, mean_of_known
-from .trajectories import Trajectory
 
 # A leg is a single heading while it turns by no more than this, and is worth calibrating on from this length
 LEG_HEADING_RANGE = np.deg2rad(25.0)

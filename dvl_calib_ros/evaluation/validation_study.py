@@ -39,7 +39,7 @@ from .procedure import (
     sensor_data,
     single_headings,
 )
-from .protocol import SCALES_PERCENT
+from .protocol import SCALES_PERCENT, Trajectory, load_folder, own_trajectories
 from .results import (
     CalibrationRun,
     CalibrationSet,
@@ -52,7 +52,6 @@ from .results import (
     Trace,
     mean_of_known,
 )
-from .trajectories import Trajectory, load_folder, own_trajectories
 
 # The procedure has no lever arm and no delay, so the model that finds them would only be another name of G1
 EVALUATED = tuple(model.name for model in LINEAR_MODELS)

@@ -11,9 +11,9 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from ..calibration.numerics.distributions import normal_isf, normal_sf
 from ..calibration.numerics.frames import Array
 from ..diagnosis.answer.plotted_series import Followed
+from .figure_data import TimeAxis, running_mean
 from .figure_style import FAINT, INK, legend_above, new_figure, plain_log_ticks
 from .replay_figures import AFTER, BAD
-from .time_axis import TimeAxis, running_mean
 
 # Points of a line: running means are smooth, so more cannot be seen
 LINE_POINTS = 300

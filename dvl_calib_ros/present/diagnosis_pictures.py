@@ -16,9 +16,9 @@ from ..calibration.numerics.frames import Array
 from ..diagnosis.answer.plotted_series import DiagnosisSeries, HeldOutTwin
 from . import diagnosis_figures as figures
 from .diagnosis import twin_errors
+from .figure_data import CUT_FROM_S, TimeAxis, running_mean
 from .figure_style import Picture, picture
 from .numbers import mm
-from .time_axis import CUT_FROM_S, TimeAxis, running_mean
 
 # Lines over time are means over this share of the run, and over so many seconds at least
 WINDOW_SHARE, WINDOW_S = 1.0 / 50.0, 5.0

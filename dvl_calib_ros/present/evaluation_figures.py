@@ -9,10 +9,9 @@ from matplotlib.figure import Figure
 
 from ..calibration.numerics.frames import Array
 from .evaluation import CLAIMED
-from .figure_data import mark_time
+from .figure_data import mark_time, running_mean
 from .figure_style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure
 from .figure_style import plain_log_ticks as log_ticks
-from .time_axis import running_mean
 
 # Seconds beyond the longest window at which "all" of a run stands
 ALL_STANDS_S = 40.0

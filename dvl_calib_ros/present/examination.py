@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ..examination.examine import NO_IMU, Content, Examination
-from ..examination.expected_result import Shown
+from ..examination.examine import NO_IMU, Content, Examination, Shown
 from ..files.parameter_files import as_yaml
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity

@@ -11,8 +11,8 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.results.results import Result
 from . import replay_figures as figures
 from .error_terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
+from .figure_data import TimeAxis
 from .figure_style import Picture, picture
-from .time_axis import TimeAxis
 
 BODY_AXES = ("ahead", "to port", "up")
 # What becomes of DVL samples, by model

@@ -14,10 +14,9 @@ from ..fleet_catalogue.update import Fleet
 from ..unpaired.results import UnpairedComparison
 from ..unpaired.simulator_rounds import ClosedGap
 from .comparison import comparison
-from .cross_check import cross_check
 from .diagnosis import diagnosis
 from .document import Document
-from .evaluation import evaluation
+from .evaluation import cross_check, evaluation
 from .examination import examination
 from .fleet import fleet
 from .unpaired import unpaired

@@ -12,9 +12,9 @@ from scipy.signal import welch
 from ..calibration.numerics.frames import Array
 from ..unpaired.gap_ladder import ALL, AS_IT_IS, NOISE, Shrunk
 from ..unpaired.results import UnpairedComparison
+from .figure_data import running_mean
 from .figure_style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
 from .replay_figures import AFTER, BAD
-from .time_axis import running_mean
 
 DVL_AXES = ("x", "y", "z")
 # Lines over time are means over this share of the run

@@ -24,8 +24,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.examination.examine import Examination, examine
-from dvl_calib_ros.examination.expected_result import EXPECTED_FROM_S
+from dvl_calib_ros.examination.examine import EXPECTED_FROM_S, Examination, examine
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

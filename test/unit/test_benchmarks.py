@@ -12,7 +12,7 @@ from benchmarks.__main__ import PARTS, main
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.procedure import Procedure, run_seed
-from dvl_calib_ros.evaluation.trajectories import own_trajectories
+from dvl_calib_ros.evaluation.protocol import own_trajectories
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS
 
 

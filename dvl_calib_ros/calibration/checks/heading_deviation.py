@@ -13,9 +13,9 @@ import numpy as np
 
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
-from ..numerics.chi_square import chi2_isf
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
+from ..numerics.tests import chi2_isf
 from ..results.results import Estimate
 
 # Its rms (rad) is worth a word from here on, where as much is found by chance so seldom where there is none.

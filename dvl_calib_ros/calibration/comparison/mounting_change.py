@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...verdict.answering import Answering
 from ...verdict.kinds import Severity
-from ..numerics.chi_square import chi2_sf
 from ..numerics.frames import Array, rotation_of, rotation_vector
+from ..numerics.tests import chi2_sf
 from ..results.extrinsics import (
     GROUPS,
     LEVER_ARM,

@@ -11,11 +11,11 @@ from ..models import Model
 from ..models.base import Observations, Unmeasured
 from ..models.parameters import Parameters
 from ..numerics import kalman
-from ..numerics.chi_square import chi2_cdf, chi2_isf
 from ..numerics.error_model import PriorOnErrors, of_unseen_roll, to_correction, to_errors
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Mask
+from ..numerics.tests import chi2_cdf, chi2_isf
 
 
 class Assembler:

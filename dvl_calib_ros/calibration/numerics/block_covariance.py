@@ -15,8 +15,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .chi_square import chi2_isf
 from .frames import Array
+from .tests import chi2_isf
 
 # Blocks kept; when they are full, neighbours are joined and blocks are twice as long. So memory is bounded, and effects
 # that last for minutes show in the end.

@@ -19,9 +19,9 @@ from ..filters.cross_validation import HeldOutError
 from ..filters.observability import OBSERVED_SHARE, Convergence, body_angle_std
 from ..models import Model
 from ..models.parameters import Parameters
-from ..numerics.chi_square import chi2_isf
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
+from ..numerics.tests import chi2_isf
 from .results import Verification
 
 # A squared error that grows by more than so many times the estimate's variance is no chance (99 % of chi-square with

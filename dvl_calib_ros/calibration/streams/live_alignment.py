@@ -31,10 +31,9 @@ from ..numerics.samples import (
     VelocityFrame,
 )
 from .clock_correction import SECOND_NS, Clocks
-from .dropouts import DROPOUT_NS, Dropouts
 from .pairing import Partners, Rows, add_count
 from .screening import ALL_AXES, VERTICAL, CovarianceScreen, is_valid_rate, is_valid_velocity, unit_quaternion
-from .stream_order import LONG_AGO_NS, SHORTEST_PAUSE_NS, NewDays, Order, Sequencer, Track
+from .stream_order import DROPOUT_NS, LONG_AGO_NS, SHORTEST_PAUSE_NS, Dropouts, NewDays, Order, Sequencer, Track
 
 # How far a DVL may lag GNSS and IMU and still find its partners, beyond what pairing waits for.
 RETENTION_NS = 10 * SECOND_NS

@@ -8,6 +8,8 @@ Where a new day begins: what belongs to the day (`Nuisance.of_the_day`, the dela
 
 Clocks are set, and an inertial navigation aligned, between one dive and the next. Live, a pause says so; of recordings
 that are replayed together it is known.
+
+How often, and for how long, the DVL sent nothing.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ import numpy as np
 from ..numerics.frames import Array
 from ..numerics.samples import Codes, Index, Mask, Stamps
 from ..numerics.tables import RowTable
+from .clock_correction import SECOND_NS
 
 # Earlier than any stamp, and so far from the ends of 64 bits that a timeout can be added.
 LONG_AGO_NS = -(2**62)
@@ -327,3 +330,31 @@ def parts_by_day(days: Sequence[int], first: int, end: int) -> Iterator[tuple[in
     own = [day for day in days if first <= day < end]
     for start, stop in pairwise(sorted({first, *own, end})):
         yield start, stop, start in own
+
+
+# A DVL that sends nothing for so long, and for so many times its shortest interval, has dropped out.
+DROPOUT_NS = SECOND_NS
+DROPOUT_INTERVALS = 3
+_NEVER_NS = 2**63 - 1
+
+
+class Dropouts:
+    """Those since the start or the last restart. longest_ns: of them."""
+
+    def __init__(self) -> None:
+        self.longest_ns = 0
+        self._shortest_interval_ns = _NEVER_NS
+
+    def add(self, interval_ns: Stamps) -> int:
+        """Take the intervals (N,) between samples, in order; how many of them are dropouts."""
+        if not len(interval_ns):
+            return 0
+        if interval_ns.max() <= DROPOUT_NS:
+            self._shortest_interval_ns = min(self._shortest_interval_ns, int(interval_ns.min()))
+            return 0
+        shortest_ns = np.minimum(np.minimum.accumulate(interval_ns), self._shortest_interval_ns)
+        self._shortest_interval_ns = int(shortest_ns[-1])
+        dropouts = interval_ns[(interval_ns > DROPOUT_NS) & (interval_ns > DROPOUT_INTERVALS * shortest_ns)]
+        if len(dropouts):
+            self.longest_ns = max(self.longest_ns, int(dropouts.max()))
+        return len(dropouts)

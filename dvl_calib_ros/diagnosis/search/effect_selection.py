@@ -11,6 +11,11 @@ A constant error of a heading is not told from the DVL's mounting: the same head
 twice around with the heading (magnetised iron, and iron that takes on the earth's field) or drifts looks like a
 mounting that moves, or that has moved between recordings on other headings. A compass does that every day and a
 mounting hardly ever, so it is named first: but where the same heading on another day contradicts.
+
+Samples of slow streams that are far off, left out before they bend what they are held against.
+
+Of a fast stream, neighbours tell a sample that is far off. Between the samples of a slow one a vehicle can turn; there
+the other stream has to say the same: that it is off, by as much and in the same direction.
 """
 
 from __future__ import annotations
@@ -20,15 +25,20 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...calibration.numerics.frames import Array
-from ...effects.base import Effect
+from ...calibration.numerics.robust import robust_std
+from ...calibration.numerics.samples import VelocityFrame
+from ...effects.base import ActsOn, Effect
+from ...effects.composition import late
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.selection_criteria import best_of, criterion, finer_steps, price_of_a_time
 from ..model.forward_model import Problem, make_problem
 from ..model.hypothesis import Hypothesis, Values, is_time_of_run, no_effect
 from ..model.recorded_streams import RecordedStreams
 from ..model.settings import SETTINGS
+from ..model.stream_curve import FAST_ENOUGH_S
 from ..noise.noise_level import estimated
 from ..noise.noise_model import Noise, white_noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
@@ -46,7 +56,6 @@ from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, leaping, told_by_stamps
 from .identifiability import Selected, tell_apart
 from .initial_guess import FirstGuess, first_guess, guess_beside
 from .observable_parameters import shown_parts, unshown_parts, without_faint
-from .slow_stream_outliers import without_contradicted
 from .unexplained import unexplained
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
@@ -378,3 +387,80 @@ def _instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
         start = ({name: sum(each[name] for each in start) / n for name in none},) * n
     rest = [effect for effect in fit.effects if effect.name not in names]
     return fit.hypothesis.with_effects([*rest, heading], n, {HEADING: start})
+
+
+# Scatter about neighbours and about the other stream, beyond which both contradict
+FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0
+# Share of the one that the other must say, along it: an effect in a turn of two samples differs from both less alike
+ALIKE = (0.6, 1.7)
+# Samples of which a scatter is known
+FEWEST = 30
+_PASSES = 3
+
+
+def without_contradicted(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
+    """The recordings without samples of slow streams that neighbours and the other stream contradict; None if none is.
+
+    Parameters
+    ----------
+    problem: Of the recordings.
+    hypothesis: Robustly fitted, so that lever arm and delays do not look like errors of single samples.
+
+    """
+    found = [_without(problem, hypothesis, index) for index in range(len(problem.recordings))]
+    return None if all(one is two for one, two in zip(found, problem.recordings, strict=True)) else tuple(found)
+
+
+def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedStreams:
+    recording = problem.recordings[index]
+    dvl = _kept(problem, hypothesis, index, ActsOn.DVL_CLOCK)
+    reference = _kept(problem, hypothesis, index, ActsOn.REFERENCE_CLOCK)
+    if dvl.all() and reference.all():
+        return recording
+    return replace(
+        recording,
+        dvl=recording.dvl.part(dvl),
+        reference=recording.reference.part(reference),
+        spikes=recording.spikes + int(np.count_nonzero(~dvl)),
+    )
+
+
+def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -> NDArray[np.bool_]:
+    """(N,) samples of one stream that are not contradicted."""
+    recording = problem.recordings[index]
+    of_dvl = clock is ActsOn.DVL_CLOCK
+    curve, other = (recording.dvl, recording.reference) if of_dvl else (recording.reference, recording.dvl)
+    kept = np.ones(len(curve.time), dtype=bool)
+    if curve.interval <= FAST_ENOUGH_S or len(curve.time) < FEWEST:
+        return kept
+    injections = hypothesis.injections(index)
+    true = curve.time
+    for _ in range(_PASSES):
+        true = curve.time - late(injections, clock, true)
+    seen = problem.seen(hypothesis, index, true)
+    measured = np.array(problem.measured)
+    error = (seen.error if of_dvl else -seen.error) * measured
+    suspicious = other.covers(seen.reference_stamps if of_dvl else seen.dvl_stamps)
+    suspicious &= np.abs(error / _scatter(error)).max(axis=1) > FROM_OTHER
+    others = curve.part(~suspicious)  # two that are off side by side would bear each other out
+    if not suspicious.any() or len(others.time) < FEWEST:
+        return kept
+
+    def in_body(values: Array) -> Array:
+        if of_dvl:
+            return np.asarray(values @ hypothesis.body_from_measured(problem.rotation_dvl_from_body).T) * measured
+        if recording.frame is VelocityFrame.BODY:
+            return values * measured
+        return np.asarray(np.einsum("nji,nj->ni", recording.rotation_enu_from_body(true), values)) * measured
+
+    usual = _scatter(in_body(curve.from_neighbours))
+    off = in_body((curve.values - others(curve.time)) / curve.loudness)
+    along = (off * error).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-300) / curve.loudness.mean(axis=1)
+    bad = suspicious & others.covers(curve.time) & (np.abs(off / usual).max(axis=1) > FROM_NEIGHBOURS)
+    bad &= (along > ALIKE[0]) & (along < ALIKE[1])
+    return ~bad
+
+
+def _scatter(values: Array) -> Array:
+    """(3,) standard deviation of values (N, 3), robustly."""
+    return np.maximum(robust_std(values), 1e-9)

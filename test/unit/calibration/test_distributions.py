@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dvl_calib_ros.calibration.numerics import chi_square, distributions
+from dvl_calib_ros.calibration.numerics import distributions, tests
 from dvl_calib_ros.calibration.numerics.robust import median, robust_std
 
 TAILS = (1e-12, 1e-4, 0.01, 0.3, 0.5, 0.9, 0.9999)
@@ -18,10 +18,10 @@ TAILS = (1e-12, 1e-4, 0.01, 0.3, 0.5, 0.9, 0.9999)
 def test_chi_square_in_plain_python_is_that_of_scipy(dof):
     for p in TAILS:
         x = stats.chi2.isf(p, dof)
-        assert chi_square.chi2_isf(p, dof) == pytest.approx(x, rel=1e-10)
-        assert chi_square.chi2_sf(x, dof) == pytest.approx(p, rel=1e-10)
-        assert chi_square.chi2_cdf(x, dof) == pytest.approx(stats.chi2.cdf(x, dof), rel=1e-10)
-    assert (chi_square.chi2_cdf(math.inf, dof), chi_square.chi2_sf(0.0, dof)) == (1.0, 1.0)
+        assert tests.chi2_isf(p, dof) == pytest.approx(x, rel=1e-10)
+        assert tests.chi2_sf(x, dof) == pytest.approx(p, rel=1e-10)
+        assert tests.chi2_cdf(x, dof) == pytest.approx(stats.chi2.cdf(x, dof), rel=1e-10)
+    assert (tests.chi2_cdf(math.inf, dof), tests.chi2_sf(0.0, dof)) == (1.0, 1.0)
 
 
 def test_distributions_of_arrays_are_those_of_scipy(rng):

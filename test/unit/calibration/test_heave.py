@@ -12,7 +12,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
-from dvl_calib_ros.evaluation.trajectories import Trajectory
+from dvl_calib_ros.evaluation.protocol import Trajectory
 from dvl_calib_ros.simulation.scenario import Scenario, motion_of, simulate
 from dvl_calib_ros.simulation.trajectories import Waves
 

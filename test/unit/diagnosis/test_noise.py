@@ -24,7 +24,7 @@ from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise import noise_level
 from dvl_calib_ros.diagnosis.noise.noise_level import claims_of
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, white_noise
-from dvl_calib_ros.diagnosis.search.slow_stream_outliers import without_contradicted
+from dvl_calib_ros.diagnosis.search.effect_selection import without_contradicted
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate

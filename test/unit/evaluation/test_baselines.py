@@ -11,7 +11,7 @@ from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.convergence import TIMES_S, curve_keys, curves, squared_errors
 from dvl_calib_ros.evaluation.metrics import BASELINES
 from dvl_calib_ros.evaluation.procedure import dvl_velocities, references
-from dvl_calib_ros.evaluation.trajectories import own_trajectories
+from dvl_calib_ros.evaluation.protocol import own_trajectories
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS
 
 MODELS = ("G1", "A1")

@@ -31,8 +31,8 @@ from dvl_calib_ros.evaluation.procedure import (
     sensor_data,
     true_state,
 )
+from dvl_calib_ros.evaluation.protocol import Trajectory, load_folder, own_trajectories
 from dvl_calib_ros.evaluation.results import UNCALIBRATED
-from dvl_calib_ros.evaluation.trajectories import Trajectory, load_folder, own_trajectories
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
 from dvl_calib_ros.logs.dvl_log import angular_velocities
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording

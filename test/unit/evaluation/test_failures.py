@@ -13,8 +13,8 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.evaluation import estimation, procedure, validation_study
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
 from dvl_calib_ros.evaluation.procedure import sensor_data
+from dvl_calib_ros.evaluation.protocol import own_trajectories
 from dvl_calib_ros.evaluation.results import Failure
-from dvl_calib_ros.evaluation.trajectories import own_trajectories
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS, evaluate
 
 N_SAMPLES, ENDS = 60, (20, 60)

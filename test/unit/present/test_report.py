@@ -23,11 +23,10 @@ from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
-from dvl_calib_ros.present.figure_data import MapTrack, explorable
+from dvl_calib_ros.present.figure_data import MapTrack, TimeAxis, explorable
 from dvl_calib_ros.present.figure_style import MODEL_STYLES, new_figure
 from dvl_calib_ros.present.page import write_replay_report, write_report
 from dvl_calib_ros.present.replay_figures import ModelLine, estimate_over_time, held_out_errors
-from dvl_calib_ros.present.time_axis import TimeAxis
 from dvl_calib_ros.verdict.kinds import Severity
 
 SECOND = 1_000_000_000
