@@ -98,7 +98,7 @@ def compare(
     Returns
     -------
     Comparison
-        ``word``: same, suspicious or moved, and all behind it; `calibration.comparison_words` has its `reasons`.
+        ``word``: same, suspicious or moved, and all behind it; `calibration.comparison` has its `reasons`.
 
     Raises
     ------

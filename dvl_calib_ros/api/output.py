@@ -1,7 +1,4 @@
-"""Results as text, as HTML of a notebook, and as data frames: what the commands print of them.
-
-Results as pages and as JSON, by what they are.
-"""
+"""Results as text, as HTML of a notebook, and as data frames."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
-"""A replay that first makes sure that what it is about to average belongs together.
+"""A replay that first checks that the recordings belong together, and recordings calibrated each by itself.
 
 Several recordings are calibrated each for itself, and compared: one mounting averaged of two is that of neither. So is
 what an `initial_calibration` says that the data contradict.
-
-Recordings that are compared: each calibrated by itself, for what it says of the mounting.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""The calibration over recorded bags: the same estimator as the node's, fed from files.
-
-A replay as plain data: what `replay --json` writes, but for what discovery says.
-"""
+"""The calibration over recorded bags: the same estimator as the node's, fed from files; and its JSON."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Recorded messages by the thousand: where each is among bytes that were read at once, instead of each by itself.
-
-Messages in order of log time, however many there are.
-"""
+"""Recorded messages by the thousand, located among bytes that are read at once, and sorted by log time."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Channels of a recording, and how their messages are decoded: by the definition that each brings along.
-
-Message definitions that a recording brings along, made harmless before rosbags turns them into Python code.
+"""Channels of a recording, and the message definitions that they bring along.
 
 rosbags generates a class and its decoder from a definition and runs the code. What a definition decides in that code is
 names, numbers and values of constants; here names must be plain, numbers bounded, and constants are left out.

@@ -1,6 +1,4 @@
-"""Messages of recordings as columns, window by window: what is laid out alike at once, the rest one by one.
-
-How the messages of a channel are laid out in CDR, so that thousands of them are read as columns at once.
+"""Messages of recordings as columns, and their layout in CDR.
 
 CDR aligns every number to its size, counted from the end of the 4 bytes of encapsulation, so the lengths of strings
 decide where everything behind them lies. A `Layout` is that of one message; others of the same length in bytes share it

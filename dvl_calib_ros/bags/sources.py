@@ -1,10 +1,8 @@
-"""One recorded file: what is in it, and its messages in order of log time, past whatever is damaged.
+"""One recorded file: MCAP or SQLite, whole or damaged.
 
 It is read by its index while that is sound, SQLite's or MCAP's, and after the first damage by the salvaging readers.
 What is caught here is what damaged bytes and bad disks cause, and no more: that a library of another version does not
 fit is no damage, and is not to be reported as such.
-
-rosbag2 databases, read by SQLite while they are sound.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""New rosbag2 recordings, written by rosbags.
-
-Attachments of MCAP recordings, which rosbags does not write.
-"""
+"""New rosbag2 recordings, written by rosbags, with the attachments of MCAP."""
 
 from __future__ import annotations
 

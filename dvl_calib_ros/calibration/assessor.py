@@ -1,9 +1,4 @@
-"""A calibrator's estimates held against data that they had not seen: verdicts, and what is left with each.
-
-What each model's estimator says, with σ worth believing: of this recording, and of the next on another day.
-
-The estimators that are more than the linear filter, asked as one: the first that has an answer gives it.
-"""
+"""Estimates of all models with their covariance, and their assessment on held-out data."""
 
 from __future__ import annotations
 

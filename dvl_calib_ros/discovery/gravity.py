@@ -1,9 +1,7 @@
-"""Whether an IMU's acceleration says the same of up and down as its orientation does.
+"""Gravity against an IMU's orientation, and the uncertainty that its messages claim of the heading.
 
 At rest an accelerometer shows what holds against gravity: upwards, and so it stays on a vehicle whose own accelerations
 average out. Turned by the orientation it must point up in the world that the orientation is of.
-
-How far an IMU's heading is to be believed, by what its messages claim of it.
 """
 
 from __future__ import annotations

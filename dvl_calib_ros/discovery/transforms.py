@@ -1,7 +1,4 @@
-"""Where the sensors sit, from what a recording has of it: /tf_static, else the fixed joints of /robot_description.
-
-Mounting, lever arm and the IMU's orientation from transforms, for a node that hears frames and transforms live.
-"""
+"""Mounting, lever arm and IMU orientation from /tf_static or /robot_description, recorded or live."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""JSON files.
-
-Files of text that are read whole: of a known kind, and of a size that such a file has.
-"""
+"""Text files that are read whole, and JSON."""
 
 from __future__ import annotations
 

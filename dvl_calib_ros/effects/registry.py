@@ -1,11 +1,7 @@
-"""All effects by name: the package's own, and those that other packages bring.
+"""All effects by name, from this package and others, and their table in the documentation.
 
-A package brings an effect by an entry point of the group `dvl_calib_ros.effects` that names its class:
-
-    [project.entry-points."dvl_calib_ros.effects"]
-    cable_drag = "my_vehicle.effects:CableDrag"
-
-The table of effects in the documentation.
+[project.entry-points."dvl_calib_ros.effects"]
+cable_drag = "my_vehicle.effects:CableDrag"
 """
 
 from __future__ import annotations

@@ -1,12 +1,10 @@
-"""What was done before: the rotation between DVL and body by least squares on SO(3), beside the models.
+"""Error measures of a calibration, and the least-squares rotation on SO(3) as a baseline.
 
 Kinsey and Whitcomb, "In situ alignment calibration of attitude and Doppler sensors for precision underwater vehicle
 navigation: theory and experiment" (2007), align displacements: what the DVL integrates to against positions. Troni and
 Whitcomb, "New velocity-based algorithms for the in situ calibration of Doppler velocity log sensors" (2010), align
 velocities. Either is the rotation C that minimises Σ |g_i - C v_i|², found by a singular value decomposition (Wahba's
 problem). They estimate no scale, have no prior, and claim no σ.
-
-How good a calibration is: vector RMSE of corrected velocities, and whether σ tells the truth.
 """
 
 from __future__ import annotations

@@ -1,11 +1,7 @@
-"""The published validation procedure: what is added to a recorded velocity, on which sets, and what was published.
+"""The published validation procedure: injected errors, data sets, published figures, trajectories.
 
 Source: Yampolsky and Klein, "Information-Aided DVL Calibration"; the paper publishes neither P0, R nor its noise
 seeds. Errors and beams are those of the recorded frame (forward-right-down); what comes out is forward-left-up.
-
-The trajectories of the procedure: a folder of recorded ones, or fifteen from the project's own generator.
-
-Layout of a folder, one recording a name ``T01`` .. ``T15``:
 
     Txx_dvl.csv       time s; velocity over ground m/s, body frame: surge (forward), sway (starboard), heave (down)
     Txx_attitude.csv  optional: time s, the same stamps; roll, pitch, yaw rad of that body in north-east-down, Z-Y-X

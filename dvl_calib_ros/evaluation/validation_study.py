@@ -1,7 +1,4 @@
-"""The published procedure over many noise seeds, and what its outcomes say.
-
-Hold-out verdicts of the procedure's calibrations, by the calibrator itself.
-"""
+"""The published procedure over many noise seeds, with hold-out verdicts."""
 
 from __future__ import annotations
 

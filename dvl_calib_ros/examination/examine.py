@@ -1,7 +1,4 @@
-"""The whole examination of a recording: what is in it, what is wrong with it, what its motion can show.
-
-What a calibration will claim: as a replay of the recording does, of a part of it where it is long.
-"""
+"""The examination of a recording: what is in it, what is wrong with it, what its motion can show."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a result file says of the mounting, in the forms that others take it in: URDF, TF, robot_localization.
-
-What a result file says of a DVL, in the terms that calibrations are compared in.
-"""
+"""The mounting of a result file in the forms that others take: URDF, TF, robot_localization, a comparison."""
 
 from __future__ import annotations
 

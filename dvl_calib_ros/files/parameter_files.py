@@ -1,7 +1,4 @@
-"""ROS 2 parameter files, read without ROS, and written from the schema.
-
-Parameters set in a ROS 2 parameter file that somebody wrote by hand, with every other byte kept.
-"""
+"""ROS 2 parameter files: read without ROS, written from the schema, and edited in place."""
 
 from __future__ import annotations
 

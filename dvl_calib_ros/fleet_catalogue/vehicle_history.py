@@ -1,7 +1,7 @@
 """What a catalogue says: of each vehicle how its DVL sat day by day, and which recordings need a person.
 
-Recordings of one day share what differs from day to day (`calibration.days`): they are averaged by their own σ, and
-that of the day is added once. A mounting that moves within a day parts the day.
+Recordings of one day share what differs from day to day (`day_to_day_covariance`): they are averaged by their own σ,
+and that of the day is added once. A mounting that moves within a day parts the day.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Attitudes of a log as IMU samples, with the angular velocity that they imply."""
+"""A DVL's log as samples, with attitudes and the angular velocity that they imply."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
-"""The message types that velocities are read from: what each holds, when it is invalid, and which way its axes point.
+"""The message types that velocities are read from.
 
 A driver is one entry in `VELOCITY_TYPES`; bags, the node, and the documentation's table go by it. The rules follow the
 definitions and what the drivers do with them: the Water Linked driver (waterlinked_dvl, marine_acoustic_msgs/Dvl) and
 dvl-a50 (dvl_msgs/DVL), which both hand on the sensor's JSON reports (docs.waterlinked.com/dvl/dvl-json-protocol).
-
-PX4's odometry, which has neither header nor frame names: its numbers as the other types have them.
 """
 
 from __future__ import annotations

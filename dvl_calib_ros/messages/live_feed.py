@@ -1,7 +1,4 @@
-"""A calibrator fed with ROS messages one by one, as they come live.
-
-Live messages from the start on, packed, for a calibration that begins anew not to lose them.
-"""
+"""Live ROS messages: fed to a calibrator one by one, and kept for one that begins anew."""
 
 from __future__ import annotations
 

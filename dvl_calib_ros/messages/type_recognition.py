@@ -8,11 +8,9 @@ Recordings opened with all that is known of message types.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from pathlib import Path
+from collections.abc import Collection
 
-from ..bags.reader import BagReader
-from .drivers import KNOWN_DEFINITIONS, VELOCITY_TYPES, VelocityType, add_type
+from .drivers import VELOCITY_TYPES, VelocityType, add_type
 
 # fields that tell a DVL's message, the most telling first -> the type that is read alike
 _ALIKE: tuple[tuple[frozenset[str], str], ...] = (
@@ -48,12 +46,3 @@ def recognised(name: str, fields: Collection[str]) -> VelocityType | None:
         return known
     like = next((like for needed, like in _ALIKE if needed <= set(fields)), None)
     return None if like is None else add_type(name, like)
-
-
-def open_bags(paths: Sequence[Path]) -> BagReader:
-    """A reader of recordings whose types are recognised. Raises InputError for what is no bag."""
-    bag = BagReader(paths, KNOWN_DEFINITIONS)
-    for topic, name in bag.topics.items():
-        if name not in VELOCITY_TYPES:
-            recognised(name, bag.fields_of(topic))
-    return bag

@@ -1,9 +1,4 @@
-"""Live, whether the IMU's acceleration says the same of up as its orientation, by a message of each second.
-
-A clock that the data show to be off is taken off while the node runs, as a replay does before it begins.
-
-Times in which this process did not run, so that what it missed is not laid to a sensor.
-"""
+"""Live checks: gravity against orientation, clock offsets taken off, pauses of the process."""
 
 from __future__ import annotations
 

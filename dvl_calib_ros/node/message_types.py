@@ -1,7 +1,4 @@
-"""Message classes by the name of their type; only what is asked for is imported.
-
-A DVL's velocity as a message of any type that DVLs are read from: `messages.drivers`, the other way round.
-"""
+"""Message classes by type name, and a DVL's velocity as a message of any type that is read."""
 
 from __future__ import annotations
 

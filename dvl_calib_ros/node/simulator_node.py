@@ -1,7 +1,7 @@
 """Our simulator as a node: publishes DVL, GNSS and IMU of a simulated run, or of a motion that it follows.
 
 Publishing follows the stamps: in a run, a sample goes out when its stamp's time has come; following an odometry topic,
-when the odometry has reached the stamp and is one message past the time of measurement (`simulation.live`).
+when the odometry has reached the stamp and is one message past the time of measurement (`simulation.live_simulation`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""What the node hears of where its sensors sit: /tf_static and robot_description, each latched by its publisher.
-
-The DVL's pose in the body as topic ~/mounting and, where asked for, as a static transform.
-"""
+"""Transforms of the node: /tf_static and robot_description heard, ~/mounting and TF published."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Error terms as people read them, and the estimates of models in them.
-
-Commands as they are typed, with the options that say what is calibrated.
-"""
+"""Error terms as people read them, and the estimates of models in them."""
 
 from __future__ import annotations
 

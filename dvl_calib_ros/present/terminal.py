@@ -1,7 +1,4 @@
-"""Tables for terminals of any width: what is too wide is folded, so that no number is cut off.
-
-A document on a terminal: an answer in its colour, sentences, tables without lines.
-"""
+"""A document on a terminal of any width: what is too wide is folded, so that no number is cut off."""
 
 from __future__ import annotations
 

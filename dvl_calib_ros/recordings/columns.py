@@ -1,8 +1,6 @@
-"""What is kept of a topic's messages: of those of a fixed layout the columns, of all others their bytes.
+"""What is kept of a topic's messages: columns where the layout is fixed, else bytes.
 
 Nothing is judged yet, for frames and parameters are known only later: values and stamps are as the messages have them.
-
-Rows that come piece by piece, on disk once there are many.
 """
 
 from __future__ import annotations

@@ -24,8 +24,8 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.samples import Stamps, Stream, Streams, no_samples
 from ..calibration.registration.registration import Registration
 from ..messages.decode import MessageDecoder
-from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
-from ..messages.type_recognition import open_bags
+from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, VELOCITY_TYPES
+from ..messages.type_recognition import recognised
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from .columns import Collector, TopicColumns, is_kept
 from .sample_columns import Stretch, stretches
@@ -343,3 +343,12 @@ def is_static(topic: str, kind: str) -> bool:
     """Whether messages of a topic say where the sensors sit."""
     name = topic.rsplit("/", 1)[-1]
     return (kind == TF_TYPE and name == "tf_static") or (kind == STRING_TYPE and name == "robot_description")
+
+
+def open_bags(paths: Sequence[Path]) -> BagReader:
+    """A reader of recordings whose types are recognised. Raises InputError for what is no bag."""
+    bag = BagReader(paths, KNOWN_DEFINITIONS)
+    for topic, name in bag.topics.items():
+        if name not in VELOCITY_TYPES:
+            recognised(name, bag.fields_of(topic))
+    return bag

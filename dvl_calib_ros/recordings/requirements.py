@@ -1,7 +1,4 @@
-"""Whether a recording has what a command needs of it.
-
-Whether two recordings are one by two names, or one a part of the other.
-"""
+"""What a command needs of recordings, and whether two of them are one."""
 
 from __future__ import annotations
 

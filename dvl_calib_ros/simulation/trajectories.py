@@ -1,7 +1,4 @@
-"""Vehicle motion to simulate: legs and turns on the surface or at constant depth.
-
-Surface waves: what they add to a vehicle's motion.
-"""
+"""Vehicle motion to simulate: legs and turns, and the waves on top of them."""
 
 from __future__ import annotations
 

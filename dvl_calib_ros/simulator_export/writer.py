@@ -1,7 +1,4 @@
-"""What a simulator can be told of a DVL, and what stays: the form that every writer has.
-
-XML as text.
-"""
+"""What a simulator can be told of a DVL, and what stays: the form that every writer has."""
 
 from __future__ import annotations
 

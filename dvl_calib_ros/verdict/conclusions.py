@@ -1,9 +1,4 @@
-"""What is said of several calibrations of one DVL: whether the mounting moved, and what makes that worth less.
-
-What a diagnosis concludes: whether there is a gap, what explains it, and what is left.
-
-What a comparison of a simulator's DVL with the vehicle's concludes, of recordings that are not of one motion.
-"""
+"""What comparisons and diagnoses conclude."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What the data fit where it is not what was configured or declared: of instruments, frames and clocks.
-
-What discovery passed over or had to guess in a recording: topics, frames, the mounting.
-"""
+"""Reasons: what the data fit where it is not what was configured, and what discovery had to guess."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""Why a calibration is to be used, to be used with care, or not to be used: the reasons of its verdict.
-
-What to drive next so that a calibration becomes good enough, and that it is.
-
-Why a model's estimate is the one: as a replay and /diagnostics say it of the selected model.
-"""
+"""Reasons of a verdict, of a model's selection, and manoeuvres to drive next."""
 
 from __future__ import annotations
 

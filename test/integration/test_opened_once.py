@@ -100,8 +100,14 @@ def test_a_command_registers_each_recording_once(words, expected, calibrated, ba
 
         return register
 
-    for name in ("discovery.clocks", "calibration.delay.clocks", "diagnosis.registered"):
+    for name in (
+        "discovery.clock_offsets",
+        "calibration.estimators.registration_schedule",
+        "diagnosis.search.initial_guess",
+    ):
         monkeypatch.setattr(f"dvl_calib_ros.{name}.register", counting(name))
     command, *arguments = words.split()
     succeed(capsys, command, *(bags[word] for word in arguments))
-    assert +counted == +Counter({"discovery.clocks": expected, "calibration.delay.clocks": calibrated})
+    assert +counted == +Counter(
+        {"discovery.clock_offsets": expected, "calibration.estimators.registration_schedule": calibrated}
+    )

@@ -24,8 +24,7 @@ from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.examination.examine import examine
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording
 from dvl_calib_ros.messages.live_feed import MessageFeed
-from dvl_calib_ros.messages.type_recognition import open_bags
-from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.recording import open_bags, open_recording
 from dvl_calib_ros.recordings.topics import Topics
 from validation.positions import Noise, Truth, driven
 

@@ -21,7 +21,8 @@ from validation.positions import Truth, driven
 TARGETS = {"dvl/twist": "/a50/velocity", "gnss/twist": "/gps", "imu/data": "/imu"}
 # A node that listens for a second
 QUICKLY = (
-    "import sys; from dvl_calib_ros.node import discovering, main; discovering.LISTEN_S = 1.0; sys.exit(main.main())"
+    "import sys; from dvl_calib_ros.node import live_discovery, main; "
+    "live_discovery.LISTEN_S = 1.0; sys.exit(main.main())"
 )
 
 

@@ -1,6 +1,4 @@
-"""Records of MCAP files: what they hold, and where they go on after damage.
-
-Chunks of MCAP files, unpacked as far as they are sound: what is unpacked is bounded, and checked.
+"""Records and chunks of MCAP files, and where records go on after damage.
 
 A chunk whose checksum does not match gives nothing: some of it is wrong, and nothing says which.
 """

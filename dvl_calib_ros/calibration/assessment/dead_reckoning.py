@@ -1,9 +1,7 @@
-"""What a calibration is worth to navigation: the track that dead reckoning gives with and without it.
+"""Dead reckoning with and without the calibration, and reasons against a calibration.
 
 Velocity errors add up to an error of position. Each sample is corrected by an estimate that has not seen its stretch,
 with the lever arm and delay that it holds, so the drift is that of data to come; the reference's own noise is in it.
-
-What the data say against a calibration beside its verdict on data held out: of a replay, and of a running node.
 """
 
 from __future__ import annotations

@@ -1,10 +1,4 @@
-"""A block's streams as they are compared: thinned, in seconds, without samples that are far off.
-
-One bends the curve that is read between the DVL's samples for all references about it, and no gate would see that.
-
-A block of time of all streams, copied from what the aligner holds: what G2 is solved by, in whatever thread.
-
-Samples of a slow DVL that are far off, left out before they bend the curve that references are held against.
+"""Blocks of all streams as they are compared: copied, thinned, in seconds, without outliers.
 
 Of a fast stream, neighbours tell a sample that is far off (outliers.py). Between the samples of a slow one a vehicle
 can turn: there neighbours only raise a suspicion, and the references about it decide. Without a sample that is wrong

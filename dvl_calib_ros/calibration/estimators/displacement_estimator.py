@@ -1,11 +1,7 @@
-"""D1 beside the other models: fed with aligned rows and with positions, solved when stamps have gone on by a fifth.
+"""D1's estimator, its verification on held-out legs and its track.
 
 All legs so far are solved at once. What is known at a stamp goes by rows and fixes before it alone, less by what a fix
 may be late, so a live run and a replay of its recording agree; the outcome takes effect a second later, in stamps.
-
-What D1 is worth to navigation: the track of dead reckoning beside positions, legs corrected that it had not seen.
-
-D1 verified: where dead reckoning leads on legs that an estimate has not seen, against positions.
 """
 
 from __future__ import annotations

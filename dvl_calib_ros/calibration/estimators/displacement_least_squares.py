@@ -1,12 +1,10 @@
-"""What positions tell of the DVL: least squares over legs of any length, with noise that lasts, and without outliers.
+"""Least squares over legs of dead reckoning between position fixes.
 
 Fixes less dead reckoning are y = o + J θ + noise, with o a constant of each stretch. Means over blocks of time are
 fitted at once; the noise of these is white, beside it a Gauss-Markov process (multipath, a beacon's sound speed) and a
 random walk (dead reckoning's own), as large and as lasting as a grid of hypotheses says. What is told is the mixture of
 all, by their evidence, so σ holds that the noise is not known either. θ: misalignment (3) rad, scale, lever arm (3) m
 beyond the parameters', by what fixes are late s, and coefficients (5) of the heading's deviation.
-
-Dead reckoning at the times of position fixes, linear in what is to be found of the DVL.
 
 The way between two times is ∫ R M v dt, with R the attitude (ENU from body), v the DVL's velocity and M the matrix that
 corrects it. It is linear in M, whatever the angles are: so W = ∫ R ⊗ v dt is summed up once, and serves any M.

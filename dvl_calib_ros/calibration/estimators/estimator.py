@@ -1,9 +1,7 @@
-"""What finds the states of one model, whatever filters them: the linear filter, G2's blocks of time, another package's.
+"""The interface of an estimator, the linear filter behind it, and the worker that solves in a thread.
 
 `Calibrator` has one for each model and asks all alike. One that is more than the linear filter is told of the aligned
 rows by `advance`, after whatever was fed, and may hold rows back until it has copied them.
-
-Who solves what takes long: whoever asks, at once, or a thread beside it.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""All models at once: every model that can use a sample is updated by it, always.
+"""The bank of linear filters: all models at once, with covariances by blocks of time.
 
 So switching models by hand or automatically is a change of what is read, never of what is computed, and the state
 after a switch is that of having run the model from the start. When a model is updated is a matter of speed alone:
 those of one `Group` are stacked and updated together, by blocks of any length.
-
-Blocks of time of filters that go on sample by sample, and what they say: σ, heading and bias.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""By how much heading and DVL are off beside what a mounting makes: states beside those of the mounting.
+"""Heading deviation and DVL bias as nuisance parameters, estimated from blocks of time.
 
 Yaw is found against the IMU's heading. A constant error of that is harmless, as the same IMU navigates; one that
 changes is not: a compass deviates by one and two cycles of the heading, a gyro drifts. A DVL has a bias, which at one
@@ -16,8 +16,6 @@ Coefficients of the heading are taken off the states, as a heading that deviates
 result. The bias is considered, and not taken off: nobody takes a bias off velocities, and a mounting without it would
 be worse at the speeds driven than one with it.
 
-Terms of blocks of time: what changes with heading, time or velocity as no mounting does, told without a column more.
-
 A block of time told Λ_b, y_b of the states. An error δ of the heading turns a reference in an earth frame as a
 misalignment about the earth's vertical does, which leans as the vehicle does: one that leans into its turns, where
 alone it has sway, would take what that makes of the vertical velocity for a roll. A bias b of the DVL is to velocities
@@ -32,8 +30,6 @@ With a bias free, speeds alone say what is scale; and where they do not change, 
 does, with as much of it in the error: it would be a scale of 1 and a bias of -v. It pulls y of the bias by
 -w n² / v, w being the information that velocities of the block are known with and n² the squares of what noise of three
 axes leaves of its mean; that is taken off.
-
-What a constant error of the DVL makes of what is found: how much of σ it is, and how far it takes the states.
 
 A DVL has one bias, on one day as on the next. Estimates of two recordings are then off together: of a bias b of σ_b
 along each axis by columns_1 b / σ_b and columns_2 b / σ_b, as far as their own speeds did not show it. Their difference

@@ -1,4 +1,4 @@
-"""That a vehicle does not heave, as G1 and G2 take it: a row for every 20 s, with the variance that the run shows.
+"""Vertical motion: the constraint that a vehicle does not heave in the mean, and its height of late.
 
 Heave of a moment is a wave, and sway goes with it: the same water moves both, so what is small in every sample still
 bends the roll. Over many waves both average out, as no vehicle leaves the surface or its depth. So the row is that of
@@ -11,8 +11,6 @@ the rows about what they are expected to be, together with `motion_std`² as if 
 blocks. It is never below that: in turns a vehicle heaves in proportion to its sway, which is a roll to all rows alike
 and scatters by nothing. So all rows weigh what is known of them now, and a filter with a variance fixed at each row
 would not do: what is kept are sums, joined with the filter's state when somebody asks for it.
-
-How high a vehicle is over where it has been of late, by its own velocity: a current changes with depth.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The calibration models as data (models.md, "The models").
 
-A model is one entry of a table, in `published`, `own`, `calibration.delay` or another package (`plugged`); nothing
+A model is one entry of a table, in `published`, `own` or another package (`plugins`); nothing
 outside its definition branches on its name. What an entry says is `base.Model`.
 """
 

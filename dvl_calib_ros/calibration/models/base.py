@@ -1,9 +1,7 @@
-"""What a calibration model is: linear in its state, ``z = H x + noise``.
+"""A calibration model and its observations: linear in its state, ``z = H x + noise``.
 
 The residual misalignment φ (DVL frame, rad) comes first, its scale-factor errors after, and last what the model must
 know to see them (nuisance states, such as a current).
-
-What models see of aligned samples, and what several of them derive from it.
 """
 
 from __future__ import annotations

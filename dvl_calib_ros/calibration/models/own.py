@@ -1,11 +1,4 @@
-"""G1, F1 and A1, our own linear models; derivations are in the docstrings of `linearise_g1`, `_f1` and `_a1`.
-
-G2, G1 with more states, is in `calibration.delay`. All hold in any right-handed frame with x ahead.
-
-G2's entry in the table of models: G1 with a lever arm and a delay, which no linear filter can begin to find.
-
-D1's entry in the table of models: positions with metres of noise, by where dead reckoning leads between them.
-"""
+"""Models of our own: G1, F1, A1, and the entries of G2 and D1."""
 
 from __future__ import annotations
 

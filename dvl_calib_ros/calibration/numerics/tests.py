@@ -1,6 +1,4 @@
-"""Many tests at once.
-
-The chi-square distribution, number by number, in plain Python.
+"""Significance of one test (chi-square) and of many (Holm), without SciPy.
 
 Calibrating asks for a handful of these numbers; `scipy.special`, which has them for arrays (`distributions`), takes a
 quarter of a second of CPU to import, a third of what a short replay may take.

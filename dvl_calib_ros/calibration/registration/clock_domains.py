@@ -1,9 +1,7 @@
-"""Which stamps are far from the others', by when messages arrived: for what a registration cannot see.
+"""Clock domains: streams stamped by one clock or by several, from the times of arrival.
 
 Where velocities and turns show how the clocks stand, it does not matter when messages came. Where they do not, stamps
 that differ by more than any delay that is looked for pair velocities of other times.
-
-Whether streams are stamped by one clock: by which stamps arrived together.
 """
 
 from __future__ import annotations

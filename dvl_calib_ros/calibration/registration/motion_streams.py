@@ -1,7 +1,4 @@
-"""What is registered: the three streams as columns, each by stamps of its own, in s since a common epoch.
-
-Velocity and slope of the DVL, and turn rates, at any time: smoothed once, for all places of the clocks.
-"""
+"""The three streams that are registered, as columns and smoothed, in s since a common epoch."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""What a calibration says: immutable data that outlives the code that made it.
-
-Where and how the DVL sits, as others take it: a pose in the body frame with its covariance.
-"""
+"""Results of a calibration as immutable data, and the pose of the DVL in the body frame."""
 
 from __future__ import annotations
 

@@ -1,12 +1,10 @@
-"""A stream's value and slope at any time, from a quadratic through the samples around it.
+"""Value and slope of a stream at any time, and the streams as columns.
 
 Two streams with a delay between them are compared at times at which neither has a sample. A straight line between
 neighbours is a filter that depends on where between them the time lies: half as noisy in the middle as on a sample, and
 blind to what curves. Delays would then be told apart by the interpolation, not by the vehicle. A quadratic through the
 five or six samples around, weighted by their distance (local regression: Cleveland, "Robust locally weighted
 regression", 1979), is the same filter everywhere, and has a slope.
-
-Columns of several blocks of time, one after the other, of which each is looked at by itself.
 
 A block is a copy of a stretch with margins, so neighbours hold the same samples twice: one call of numpy for many
 blocks must not let one see what another one holds.

@@ -1,9 +1,7 @@
-"""Samples of three streams, one by one, as rows and tracks; `alignment.Aligner` takes them by columns as well.
+"""Alignment of single samples as they come, with the recent past of the reference.
 
 Live, and where a clock leaps, whether a message is valid and in order is asked of one by itself; what is done when a
 clock leaps is here.
-
-The recent past of the reference: its velocities less a constant error, and which axes it does not measure.
 """
 
 from __future__ import annotations

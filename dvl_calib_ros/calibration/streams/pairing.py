@@ -1,11 +1,7 @@
-"""What the IMU and the reference say at the times of the DVL's samples, and which of these are used at all.
+"""Pairing of DVL samples with attitude and reference, and the gates that decide which are used.
 
 By columns only: live, of the one or two rows that a message decides. Who calls says how many rows are decided, in
 order, and how far each track had come by then.
-
-The table that an alignment makes.
-
-Which DVL samples in order are used: not too slow, not frozen, not in too sharp a turn. And the prior's window.
 """
 
 from __future__ import annotations

@@ -1,15 +1,11 @@
-"""Order of each stream, and what it says at another's times, decided by header stamps alone.
+"""Order of each stream by header stamps alone, its values at other times, new days and dropouts.
 
 Nothing here looks at a clock, nor at the order in which *different* topics arrive, as long as one topic does not lag
 another by more than a bounded time in stamps. So a live run and a replay of its recording decide alike. What stands
 here twice, for one sample and for columns of them, is the same rule (test_alignment.py).
 
-Where a new day begins: what belongs to the day (`Nuisance.of_the_day`, the delay of the DVL) is then found anew.
-
 Clocks are set, and an inertial navigation aligned, between one dive and the next. Live, a pause says so; of recordings
 that are replayed together it is known.
-
-How often, and for how long, the DVL sent nothing.
 """
 
 from __future__ import annotations

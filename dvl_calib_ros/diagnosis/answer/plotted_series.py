@@ -1,7 +1,4 @@
-"""What the pictures of a diagnosis show, sample by sample; collected only when somebody wants to look.
-
-What is left beside what it follows: the regressor as a navigator knows it, with its unit, for a picture.
-"""
+"""Series of a diagnosis for its pictures."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Twins of recordings: what a simulated DVL measures on the recorded motion, without and with what was found.
-
-Bags of the twins that a diagnosis makes of recordings.
-"""
+"""Simulated twins of recordings, without and with what was found, and their bags."""
 
 from __future__ import annotations
 

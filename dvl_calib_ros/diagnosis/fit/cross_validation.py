@@ -28,7 +28,7 @@ def fitted_without(
 ) -> Iterator[tuple[int, list[Fit]]]:
     """Every fold of bins (M,), and fits of hypotheses to all the others.
 
-    Models that are linear need no further fit: `calibration.folds` leaves out what a fold told.
+    Models that are linear need no further fit: `calibration.filters.cross_validation` leaves out what a fold told.
     """
     for fold in np.unique(fold_of).tolist():
         train = fitter.without(fold_of == fold)

@@ -1,7 +1,4 @@
-"""What a fit costs and gains, and how sure an effect is given all others.
-
-What is not shown, and what is left, fitted beside a fit: the one place where these are put together.
-"""
+"""Cost and gain of a fit, with nuisance columns beside it."""
 
 from __future__ import annotations
 

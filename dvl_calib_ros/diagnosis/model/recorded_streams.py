@@ -1,7 +1,4 @@
-"""What a diagnosis looks at: of each recording the streams as they are, each with stamps of its own.
-
-Where the DVL's clock was set back, by its stamps alone: some were given twice, or what came then was thrown away.
-"""
+"""The streams of a recording as they are, each with its own stamps, and steps back of the DVL's clock."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""A fit without those of its effects that the data does not call for, given all others.
-
-What happens twice: a second time tried beside the first, either tried alone, and what is only taken back.
-"""
+"""Elimination of effects that the data do not call for, and effects that happen twice."""
 
 from __future__ import annotations
 

@@ -1,18 +1,14 @@
-"""Which effects the data calls for.
+"""Selection of the effects that the data call for.
 
 Columns propose: about the best fit so far, every effect's derivatives make one Gram matrix, in which all combinations
 of up to three effects are small least squares problems. The composed model decides: the best proposals are fitted in
 it until they stand still, and compared by what they explain less what so many parameters explain by chance. About the
 winner it is asked again, with the noise that is left by everything together: so that no effect is taken for noise.
 
-A heading that is wrong, where several recordings of one vehicle disagree in yaw.
-
 A constant error of a heading is not told from the DVL's mounting: the same heading navigates. One that swings once or
 twice around with the heading (magnetised iron, and iron that takes on the earth's field) or drifts looks like a
 mounting that moves, or that has moved between recordings on other headings. A compass does that every day and a
 mounting hardly ever, so it is named first: but where the same heading on another day contradicts.
-
-Samples of slow streams that are far off, left out before they bend what they are held against.
 
 Of a fast stream, neighbours tell a sample that is far off. Between the samples of a slow one a vehicle can turn; there
 the other stream has to say the same: that it is off, by as much and in the same direction.
