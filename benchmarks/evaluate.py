@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from dvl_calib_ros.calibration.filters.filter_setup import Assembler
-from dvl_calib_ros.calibration.filters.vertical_motion import HeightOfLate
+from dvl_calib_ros.calibration.filters.vertical_motion import RelativeHeight
 from dvl_calib_ros.calibration.models import MODELS, Model, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import Array
@@ -110,7 +110,7 @@ def _calibrate(model: Model, data: SensorData, parameters: Parameters, ends: Seq
     seen = variants.observations(model.needs, parameters)
     if model.uses_height:
         height = np.zeros(usable.size)
-        height[usable[0]] = HeightOfLate().add(variants.rows.stamps_ns[usable[0]], seen.rising[usable[0]])
+        height[usable[0]] = RelativeHeight().add(variants.rows.stamps_ns[usable[0]], seen.rising[usable[0]])
         seen = replace(seen, height=height)
     given = assembler.measurements(seen, variants.rows.share(model.aided), variants.rows.prior_known)
     used = given.usable[0] & usable[0]

@@ -13,7 +13,7 @@ import numpy as np
 from ..calibration.assessment.dead_reckoning import Navigation, doubts, navigation_document, objections
 from ..calibration.assessment.manoeuvre_planner import drift_left_open
 from ..calibration.calibrator import Calibrator
-from ..calibration.checks.data_warnings import data_advice, gate_advice, message_advice, reference_advice
+from ..calibration.checks.data_warnings import gate_warnings, message_warnings, recording_warnings, reference_warnings
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_document
 from ..calibration.comparison.mounting_change import Comparison
 from ..calibration.comparison.mounting_change_reasons import comparison_document
@@ -276,12 +276,12 @@ def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[R
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
         raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(decoder, dvl)}")
-    found = message_advice(result.counts) + decoder.dvl_type.advice(dvl) + data_advice(result.counts)
+    found = message_warnings(result.counts) + decoder.dvl_type.advice(dvl) + recording_warnings(result.counts)
     if decoder.zero_stamps:
         found.append(finding("STAMPS_MISSING_IN_BAG", count=decoder.zero_stamps))
     for estimate in result.estimates.values():
-        found += gate_advice(estimate)
-    return found + reference_advice(result.estimate, result.own_days)
+        found += gate_warnings(estimate)
+    return found + reference_warnings(result.estimate, result.own_days)
 
 
 def _remedy(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:

@@ -26,7 +26,7 @@ from .numerics.samples import Index, Stamps
 from .registration.registration import Registration
 from .results import results
 from .results.held_out_verification import SEVERAL, verify
-from .results.results import Estimate, Verification, finds_arm
+from .results.results import Estimate, Verification, estimates_lever_arm
 from .results.thinned_recording import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
 
 # What is said of a running calibration on the way: of the rest its diagnostics say more than a verdict does.
@@ -36,7 +36,7 @@ JUDGED_LIVE = {
 }  # fmt: skip
 
 
-class Judge:
+class Assessor:
     """Judges the estimates of one calibrator."""
 
     def __init__(self, estimates: Estimates) -> None:
@@ -163,7 +163,7 @@ class Judge:
         if kept is None:
             return None
         x, recording = state.x, kept[0]
-        if finds_arm(model):
+        if estimates_lever_arm(model):
             return typical_error(recording, Terms.of_state(x), p)
         if self._compared is None or self._compared[0] is not recording:
             every = np.arange(len(recording.dvl.times))
@@ -189,7 +189,7 @@ class Estimates:
     def __init__(
         self,
         estimators: Mapping[str, Estimator],
-        further: FurtherEstimators,
+        further: NonlinearEstimators,
         models: Sequence[str],
         parameters: Parameters,
     ) -> None:
@@ -271,7 +271,7 @@ class Estimates:
     @property
     def arm_finders(self) -> Iterator[Model]:
         """Wanted models that find the lever arm, the best first."""
-        return (MODELS[name] for name in self._models if results.finds_arm(MODELS[name]))
+        return (MODELS[name] for name in self._models if results.estimates_lever_arm(MODELS[name]))
 
     def without_tilt(self, estimate: Estimate) -> Estimate:
         """An estimate that claims no roll and pitch where those of the vehicle are not known, or no reference measures
@@ -289,7 +289,7 @@ class Estimates:
         level = p.rotation_dvl_from_body[:, :unknown_axes]
         unknown = np.zeros((model.n_state, model.n_state))
         unknown[:3, :3] = p.initial_std_misalignment**2 * (level @ level.T)
-        if needs == MEASURES_VERTICAL and results.finds_arm(model):  # nor does anything show its height
+        if needs == MEASURES_VERTICAL and results.estimates_lever_arm(model):  # nor does anything show its height
             height = model.state_names.index("lever_arm_z")
             unknown[height, height] = p.initial_std_lever_arm**2
         own = estimate.velocity_covariance + unknown
@@ -310,13 +310,13 @@ class Estimates:
         estimator = self.estimators[model.name]
         x, p = estimator.of_recording()
         shown = GaussianState(x, p - estimator.left_open)
-        return bool(results.contradicted(model, shown, self.parameters).any())
+        return bool(results.contradicts_configured_arm(model, shown, self.parameters).any())
 
 
 _Answer = TypeVar("_Answer")
 
 
-class FurtherEstimators:
+class NonlinearEstimators:
     """Those of a calibrator, in the order of their models. Names and answers are those of `Estimator`."""
 
     def __init__(self, estimators: Sequence[Estimator]) -> None:

@@ -19,7 +19,7 @@ from ..verdict.reasons import Reason
 from .assessment.dead_reckoning import Navigation
 from .assessment.manoeuvre_planner import RecentMotion, recent_motion
 from .assessment.model_selection import Selection
-from .assessor import Estimates, FurtherEstimators, Judge
+from .assessor import Assessor, Estimates, NonlinearEstimators
 from .estimators.estimator import Estimator, EstimatorSetup, LinearEstimator, Worker, kind_of
 from .filters.build_observations import Observer, RowsSeen, own_copy
 from .filters.filter_bank import Group, groups_of
@@ -149,9 +149,9 @@ class Calibrator:
             if MODELS[name].estimator:
                 self._estimators[name] = self._made(MODELS[name])
         # those that are more than the linear filter
-        self._further = FurtherEstimators([self._estimators[name] for name in self._models if MODELS[name].estimator])
+        self._further = NonlinearEstimators([self._estimators[name] for name in self._models if MODELS[name].estimator])
         self._estimates = Estimates(self._estimators, self._further, self._models, self.parameters)
-        self._judge = Judge(self._estimates)
+        self._judge = Assessor(self._estimates)
         self._headings = Headings(self.parameters)
         self._n_headings = 0  # rows that it has had
         self._seen: dict[Needs, RowsSeen] = {}

@@ -21,7 +21,7 @@ from .answer.confidence_intervals import Times, Triple, covariance_of
 from .answer.dvl_description import dvl_seen
 from .answer.gap_closure import Gap, closure_alone, held_out, measure_gap
 from .answer.gap_location import places
-from .answer.held_out_validation import borne_out, settled
+from .answer.held_out_validation import confirmed, settled
 from .answer.noise_findings import noise_findings
 from .answer.plotted_series import collect_series
 from .answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
@@ -44,7 +44,7 @@ from .search.arm_clock_ambiguity import (
 from .search.effect_selection import EffectSelection, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
-from .search.observable_parameters import somewhere, with_shown
+from .search.observable_parameters import somewhere, with_observable
 from .search.unexplained import Unexplained, matters, moved_by
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
@@ -110,7 +110,7 @@ def diagnose_recordings(
     selection, rest = settled(selection, len(testable))
     residuals = held_out(selection)
     gap = measure_gap(selection, residuals)
-    stands, rest = borne_out(selection, rest, gap, len(testable))
+    stands, rest = confirmed(selection, rest, gap, len(testable))
     if stands is not selection:
         selection = stands
         residuals = held_out(selection)
@@ -122,7 +122,7 @@ def diagnose_recordings(
     if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # whose part in the sizes nobody knows
         moved = moved_by(selection.fitter.problem, selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
-    covariance = with_shown(selection.fitter.problem, selection.fit, covariance)
+    covariance = with_observable(selection.fitter.problem, selection.fit, covariance)
     unmoved, covariance = covariance, with_open(selection.fit, covariance, selection.opened)
     covariance = with_moved(selection.fit, covariance, selection.moved)
     found = tuple(

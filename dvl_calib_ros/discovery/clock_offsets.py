@@ -19,7 +19,7 @@ from ..calibration.registration.frame_hypotheses import Reading, Readings
 from ..calibration.registration.gauss_newton import white_noise
 from ..calibration.registration.motion_streams import MotionStreams, in_order, make_motion, motion_of
 from ..calibration.registration.registration import ALIKE_S, LEFT_TO_CALIBRATION_S, OFFSETS, Registration, register
-from ..calibration.registration.unregistrable_clocks import Far, far_clocks
+from ..calibration.registration.unregistrable_clocks import UnregistrableClocks, far_clocks
 from ..calibration.streams.interpolation import ImuColumns
 from ..calibration.streams.screening import unit_quaternions
 from ..messages.decode import MessageDecoder
@@ -49,7 +49,7 @@ class FoundClocks:
     registration: Registration
     offsets: Mapping[str, float]
     parameters: Parameters
-    far: Far | None = None
+    far: UnregistrableClocks | None = None
 
     @property
     def doubt(self) -> Reason | None:

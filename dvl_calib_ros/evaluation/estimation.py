@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..calibration.filters.build_observations import Observer
 from ..calibration.filters.filter_setup import Assembler
-from ..calibration.filters.vertical_motion import HeaveRows, HeaveSums, HeightOfLate, with_heave
+from ..calibration.filters.vertical_motion import HeaveRows, HeaveSums, RelativeHeight, with_heave
 from ..calibration.models import MODELS, Model, Needs
 from ..calibration.models.base import Observations
 from ..calibration.models.parameters import Parameters
@@ -190,7 +190,7 @@ def _heights(seen: Observations, variants: AlignedVariants, given: Mask) -> Arra
     heights = np.zeros(given.shape)
     columns = (each.reshape(given.shape) for each in (variants.rows.stamps_ns, seen.rising))
     for own, at, stamps_ns, rising in zip(heights, given, *columns, strict=True):
-        own[at] = HeightOfLate().add(stamps_ns[at], rising[at])
+        own[at] = RelativeHeight().add(stamps_ns[at], rising[at])
     return heights.ravel()
 
 

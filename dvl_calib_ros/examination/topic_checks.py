@@ -9,7 +9,7 @@ import numpy as np
 from ..calibration.models.parameters import SCHEMA, Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import Stream
-from ..calibration.registration.clock_domains import apart
+from ..calibration.registration.clock_domains import arrival_offset
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Recorded
 from ..verdict.reasons import Reason, finding
@@ -113,7 +113,7 @@ def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> li
     """Streams (by dvl, reference, imu) that stamp by another clock than the rest."""
     offsets = {Stream(role): clock_offset_s(topic) for role, topic in topics.items()}
     found = []
-    for each in apart({stream: ahead for stream, ahead in offsets.items() if ahead is not None}, parameters):
+    for each in arrival_offset({stream: ahead for stream, ahead in offsets.items() if ahead is not None}, parameters):
         name = f"{each.stream.value}_time_offset"
         late, bound = getattr(parameters, name) + each.ahead, SCHEMA[name].high
         can_be_taken_off = bound is not None and abs(late) <= bound

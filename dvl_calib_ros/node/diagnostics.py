@@ -11,18 +11,18 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.checks.data_warnings import (
-    consistency_advice,
-    data_advice,
-    gate_advice,
-    message_advice,
-    reference_advice,
+    consistency_warnings,
+    gate_warnings,
+    message_warnings,
+    recording_warnings,
+    reference_warnings,
 )
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
-from ..calibration.registration.clock_domains import apart
+from ..calibration.registration.clock_domains import arrival_offset
 from ..calibration.results.results import Estimate, scale_and_delay
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
@@ -118,7 +118,7 @@ def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], paramete
             side=each.side,
             other=_NAMED[each.other],
         )
-        for each in apart(ahead, parameters, SILENCE_S)
+        for each in arrival_offset(ahead, parameters, SILENCE_S)
     }
 
 
@@ -144,9 +144,9 @@ def diagnose(
     grown["dvl"]["dropouts"] -= min(grown["dvl"]["dropouts"], len(pauses_s))
     found = [finding("PROCESS_PAUSED", seconds=sum(pauses_s))] if pauses_s else []
     found += [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(grown)]
-    found += message_advice(grown) + data_advice(grown) + dvl_type.advice(grown["dvl"])
-    found += gate_advice(estimate) + consistency_advice(estimate)
-    found += reference_advice(estimate)
+    found += message_warnings(grown) + recording_warnings(grown) + dvl_type.advice(grown["dvl"])
+    found += gate_warnings(estimate) + consistency_warnings(estimate)
+    found += reference_warnings(estimate)
     if says := calibrator.suggestion_so_far:
         found.append(finding("CONFIGURATION_WRONG", says=says))
     doubts = calibrator.doubts_so_far

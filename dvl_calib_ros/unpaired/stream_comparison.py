@@ -8,7 +8,7 @@ import numpy as np
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import robust_std
-from ..calibration.streams.outliers import beside, off_neighbours
+from ..calibration.streams.outliers import deviation_from_neighbours, neighbours
 from ..diagnosis.model.stream_curve import FAST_ENOUGH_S
 from .both_sides import DITHER_MPS, Log
 from .results import Triple
@@ -47,10 +47,10 @@ def _spikes(values: Array) -> int:
     """Samples far from where four neighbours tell them to be, and farther than these."""
     if len(values) < 10:
         return 0
-    off = off_neighbours(values)
+    off = deviation_from_neighbours(values)
     scale = np.maximum(robust_std(off), DITHER_MPS)
     size = (np.abs(off) / scale).max(axis=1)
-    return int(np.count_nonzero((size > OUTLIER) & (size > beside(size))))
+    return int(np.count_nonzero((size > OUTLIER) & (size > neighbours(size))))
 
 
 def _exact(vehicle: Log, simulator: Log) -> Candidate | None:

@@ -16,10 +16,17 @@ from numpy.typing import NDArray
 
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
-from ..checks.data_warnings import one_heading_advice
-from ..checks.heading_deviation import HeadingDeviation, heading_advice, heading_deviation, how_bad
-from ..checks.lever_arm_check import told_arm_advice
-from ..checks.residual_tests import LeftOver, finds_nothing, lag_of, left_over, left_over_advice, std_along
+from ..checks.data_warnings import one_heading_warnings
+from ..checks.heading_deviation import HeadingDeviation, heading_deviation, heading_warnings, severity_of
+from ..checks.lever_arm_check import lever_arm_warnings
+from ..checks.residual_tests import (
+    ResidualTrend,
+    is_insignificant,
+    reference_lag_s,
+    residual_trend,
+    residual_warnings,
+    std_along,
+)
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
@@ -110,7 +117,7 @@ class Navigation:
     error_before: Array
     error_after: Array
     deviation: HeadingDeviation | None = None
-    followed: LeftOver | None = None
+    followed: ResidualTrend | None = None
 
     @property
     def speed(self) -> float:
@@ -220,11 +227,11 @@ class _Level(NamedTuple):
                 level[some, 2:] = np.matmul(seen.rotation_enu_from_body, body[..., None])[:, :2, 0]
 
 
-def _followed(recording: ThinnedRecording, after: _Level, use: Index) -> LeftOver | None:
-    """As of `left_over`, of the samples that are used."""
+def _followed(recording: ThinnedRecording, after: _Level, use: Index) -> ResidualTrend | None:
+    """As of `residual_trend`, of the samples that are used."""
     rotation, velocity, error, rates = (each[use] for each in after.whole)
     interval_s = float(median(np.diff(recording.reference.times)))
-    return left_over(recording.dvl.times[use], rotation, velocity, error, rates, interval_s)
+    return residual_trend(recording.dvl.times[use], rotation, velocity, error, rates, interval_s)
 
 
 def _steps(times: Array) -> Array:
@@ -342,17 +349,17 @@ def doubts(
     """
     found = [finding("IMU_LEVEL")] if is_level else []
     if not suggested:
-        found += [each.weighed(Severity.MARGINAL) for each in told_arm_advice(finders, parameters)]
+        found += [each.weighed(Severity.MARGINAL) for each in lever_arm_warnings(finders, parameters)]
     if navigation is None:
         return found
     if navigation.deviation is not None:
-        found.append(heading_advice(navigation.deviation).weighed(how_bad(navigation.deviation, estimate)))
+        found.append(heading_warnings(navigation.deviation).weighed(severity_of(navigation.deviation, estimate)))
     if in_earth:
-        found += one_heading_advice(estimate, parameters, navigation.speed)
-    return found + left_over_advice(
+        found += one_heading_warnings(estimate, parameters, navigation.speed)
+    return found + residual_warnings(
         navigation.followed,
         are_positions(parameters),
-        lag_of(estimate, parameters),
-        finds_nothing(estimate),
+        reference_lag_s(estimate, parameters),
+        is_insignificant(estimate),
         std_along(estimate, parameters),
     )

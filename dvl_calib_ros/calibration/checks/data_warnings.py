@@ -39,7 +39,7 @@ _MESSAGE_FAULTS = {
 }
 
 
-def message_advice(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
+def message_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     """What is wrong with messages of each stream that were not used; from `Calibrator.counts`."""
     return [
         finding(code, count=counts[stream][fault], stream=name)
@@ -49,7 +49,7 @@ def message_advice(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     ]
 
 
-def data_advice(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
+def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     """What is wrong with the data that came; from `Calibrator.counts`."""
     dvl, pairing = counts["dvl"], counts["pairing"]
     found = []
@@ -89,7 +89,7 @@ def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
     return usable >= ENOUGH_SAMPLES and pairing["unpaired"] >= ENOUGH_SAMPLES
 
 
-def gate_advice(estimate: Estimate) -> list[Reason]:
+def gate_warnings(estimate: Estimate) -> list[Reason]:
     """Whether a model's gate throws away so much that the configuration must be wrong."""
     given = estimate.used + estimate.gated
     if given < ENOUGH_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
@@ -97,14 +97,14 @@ def gate_advice(estimate: Estimate) -> list[Reason]:
     return [finding("SAMPLES_GATED", model=estimate.model, gated=estimate.gated, given=given)]
 
 
-def consistency_advice(estimate: Estimate) -> list[Reason]:
+def consistency_warnings(estimate: Estimate) -> list[Reason]:
     """Whether a model's innovations are larger than it believes; smaller ones only make σ too large."""
     if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
         return []
     return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]
 
 
-def one_heading_advice(estimate: Estimate, parameters: Parameters, speed: float) -> list[Reason]:
+def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: float) -> list[Reason]:
     """Whether nothing but what is assumed of it tells a constant error of reference or DVL from yaw and scale.
 
     speed: m/s, usual.
@@ -120,7 +120,7 @@ def one_heading_advice(estimate: Estimate, parameters: Parameters, speed: float)
     return [finding("ONE_HEADING", off=off, degrees=math.degrees(share), percent=100.0 * share)]
 
 
-def reference_advice(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reason]:
+def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reason]:
     """Whether its clock leaves lever arm or yaw open, and whether it is wrong by a constant, on each of several days.
 
     days: that the model found something of, if there are several.

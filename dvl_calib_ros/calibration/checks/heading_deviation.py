@@ -75,7 +75,7 @@ def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> H
     )  # fmt: skip
 
 
-def how_bad(found: HeadingDeviation, estimate: Estimate) -> Severity:
+def severity_of(found: HeadingDeviation, estimate: Estimate) -> Severity:
     """To a verdict: reject where the compass is to be calibrated before an estimate is worth anything."""
     is_cut = estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
     if (is_cut and found.rms > GATED_FIRST) or found.rms > max(FIRST, SURELY * found.std):
@@ -84,7 +84,7 @@ def how_bad(found: HeadingDeviation, estimate: Estimate) -> Severity:
     return Severity.MARGINAL if is_drift or is_cut else Severity.WARNING
 
 
-def heading_advice(found: HeadingDeviation) -> Reason:
+def heading_warnings(found: HeadingDeviation) -> Reason:
     """What to say of it."""
     degrees = math.degrees
     course = "with time" if found.by_time else "with the heading"

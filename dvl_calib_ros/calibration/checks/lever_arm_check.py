@@ -14,20 +14,20 @@ from ...verdict.reasons import Reason, finding
 from ..models import MODELS
 from ..models.parameters import Parameters
 from ..numerics.kalman import GaussianState
-from ..results.results import ARM, contradicted, finds_arm
+from ..results.results import ARM, contradicts_configured_arm, estimates_lever_arm
 
 if TYPE_CHECKING:
     from ..results.results import Estimate
 
 
-def told_arm_advice(estimates: Iterable[Estimate], parameters: Parameters) -> list[Reason]:
+def lever_arm_warnings(estimates: Iterable[Estimate], parameters: Parameters) -> list[Reason]:
     """Whether the lever arm that was told is another than the one that the first estimate shows that finds it."""
-    estimate = next((each for each in estimates if each.used and finds_arm(MODELS[each.model])), None)
+    estimate = next((each for each in estimates if each.used and estimates_lever_arm(MODELS[each.model])), None)
     if estimate is None:
         return []
     # a late clock, which at one speed explains as much, is one of the causes
     state = GaussianState(estimate.state, estimate.covariance - estimate.left_open)
-    off = contradicted(MODELS[estimate.model], state, parameters)
+    off = contradicts_configured_arm(MODELS[estimate.model], state, parameters)
     if not off.any():
         return []
     arm = estimate.lever_arm(parameters.lever_arm)

@@ -89,7 +89,7 @@ NO_ANGLE, NO_SCALE, NO_ARM_M, BY_CHANCE = math.radians(0.35), 0.005, 0.2, 3.0
 FOLLOWED_BY_POSITIONS = 0.1
 
 
-class LeftOver(NamedTuple):
+class ResidualTrend(NamedTuple):
     """What the velocity that is left follows.
 
     tilt, tilt_std: (2,) share of roll and of pitch that the DVL's velocity leaves out, 0 of a right one, 1 of a
@@ -128,9 +128,9 @@ class _Fit(NamedTuple):
         return float(self.p[-1] @ np.einsum("n,nij,ni->j", self.weight, columns, values))
 
 
-def left_over(
+def residual_trend(
     time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
-) -> LeftOver | None:
+) -> ResidualTrend | None:
     """None where there is too little to look at.
 
     Parameters
@@ -191,7 +191,7 @@ def left_over(
     bends_by = fast.seen_of(both, _turned(body_from_enu, whole_bend))
     shows = shows and bends_by > LEAST_OF_BEND
     smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
-    return LeftOver(
+    return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
         *_circular(time, velocity - error, error, both, fast),
     )  # fmt: skip
@@ -220,13 +220,13 @@ def _beside(time: Array, values: Array, starts: Index) -> Array:
     return np.repeat(means, np.diff(starts, append=len(time)), axis=0)
 
 
-def lag_of(estimate: Estimate, parameters: Parameters) -> float:
+def reference_lag_s(estimate: Estimate, parameters: Parameters) -> float:
     """By what (s) the reference lags behind the DVL, as it was found."""
     own = dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
     return parameters.reference_time_offset - parameters.dvl_time_offset - own.get("time_offset", 0.0)
 
 
-def finds_nothing(estimate: Estimate) -> bool:
+def is_insignificant(estimate: Estimate) -> bool:
     """Whether a calibration finds nothing to correct but a lag.
 
     One that knows no two angles has found nothing either way, and a filter of the DVL shows no lever arm of its own.
@@ -249,8 +249,8 @@ def std_along(estimate: Estimate, parameters: Parameters) -> Array:
     return np.sqrt([float(ahead @ p[3:, 3:] @ ahead), turned[2], turned[1]])
 
 
-def left_over_advice(
-    found: LeftOver | None,
+def residual_warnings(
+    found: ResidualTrend | None,
     of_positions: bool = False,
     lag_s: float = 0.0,
     is_nil: bool = False,
@@ -259,7 +259,7 @@ def left_over_advice(
     """What to say of it, as bad as it is to the verdict.
 
     of_positions: the reference's velocities are differences of positions, which smooths them by their interval.
-    lag_s, is_nil, along: as of `lag_of`, `finds_nothing` and `std_along`.
+    lag_s, is_nil, along: as of `reference_lag_s`, `is_insignificant` and `std_along`.
     """
     if found is None:
         return []
@@ -308,7 +308,7 @@ def left_over_advice(
     return said
 
 
-def _smoothed_one(found: LeftOver) -> str:
+def _smoothed_one(found: ResidualTrend) -> str:
     return "reference" if found.smoothed > 0.0 else "DVL"
 
 

@@ -21,7 +21,7 @@ from ..assessment.model_selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..filters.cross_validation import HeldOutError, Moments
 from ..filters.filter_bank import ModelCounts
 from ..filters.filter_setup import gate_of, prior
-from ..filters.heading_bias import OfBias
+from ..filters.heading_bias import BiasCovariance
 from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models.own import BEYOND, DELAY, LEVER_ARM, N_G1, N_STATE
 from ..numerics.frames import Array
@@ -188,12 +188,12 @@ class DelayFilter(Estimator):
         return self._solver.registration() if self._is_settled else told.looked.registration
 
     @property
-    def of_bias(self) -> OfBias:
+    def of_bias(self) -> BiasCovariance:
         """As `Estimator`."""
         posterior = self.posterior
         if posterior is not None and self.claims:
             return posterior.of_bias
-        found, base = OfBias.none(N_STATE), self._base.of_bias
+        found, base = BiasCovariance.none(N_STATE), self._base.of_bias
         found.columns[:N_G1] = base.columns
         return found
 

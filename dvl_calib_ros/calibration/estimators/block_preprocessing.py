@@ -18,7 +18,7 @@ from ..numerics.robust import median, robust_std, steps
 from ..numerics.samples import FRAME_CODES, Codes, Index, Mask, Stamps, VelocityFrame
 from ..results.thinned_recording import NOT_MEASURED, thinned
 from ..streams.interpolation import MARGIN_S, DvlColumns, ImuColumns, ReferenceColumns, binned
-from ..streams.outliers import beside, off_neighbours, without_spikes
+from ..streams.outliers import deviation_from_neighbours, neighbours, without_spikes
 from ..streams.position_velocities import are_positions, of_moments
 from .observation_rows import DelayedRows
 
@@ -308,7 +308,7 @@ def _share_left(
 
 def _suspicious(velocity: Array) -> Index:
     """Which samples of (N, 3) m/s are further from what neighbours tell than most, and than those beside them."""
-    off = off_neighbours(velocity)
+    off = deviation_from_neighbours(velocity)
     far = (np.abs(off) / np.maximum(robust_std(off), LEAST_NOISE_MPS)).max(axis=1)
-    found = np.flatnonzero((far > SUSPICIOUS) & (far >= beside(far)))
+    found = np.flatnonzero((far > SUSPICIOUS) & (far >= neighbours(far)))
     return found[np.argsort(-far[found], kind="stable")[:MOST]]

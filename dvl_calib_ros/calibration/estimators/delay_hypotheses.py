@@ -20,8 +20,8 @@ import numpy as np
 
 from ..filters.cross_validation import FOLDS, FoldInformation, folds_of, with_states_of
 from ..filters.heading_bias import (
+    BiasCovariance,
     HeadingEvidence,
-    OfBias,
     all_told,
     block_terms,
     heading_states,
@@ -449,7 +449,7 @@ class DelayBank:
         )
         shown = self._shown([each.best for each in known], information, noise, inflations)
         for number, each in enumerate(known):
-            likely, heading, of_bias, drifted = each.likely, None, OfBias.none(N_STATE), 0.0
+            likely, heading, of_bias, drifted = each.likely, None, BiasCovariance.none(N_STATE), 0.0
             if deviations:
                 heading, shift, more, of_each, drifted, _ = deviations[number]
                 likely = GaussianState(likely.x + shift, likely.p + more)

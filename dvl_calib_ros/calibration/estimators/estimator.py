@@ -19,7 +19,7 @@ from ..assessment.dead_reckoning import Navigation
 from ..assessment.model_selection import NO_EVIDENCE, Evidence
 from ..filters.cross_validation import HeldOutError, Moments, held_out_error
 from ..filters.filter_bank import Group, ModelCounts
-from ..filters.heading_bias import OfBias
+from ..filters.heading_bias import BiasCovariance
 from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models import Model
 from ..models.parameter_spec import ParameterError
@@ -119,9 +119,9 @@ class Estimator(ABC):
         return np.zeros((n, n))
 
     @property
-    def of_bias(self) -> OfBias:
+    def of_bias(self) -> BiasCovariance:
         """What a bias of the DVL makes of `of_recording`."""
-        return OfBias.none(len(self.state().x))
+        return BiasCovariance.none(len(self.state().x))
 
     @property
     def registration(self) -> Registration | None:
@@ -263,7 +263,7 @@ class LinearEstimator(Estimator):
         return self._group.of_recording(self._model.name)
 
     @property
-    def of_bias(self) -> OfBias:
+    def of_bias(self) -> BiasCovariance:
         """As `Estimator`."""
         self._update(self._group)
         return self._group.of_bias(self._model.name)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..filters.heading_bias import HeadingEvidence, OfBias
+from ..filters.heading_bias import BiasCovariance, HeadingEvidence
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, Mask, Stamps
@@ -108,7 +108,7 @@ class Likely(NamedTuple):
     shown: Mask
     inflation: Array
     heading: GaussianState | None
-    of_bias: OfBias
+    of_bias: BiasCovariance
     drifted: float
 
 
@@ -129,7 +129,7 @@ class Posterior:
     turned: Array
     by_lever_arm: Array
     heading: GaussianState | None
-    of_bias: OfBias
+    of_bias: BiasCovariance
 
 
 class Ended(NamedTuple):

@@ -27,10 +27,10 @@ from ..numerics.samples import Index, Mask, Stamps
 from .cross_validation import FOLDS, FoldInformation, Moments, folds_of, with_states_of
 from .filter_setup import Assembler
 from .heading_bias import (
+    BiasCovariance,
     BlockTerms,
     HeadingEvidence,
     HeadingStates,
-    OfBias,
     TermsOfBlock,
     all_told,
     heading_states,
@@ -39,7 +39,7 @@ from .heading_bias import (
     with_terms,
 )
 from .state_history import Counts, Standing
-from .vertical_motion import HeaveRows, HeaveSums, HeightOfLate, with_heave
+from .vertical_motion import HeaveRows, HeaveSums, RelativeHeight, with_heave
 
 Ends = Index
 # Blocks by whose scatter σ is checked, s: as long as the noise of a vehicle's motion lasts.
@@ -114,7 +114,7 @@ class Group:
         self._n_errors = models[0].n_errors
         self._scatter = self._new_scatter() if still else None
         self._heave = HeaveRows(len(models), models[0].n_state, parameters) if models[0].heave is not None else None
-        self._height = HeightOfLate() if models[0].uses_height else None
+        self._height = RelativeHeight() if models[0].uses_height else None
         self._states: dict[str, GaussianState] = {}
         self._of_recording: dict[str, GaussianState] = {}
         self._sound: dict[str, GaussianState] = {}  # the last that could be published
@@ -333,10 +333,10 @@ class Group:
             self._of_recording[name] = found.of_bias.at(0).added_to(raised)
         return self._of_recording[name]
 
-    def of_bias(self, name: str) -> OfBias:
+    def of_bias(self, name: str) -> BiasCovariance:
         """What a bias of the DVL makes of `of_recording`, by one model."""
         if self._scatter is None:
-            return OfBias.none(self._x.shape[1])
+            return BiasCovariance.none(self._x.shape[1])
         return self._scatter.found(self.index[name]).of_bias.at(0)
 
     def heading_deviation(self, name: str) -> GaussianState | None:

@@ -252,7 +252,7 @@ class HeadingStates(NamedTuple):
     coefficients: GaussianState | None
     shift: Array
     more: Array
-    of_bias: OfBias
+    of_bias: BiasCovariance
     drifted: float
     inflation: Array
 
@@ -326,7 +326,7 @@ def _none(seen: HeadingEvidence) -> HeadingStates:
     if not seen.has_terms and len(seen.blocks.vector):
         best = slice(seen.best, seen.best + 1)
         factor = inflations([seen.blocks], seen.states.x[best], seen.states.p[best])[0]
-    return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), OfBias.none(m, n), 0.0, factor)
+    return HeadingStates(None, np.zeros((m, n)), np.zeros((m, n, n)), BiasCovariance.none(m, n), 0.0, factor)
 
 
 class _Deviation(NamedTuple):
@@ -421,7 +421,7 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
     found, factor = inflation(root)
     every = np.arange(len(owner))
     shift, more = deviating(root, as_claimed, every)[1]
-    of_bias = OfBias.none(*shift.shape)
+    of_bias = BiasCovariance.none(*shift.shape)
     if std[_BIAS].any():
         # of the heading its size goes by the level, and σ grows with what is left; a bias is known before to what it is
         worth = np.where(_BIAS, level_of(_BIAS, std)[:, None], 1.0)
@@ -429,7 +429,7 @@ def _deviating(each: Sequence[_Deviation], std: Array) -> list[HeadingStates]:
         bias, p_bias = of_all.x[:, :N_BIAS], of_all.p[:, :N_BIAS, :N_BIAS]
         off = turned.swapaxes(1, 2) @ of_all.p[:, :, :N_BIAS] @ np.linalg.inv(p_bias)
         # it is as large as its prior and the data leave it, and is left in the states with all that the data show of it
-        of_bias = OfBias(off @ _root(p_bias + bias[:, :, None] * bias[:, None]))
+        of_bias = BiasCovariance(off @ _root(p_bias + bias[:, :, None] * bias[:, None]))
     states = []
     for number, (end, size) in enumerate(zip(ends.tolist(), sizes.tolist(), strict=True)):
         at = slice(end - size, end)
@@ -507,7 +507,7 @@ def _size(information: Array, scores: Array, root: Array, which: Mask) -> Array:
     return size
 
 
-class OfBias(NamedTuple):
+class BiasCovariance(NamedTuple):
     """Of states (..., n).
 
     columns: (..., n, 3), by how much states are off where the DVL is off by one σ along each of its axes: of its prior
@@ -522,21 +522,21 @@ class OfBias(NamedTuple):
         return np.asarray(self.columns @ self.columns.swapaxes(-1, -2))
 
     @staticmethod
-    def none(*shape: int) -> OfBias:
+    def none(*shape: int) -> BiasCovariance:
         """Of states (..., n) = shape that no bias reaches."""
-        return OfBias(np.zeros((*shape, 3)))
+        return BiasCovariance(np.zeros((*shape, 3)))
 
-    def at(self, index: int | slice) -> OfBias:
+    def at(self, index: int | slice) -> BiasCovariance:
         """Of some of several."""
-        return OfBias(self.columns[index])
+        return BiasCovariance(self.columns[index])
 
-    def mixed(self, share: Array) -> OfBias:
+    def mixed(self, share: Array) -> BiasCovariance:
         """Of the mean of M, each with a share (M,)."""
-        return OfBias(np.tensordot(share, self.columns, axes=1))
+        return BiasCovariance(np.tensordot(share, self.columns, axes=1))
 
-    def where(self, known: Mask) -> OfBias:
+    def where(self, known: Mask) -> BiasCovariance:
         """Of those states (n,) alone that are known from data."""
-        return OfBias(np.where(known[:, None], self.columns, 0.0))
+        return BiasCovariance(np.where(known[:, None], self.columns, 0.0))
 
     def added_to(self, state: GaussianState) -> GaussianState:
         """The state x (n,), P (n, n) of a DVL that may be off so far."""

@@ -243,7 +243,7 @@ MEMORY_S = 100.0
 LONGEST_STEP_S = 5.0
 
 
-class HeightOfLate:
+class RelativeHeight:
     """Integrates the vertical velocity sample by sample, so that it does not matter in what blocks they come."""
 
     def __init__(self) -> None:

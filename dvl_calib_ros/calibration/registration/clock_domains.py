@@ -18,7 +18,7 @@ from ..numerics.samples import SampleBlock, Stamps, Stream, Streams
 from ..streams.interpolation import LONGEST_DELAY_S
 
 
-class Apart(NamedTuple):
+class ArrivalOffset(NamedTuple):
     """Stamps of a stream are ahead of those of the other by so many s beyond what the parameters take off."""
 
     stream: Stream
@@ -36,7 +36,7 @@ def limit_s(parameters: Parameters) -> float:
     return LONGEST_DELAY_S + parameters.position_window
 
 
-def apart(ahead: Mapping[Stream, float], parameters: Parameters, late_s: float = 0.0) -> list[Apart]:
+def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, late_s: float = 0.0) -> list[ArrivalOffset]:
     """Streams by another clock than the rest.
 
     ahead: of each stream, the DVL first, how far its stamps are ahead of its messages' arrival, s, beside any common
@@ -56,7 +56,11 @@ def apart(ahead: Mapping[Stream, float], parameters: Parameters, late_s: float =
         middle = sorted(corrected.values())[1]
         if abs(corrected[other] - middle) > limit_s(parameters):
             other = min(corrected, key=lambda stream: abs(corrected[stream] - middle))
-    found = (Apart(stream, other, corrected[stream] - corrected[other]) for stream in corrected if stream is not other)
+    found = (
+        ArrivalOffset(stream, other, corrected[stream] - corrected[other])
+        for stream in corrected
+        if stream is not other
+    )
     # samples that are old when they are stamped arrive by neither clock's fault
     return [
         each
@@ -127,7 +131,7 @@ class StreamClocks:
             if len(spread.kept):
                 ahead[stream] = float(median(1e-9 * spread.kept))
         said = []
-        for each in apart(ahead, parameters):
+        for each in arrival_offset(ahead, parameters):
             known = WELL_KNOWN.get(round(abs(each.ahead)))
             said.append(
                 finding(

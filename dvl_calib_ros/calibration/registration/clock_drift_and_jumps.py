@@ -39,7 +39,7 @@ NO_STREAMS: Mapping[str, Array] = {}
 
 
 @dataclass(frozen=True)
-class Unsteady:
+class ClockChange:
     """whose: by the name of `DIRECTIONS`, "" where that does not show. drift: by how much later its stamps get, s/s
     since time 0. leap: by how much later they are from `at` (s) on. std: σ of whichever of both it is."""
 
@@ -61,7 +61,7 @@ class Unsteady:
         way = "ahead" if self.leap > 0.0 else "back"
         return finding("CLOCK_LEAPS", whose=whose, way=way, seconds=abs(self.leap), std=self.std, at=self.at)
 
-    def timed(self, motion: MotionStreams, fit: MotionFit, x: Array, rotation: Array, level: float) -> Unsteady:
+    def timed(self, motion: MotionStreams, fit: MotionFit, x: Array, rotation: Array, level: float) -> ClockChange:
         """A leap ahead at the hole that it leaves in the stamps, if there is just one; else at the time at which the
         clocks before it and those after it explain most together.
 
@@ -147,7 +147,7 @@ def _holes(times: Array, leap: float, at: float, reach: float) -> Index:
 
 def unsteady(
     times: Array, stretches: Sequence[Fitted], is_turned: bool, streams: Mapping[str, Array] = NO_STREAMS
-) -> Unsteady | None:
+) -> ClockChange | None:
     """Which clock moves through stretches at times (S,) s; None where that is not beyond doubt.
 
     streams: as of `stamps`; where stamps have no hole, their clock has not leapt ahead.
@@ -187,7 +187,7 @@ def unsteady(
         return None
     others = min((each[0] for each in found if each[3] != name), default=np.inf)
     whose = name if is_turned and others - left > TOLD_APART * scatter else ""
-    return Unsteady(whose, value, std=std) if course.at is None else Unsteady(whose, 0.0, value, course.at, std)
+    return ClockChange(whose, value, std=std) if course.at is None else ClockChange(whose, 0.0, value, course.at, std)
 
 
 def _leaps(times: Array) -> Iterator[_Course]:

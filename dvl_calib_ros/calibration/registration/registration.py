@@ -16,7 +16,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
-from .clock_drift_and_jumps import MOST_STRETCHES, STRETCH_S, Unsteady, stamps, unsteady
+from .clock_drift_and_jumps import MOST_STRETCHES, STRETCH_S, ClockChange, stamps, unsteady
 from .delay_search import LONGEST_S, places
 from .gauss_newton import (  # fmt: skip
     APART,
@@ -124,7 +124,7 @@ class Registration:
     open_by: Array
     turn_open: Array
     next_worse: float
-    unsteady: Unsteady | None = None
+    unsteady: ClockChange | None = None
 
     @property
     def left_open(self) -> Array:
@@ -198,7 +198,7 @@ def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_
 
 
 def _registered(
-    motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, moves: Unsteady | None
+    motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, moves: ClockChange | None
 ) -> Registration | None:
     """moves: what has been taken off a clock; None to look whether one moves."""
     curves = Curves(motion)
@@ -247,7 +247,7 @@ def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> 
     return min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
 
 
-def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> Unsteady | None:
+def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
     """A clock that moves, by the places of all of them in stretches of a motion."""
     times = motion.reference_times
     number = min(int((times[-1] - times[0]) / STRETCH_S), MOST_STRETCHES)

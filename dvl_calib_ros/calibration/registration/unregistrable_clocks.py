@@ -30,7 +30,7 @@ MOVING_MPS = 0.2
 Series = NDArray[Any]  # of complex numbers
 
 
-class Far(NamedTuple):
+class UnregistrableClocks(NamedTuple):
     """whose: of the clock that is off. others: beside which. late: by about so many s, more than is registered."""
 
     whose: str
@@ -46,7 +46,7 @@ class Far(NamedTuple):
         )
 
 
-def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Far | None:
+def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> UnregistrableClocks | None:
     """Which stamps are too far from the others to be registered; None if that is not beyond doubt.
 
     rotation_dvl_from_body: (3, 3), the nominal mounting.
@@ -60,7 +60,7 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Far | No
         _speed(dvl_times, body), dvl_times[0], _speed(reference_times, reference), reference_times[0], known, is_own
     )
     if is_far:
-        return Far("the DVL's", "the reference's", late)
+        return UnregistrableClocks("the DVL's", "the reference's", late)
     if not motion.in_earth or not motion.has_attitude:
         return None
     at = np.arange(max(dvl_times[0] - late, reference_times[0]), min(dvl_times[-1] - late, reference_times[-1]), STEP_S)
@@ -74,7 +74,7 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Far | No
     ahead: Series = rotation[:, :2, 0] @ [1.0, 1j]
     moving = ((np.abs(course) > MOVING_MPS**2) & covered(reference_times, at)).astype(float)
     late, is_far = lag(_unit(ahead), motion.imu.times[0], _unit(course), at[0], moving)
-    return Far("the IMU's", "those of DVL and reference", late) if is_far else None
+    return UnregistrableClocks("the IMU's", "those of DVL and reference", late) if is_far else None
 
 
 def _unit(series: Series) -> Series:

@@ -12,7 +12,7 @@ import numpy as np
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, by_severity
 from ..filters.cross_validation import HeldOutError
-from ..filters.heading_bias import OfBias
+from ..filters.heading_bias import BiasCovariance
 from ..filters.observability import Convergence, Observability, observability, scale_std_ahead
 from ..models import MODELS, Model
 from ..models.parameters import FROM_REFERENCE, TOLD, UNKNOWN, Parameters
@@ -43,7 +43,7 @@ class Estimate:
     recording_covariance: Array
     filter_covariance: Array
     left_open: Array
-    of_bias: OfBias
+    of_bias: BiasCovariance
     used: int
     gated: int
     mean_nis: float
@@ -276,7 +276,7 @@ def position_in_body(model: Model, state: GaussianState, parameters: Parameters)
         shown: Mask = np.array([name in seen for name in _ARM])
         if not given.any() and not shown.all():
             return None
-        shown = shown & ~stands(model, state, parameters)
+        shown = shown & ~keeps_configured_arm(model, state, parameters)
         arm = np.where(shown, lever_arm(model, state, given.tolist()), given)
     x, y, z = (arm + parameters.reference_position).tolist()
     return x, y, z
@@ -367,22 +367,22 @@ SIGMAS, MEASURED_TO = 10.0, 0.05
 WORSE_THAN_TOLD = 2.0
 
 
-def finds_arm(model: Model) -> bool:
+def estimates_lever_arm(model: Model) -> bool:
     """Whether its states have the lever arm."""
     return set(ARM) <= set(model.state_names)
 
 
-def stands(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
+def keeps_configured_arm(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
     """(3,) whether it is where it was told to be, by axis: contradicted, or known less well than by a tape measure."""
-    if not any(parameters.lever_arm) or not finds_arm(model):
+    if not any(parameters.lever_arm) or not estimates_lever_arm(model):
         return np.zeros(3, dtype=bool)
     std = np.sqrt(np.diag(state.p)[[model.state_names.index(name) for name in ARM]])
-    return contradicted(model, state, parameters) | np.asarray(std > WORSE_THAN_TOLD * MEASURED_TO)
+    return contradicts_configured_arm(model, state, parameters) | np.asarray(std > WORSE_THAN_TOLD * MEASURED_TO)
 
 
-def contradicted(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
+def contradicts_configured_arm(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
     """(3,) whether the data show the DVL elsewhere than it was told to be, by axis of the body."""
-    if not any(parameters.lever_arm) or not finds_arm(model):
+    if not any(parameters.lever_arm) or not estimates_lever_arm(model):
         return np.zeros(3, dtype=bool)
     at = [model.state_names.index(name) for name in ARM]
     away, std = np.abs(state.x[at]), np.sqrt(np.diag(state.p)[at])

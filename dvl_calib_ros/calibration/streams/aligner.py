@@ -31,7 +31,7 @@ from .batch_alignment import (
     ordered,
     screened,
 )
-from .live_alignment import OneByOne
+from .live_alignment import LiveAlignment
 from .pairing import add_count
 from .stream_order import LONG_AGO_NS
 
@@ -39,7 +39,7 @@ from .stream_order import LONG_AGO_NS
 COLUMNS_FROM = 64
 
 
-class Aligner(OneByOne):
+class Aligner(LiveAlignment):
     """Aligns three streams, by columns where these go on in a simple order."""
 
     def take(self, streams: Streams) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from ..numerics.frames import Array
 from ..numerics.samples import Codes, Index, Mask, Stamps, Stream, Streams
 from .clock_correction import Clocks
-from .pairing import BODY, Partners, Rows
+from .pairing import BODY, Pairer, Rows
 from .screening import ALL_AXES, are_valid_velocities, screen_columns, unit_quaternions, valid_rates
 from .stream_order import LONG_AGO_NS, Admitted, Sequencer, Track
 
@@ -142,7 +142,7 @@ def ordered(
 
 
 def decisions(
-    partners: Partners, rows: Rows, reference: Track, imu: Track, chunk: OrderedStreams, events: Events
+    partners: Pairer, rows: Rows, reference: Track, imu: Track, chunk: OrderedStreams, events: Events
 ) -> Decisions | None:
     """When the rows that wait, and those that come, are decided; None where one may get its partner by waiting: while
     attitude is waited for, a reference that is overdue may come after all."""

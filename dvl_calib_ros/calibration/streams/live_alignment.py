@@ -29,7 +29,7 @@ from ..numerics.samples import (
     VelocityFrame,
 )
 from .clock_correction import SECOND_NS, Clocks
-from .pairing import Partners, Rows, add_count
+from .pairing import Pairer, Rows, add_count
 from .screening import ALL_AXES, VERTICAL, CovarianceScreen, is_valid_rate, is_valid_velocity, unit_quaternion
 from .stream_order import DROPOUT_NS, LONG_AGO_NS, SHORTEST_PAUSE_NS, Dropouts, NewDays, Order, Sequencer, Track
 
@@ -43,7 +43,7 @@ FORGET_EVERY = 256
 _NAN_4, _NAN_3 = (math.nan,) * 4, (math.nan,) * 3
 
 
-class OneByOne:
+class LiveAlignment:
     """Aligns three streams; `rows` are its outcome, `partners` says how many of them are decided.
 
     reference, imu: their samples of late. dropouts: of the DVL. lag_ns: by how much (in stamps) one stream may lag
@@ -98,9 +98,7 @@ class OneByOne:
 
     def _forget_dvl(self) -> None:
         self.rows = Rows()
-        self.partners = Partners(
-            self.parameters, self.rows, self.reference, self.imu, self.tally, self._prior_sway_heave
-        )
+        self.partners = Pairer(self.parameters, self.rows, self.reference, self.imu, self.tally, self._prior_sway_heave)
         self.reference.vertical_seen = False
         # what the first waiting rows wait for: samples of these streams, or any stream's stamp reaching this
         self._waits_for: set[Track] = set()

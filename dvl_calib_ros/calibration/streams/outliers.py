@@ -14,7 +14,7 @@ SPIKE, PASSES = 12.0, 6
 FEWEST = 10
 
 
-def off_neighbours(values: Array) -> Array:
+def deviation_from_neighbours(values: Array) -> Array:
     """(N, k) how far samples are from the cubic through two neighbours on either side; 0 at the ends."""
     off = np.zeros_like(values)
     x = values
@@ -22,7 +22,7 @@ def off_neighbours(values: Array) -> Array:
     return off
 
 
-def beside(sizes: Array) -> Array:
+def neighbours(sizes: Array) -> Array:
     """(N,) the larger of the two neighbours of each of (N,), which are not negative."""
     return np.maximum(np.append(sizes[1:], 0.0), np.append(0.0, sizes[:-1]))
 
@@ -47,7 +47,7 @@ def without_spikes(
             break
         x = values[kept]
         loud = np.ones_like(x) if loudness is None else loudness[kept]
-        off = off_neighbours(x) / loud
+        off = deviation_from_neighbours(x) / loud
         scale = np.maximum(robust_std(off), smallest)
         if also_at_ends:
             off[:2], off[-2:] = (x[:2] - median(x[:5])), (x[-2:] - median(x[-5:]))
@@ -59,7 +59,7 @@ def without_spikes(
         about = np.clip(at, 2, len(far) - 3)[:, None] + np.arange(-2, 3)
         alone = np.abs(x[at] - median(x[about].swapaxes(0, 1))) / loud[at]
         far[at] = (np.minimum(np.abs(off[at]), alone) / scale).max(axis=1)
-        good = (far < SPIKE) | (far < beside(far))  # what a spike does to its neighbours is not theirs
+        good = (far < SPIKE) | (far < neighbours(far))  # what a spike does to its neighbours is not theirs
         if good.all():
             break
         kept = kept[good]

@@ -30,7 +30,7 @@ def add_count(tally: Counter[str], name: str, count: int) -> None:
         tally[name] += count
 
 
-class Partners:
+class Pairer:
     """Fills in the rows of an aligner.
 
     n_judged, n_oriented, n_paired: numbers of the first row whose verdict, attitude or reference is not decided yet.

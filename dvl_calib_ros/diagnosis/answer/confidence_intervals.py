@@ -10,8 +10,8 @@ import numpy as np
 from ...calibration.numerics.frames import Array
 from ...effects.base import MountingEffect
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.parametric_bootstrap import made_up
-from ..fit.selection_criteria import FittedBeside, blocks_of
+from ..fit.parametric_bootstrap import simulated_recordings
+from ..fit.selection_criteria import NuisanceFit, blocks_of
 from ..model.forward_model import Problem
 from ..model.hypothesis import is_time_of_run
 from ..search.clock_jumps import LEAP, time_by_stamps
@@ -49,7 +49,10 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
 def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
     """A covariance (n, n) with what fits to made-up recordings are off by, and scatter beyond it."""
     steps = np.array(
-        [fitter.step_of(other, seen, left, fit) for other, seen, left in made_up(fitter.problem, fit, MADE_UP)]
+        [
+            fitter.step_of(other, seen, left, fit)
+            for other, seen, left in simulated_recordings(fitter.problem, fit, MADE_UP)
+        ]
     )
     std = np.sqrt(np.diag(covariance))
     off, scatter = steps.mean(axis=0), steps.std(axis=0, ddof=1) / std
@@ -65,7 +68,7 @@ def with_unshown_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:
     """
     if not any(isinstance(effect, MountingEffect) for effect in fit.effects):
         return covariance
-    beside, own = FittedBeside.of_fit(problem, fit), np.arange(fit.columns.shape[2])
+    beside, own = NuisanceFit.of_fit(problem, fit), np.arange(fit.columns.shape[2])
     if len(beside.std) == len(own):
         return covariance
     both = beside.step(fit.noise, fit.residual)

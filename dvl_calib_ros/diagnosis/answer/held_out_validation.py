@@ -8,7 +8,7 @@ import numpy as np
 
 from ...effects.base import Effect
 from ..fit.gauss_newton import Fit
-from ..fit.selection_criteria import FittedBeside, blocks_of, price, robust_p
+from ..fit.selection_criteria import NuisanceFit, blocks_of, price, robust_p
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
@@ -92,7 +92,7 @@ def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectS
 def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
     """By how much better, in deviance, an unknown cause beside a reduced fit predicts stretches that it was not fitted
     to than the fit does."""
-    whole, rest = (FittedBeside.of_fit(problem, each) for each in (fit, reduced))
+    whole, rest = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
     rest = rest.and_rest(other.clearest, reduced.residual)
     effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
     return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
@@ -103,14 +103,14 @@ def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
 
-def borne_out(
+def confirmed(
     selection: EffectSelection, rest: Unexplained, gap: Gap, n_tested: int
 ) -> tuple[EffectSelection, Unexplained]:
     """A selection and what it leaves, as they are if it is borne out; else none of its effects, and what is left then.
 
     What explains much may be told by one stretch alone, as a leap by one turn. It stands if no unknown cause does.
     """
-    if not selection.selected or is_borne_out(selection, gap, n_tested):
+    if not selection.selected or is_confirmed(selection, gap, n_tested):
         return selection, rest
     none = selection.withdrawn()
     left = unexplained(none.fitter, none.fit)
@@ -120,7 +120,7 @@ def borne_out(
     return none, left
 
 
-def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
+def is_confirmed(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
     """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
     fit = selection.fit
     explained = selection.base.deviance - fit.deviance
@@ -129,7 +129,7 @@ def is_borne_out(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
         values = fit.hypothesis.vector()[6:] - np.array([each.spec.default for each in parameters])
         without = fit.residual - columns @ values
         problem = selection.fitter.problem
-        known = FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns[:, :, :6])
+        known = NuisanceFit.of(problem, fit.hypothesis, fit.seen, fit.columns[:, :, :6])
         told = told_elsewhere(problem, fit.noise, known, columns, without)
         if told < BORNE_OUT * (explained - len(values)):
             return False

@@ -14,7 +14,7 @@ from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.tests import holm
 from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, around
-from ..fit.parametric_bootstrap import made_up
+from ..fit.parametric_bootstrap import simulated_recordings
 from ..model.claimed_noise import followed
 from ..model.forward_model import Problem
 from ..noise.noise_level import SIGNIFICANT, claims_of, fit_claims, fit_level, stretches_of
@@ -113,7 +113,7 @@ def _made_by_comparing(problem: Problem, fit: Fit) -> Noise:
     the vehicle's motion.
     """
     noise, white = fit.noise, replace(fit, noise=fit.noise.white)
-    residuals = [residual for _, _, residual in made_up(problem, white, MADE_UP)]
+    residuals = [residual for _, _, residual in simulated_recordings(problem, white, MADE_UP)]
     m = len(fit.residual)
     pooled = replace(
         noise,

@@ -42,7 +42,7 @@ class _OtherWay(Curve):
         return self
 
 
-def made_up(problem: Problem, fit: Fit, count: int) -> Iterator[tuple[Problem, list[Seen], Array]]:
+def simulated_recordings(problem: Problem, fit: Fit, count: int) -> Iterator[tuple[Problem, list[Seen], Array]]:
     """`count` problems like one, each seen through the fit's hypothesis, with its residual (M, A) as large as the
     fit's.
 

@@ -95,7 +95,7 @@ def _told_by_unshown(problem: Problem, fit: Fit) -> float:
     """Deviance that what is not shown, and not fitted, would explain beside a fit, as straight lines tell it."""
     if not problem.lacks_columns(fit.hypothesis):
         return 0.0
-    both = FittedBeside.of_fit(problem, fit).step(fit.noise, fit.residual)
+    both = NuisanceFit.of_fit(problem, fit).step(fit.noise, fit.residual)
     alone = both.part(np.arange(fit.columns.shape[2]))
     return alone.misfit(alone.solution()) - both.misfit(both.solution())
 
@@ -143,7 +143,7 @@ def finer_steps(problem: Problem) -> list[float]:
     return steps
 
 
-class FittedBeside(NamedTuple):
+class NuisanceFit(NamedTuple):
     """What is fitted beside what is looked for. columns: (M, A, k) d residual / d parameters. std, centre: (k,), of the
     prior of what they explain of a fit's residual.
     """
@@ -153,25 +153,25 @@ class FittedBeside(NamedTuple):
     centre: Array
 
     @staticmethod
-    def of(problem: Problem, hypothesis: Hypothesis, seen: Sequence[Seen], columns: Array) -> FittedBeside:
+    def of(problem: Problem, hypothesis: Hypothesis, seen: Sequence[Seen], columns: Array) -> NuisanceFit:
         """Columns (M, A, k) of the first k parameters of a hypothesis, and those of what is not shown (u more)."""
         unshown, sizes = problem.unshown_columns(hypothesis, seen)
         k, none = columns.shape[2], np.zeros(len(sizes))
         std, centre = np.append(prior_std(hypothesis)[:k], sizes), np.append(hypothesis.vector()[:k], none)
-        return FittedBeside(np.concatenate([columns, unshown], axis=2), std, centre)
+        return NuisanceFit(np.concatenate([columns, unshown], axis=2), std, centre)
 
     @staticmethod
-    def of_fit(problem: Problem, fit: Fit) -> FittedBeside:
+    def of_fit(problem: Problem, fit: Fit) -> NuisanceFit:
         """All parameters of a fit, and what is not shown."""
-        return FittedBeside.of(problem, fit.hypothesis, fit.seen, fit.columns)
+        return NuisanceFit.of(problem, fit.hypothesis, fit.seen, fit.columns)
 
-    def and_rest(self, raw: Array, residual: Array) -> FittedBeside:
+    def and_rest(self, raw: Array, residual: Array) -> NuisanceFit:
         """And columns raw (M, A, c), of unit size, of what a residual (M, A) follows."""
         size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
         # all together are no larger than the residual: else stretches without a turn would be told of any size
         std, none = np.full(raw.shape[2], _likely(raw, residual)), np.zeros(raw.shape[2])
         columns = np.concatenate([self.columns, raw / size], axis=2)
-        return FittedBeside(columns, np.append(self.std, std), np.append(self.centre, none))
+        return NuisanceFit(columns, np.append(self.std, std), np.append(self.centre, none))
 
     def step(self, noise: Noise, residual: Array) -> WhitenedLeastSquares:
         """Of the step (k,) of what is fitted that leaves least of a residual (M, A) under a noise."""

@@ -16,7 +16,7 @@ from scipy.interpolate import make_interp_spline
 
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
-from ...calibration.streams.outliers import beside, off_neighbours, without_spikes
+from ...calibration.streams.outliers import deviation_from_neighbours, neighbours, without_spikes
 from .claimed_noise import loudness
 from .settings import SETTINGS
 
@@ -162,12 +162,12 @@ class Curve:
     @cached_property
     def from_neighbours(self) -> Array:
         """(N, k) how far samples are from the cubic through two neighbours on either side, over their loudness."""
-        return off_neighbours(self.values) / self.loudness
+        return deviation_from_neighbours(self.values) / self.loudness
 
     def without_spikes(self) -> Curve:
         """The same without samples far from where their neighbours are, which would bend the curve about them.
 
-        Of a fast stream only: between the samples of a slow one a vehicle can turn (`without_contradicted`).
+        Of a fast stream only: between the samples of a slow one a vehicle can turn (`without_slow_outliers`).
         """
         if self.interval > FAST_ENOUGH_S:
             return self
@@ -246,7 +246,7 @@ def _gain(power: Array, noise: float) -> Array:
     edges = np.unique(np.concatenate([[0], np.geomspace(1.0, n, BANDS), [n]]).astype(int))
     mean = np.add.reduceat(power, edges[:-1]) / np.diff(edges)
     over = np.clip((mean / max(noise, 1e-300) - NOISE_ALONE) / (SOME_MOTION - NOISE_ALONE), 0.0, 1.0)
-    return np.repeat(np.maximum(over, beside(over)), np.diff(edges))
+    return np.repeat(np.maximum(over, neighbours(over)), np.diff(edges))
 
 
 def segments_of(times: Sequence[Array]) -> tuple[slice, ...]:

@@ -25,14 +25,14 @@ from ..model.hypothesis import Hypothesis, is_time_of_run
 from ..model.settings import SETTINGS
 from .arm_clock_ambiguity import DVL_CLOCK, LAG, TWO_CLOCKS, lag_not_taken_back
 from .candidates import KEPT_VARIANTS
-from .clock_jumps import LEAP, gaps, is_shown_by_stamps
+from .clock_jumps import LEAP, gaps, is_in_stamps
 from .unexplained import Unexplained, matters, unexplained
 
 # A clock that explains less than this share of what two leaps do, and makes them cancel, is not late before them
 LITTLE_OF_LEAPS = 0.02
 
 
-def only_called_for(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """A fit without those effects that are not called for given all others, or add next to nothing to a strong one."""
     threshold = float(np.log(SETTINGS.level / n_effects))
     while fit.effects:
@@ -134,7 +134,7 @@ def without_nothing(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
-def only_borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+def only_confirmed(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """A fit without effects that the scatter of the blocks does not bear out, whatever the noise's colour."""
     block = blocks_of(fitter.problem)
     while fit.effects:
@@ -146,7 +146,7 @@ def only_borne_out(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
-def once_where_borne_out(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
+def once_where_confirmed(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
     """A fit in which what happens twice happens once, where the scatter of the blocks does not bear out the other."""
     block = blocks_of(fitter.problem)
     for effect in fit.effects:
@@ -172,7 +172,7 @@ TAKEN_BACK = 0.25
 TAKEN_BACK_EXACTLY, MUCH = 0.05, 150.0
 
 
-def happening_again(
+def repeated_effects(
     fitter: Fitter, fits: Sequence[Fit], every: Mapping[str, Effect], effects: Mapping[str, Effect]
 ) -> list[Fit]:
     """Of what may happen twice, the best fit in which it happens once with a second time, where that promises to be
@@ -258,7 +258,7 @@ def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | 
     apart, share = apart_and_undone(fit, name)
     if apart < step_of_times(fitter.problem):
         return True
-    if share >= TAKEN_BACK or (name == LEAP and is_shown_by_stamps(fitter, fit)):
+    if share >= TAKEN_BACK or (name == LEAP and is_in_stamps(fitter, fit)):
         return False
     if drop < MUCH:
         return True

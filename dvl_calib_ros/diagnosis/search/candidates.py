@@ -78,12 +78,12 @@ def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hy
     own = tuple(range(len(fit.effects)))
     return [
         *(combined(fitter, fit, table, chosen) for chosen in (worth if own in worth else [*worth, own])),
-        *told_by_other_clocks(fitter, fit, effects),
+        *by_other_clocks(fitter, fit, effects),
         *_told_by_a_lag(fit, effects),
     ]
 
 
-def coming_and_going(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     """The best with effects that come and go, as they would be if the noise were white.
 
     Noise with a memory takes in what a wrong time leaves, and of times on a grid the least wrong ones are no better.
@@ -263,13 +263,13 @@ def _is_told_by_two_clocks(table: StraightLines, chosen: Sequence[int]) -> bool:
     return ATTITUDE_CLOCK not in names or len(names & set(CLOCKS)) == 1
 
 
-def told_by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     """The fit's offsets said by fewer clocks, and by all that can say them: for large ones no straight line would.
 
     A leap at the beginning is a DVL's clock that is late throughout.
     """
     n, values = len(fit.seen), fit.values
-    said = (*CLOCKS, LEAP) if leaps_at_the_beginning(fitter, fit) else CLOCKS
+    said = (*CLOCKS, LEAP) if jumps_at_start(fitter, fit) else CLOCKS
     if not set(said) & set(values):
         return []
     dvl, reference, attitude = (
@@ -315,7 +315,7 @@ def _told_by_a_lag(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     ]
 
 
-def leaps_at_the_beginning(fitter: Fitter, fit: Fit) -> bool:
+def jumps_at_start(fitter: Fitter, fit: Fit) -> bool:
     """Whether there is one leap, and before the first of the times that are tried for it."""
     leaps = fit.values.get(LEAP, ())
     first = step_of_times(fitter.problem)

@@ -107,7 +107,7 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     return found
 
 
-def told_by_stamps(
+def jumps_in_stamps(
     fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]
 ) -> list[Hypothesis]:
     """Hypotheses of a fit of one recording that leaps where the stamps say so to a sample, once or twice, by what the
@@ -193,7 +193,7 @@ def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, f
     return None
 
 
-def is_shown_by_stamps(fitter: Fitter, fit: Fit) -> bool:
+def is_in_stamps(fitter: Fitter, fit: Fit) -> bool:
     """Whether the stamps of the DVL of one recording show one of the leaps of a fit, where they are next to it."""
     if len(fit.seen) > 1 or LEAP not in fit.values:
         return False

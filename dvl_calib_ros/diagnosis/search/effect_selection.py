@@ -40,18 +40,18 @@ from ..noise.noise_model import Noise, white_noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .arm_clock_ambiguity import ARM, TWO_CLOCKS, OpenArm, guessed_arm
 from .backward_elimination import (
-    happening_again,
+    eliminate,
     is_taken_back,
-    once_where_borne_out,
-    only_borne_out,
-    only_called_for,
+    once_where_confirmed,
+    only_confirmed,
+    repeated_effects,
     without_nothing,
 )
-from .candidates import coming_and_going, leaps_at_the_beginning, proposed, told_by_other_clocks, variants_about
-from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, leaping, told_by_stamps
-from .identifiability import Selected, tell_apart
+from .candidates import by_other_clocks, intermittent_effects, jumps_at_start, proposed, variants_about
+from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, jumps_in_stamps, leaping
+from .identifiability import Selected, identify_effects
 from .initial_guess import FirstGuess, first_guess, guess_beside
-from .observable_parameters import shown_parts, unshown_parts, without_faint
+from .observable_parameters import observable_parts, unobservable_parts, without_insignificant
 from .unexplained import unexplained
 
 # What a vehicle with a gap has most often; the first fit starts with all of these
@@ -99,8 +99,8 @@ def started(
     with what of each is shown."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
-    every, effects = effects, shown_parts({name: effect.once for name, effect in effects.items()}, problem)
-    problem = replace(problem, unshown=unshown_parts(every, effects))
+    every, effects = effects, observable_parts({name: effect.once for name, effect in effects.items()}, problem)
+    problem = replace(problem, unshown=unobservable_parts(every, effects))
     found: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
@@ -123,7 +123,7 @@ def select(
     effects = every = {name: effect.usual for name, effect in effects.items()}  # what is not shown is no noise either
     problem, start, guesses, effects = started(recordings, rotation_dvl_from_body, lever_arm, effects)
     fitter, fit = _first_fit(problem, start)
-    kept = without_contradicted(problem, fit.hypothesis)
+    kept = without_slow_outliers(problem, fit.hypothesis)
     if kept is not None:
         problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
         problem = replace(problem, unshown=fitter.problem.unshown)
@@ -140,29 +140,29 @@ def select(
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
         leapt = [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
         fits += [each for each in leapt if not is_taken_back(fitter, each, LEAP, fit.deviance - each.deviance)]
-        fits += happening_again(fitter, fits, every, effects)
+        fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
-        for hypothesis in coming_and_going(fitter, fit, effects):
+        for hypothesis in intermittent_effects(fitter, fit, effects):
             as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
             fits.append(fitter.fit(as_white.hypothesis, fit.noise))
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
         best = fitter.refined_as_white(fitter.refined(best_of(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
         best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))
-        best = only_called_for(fitter, best, len(effects))
+        best = eliminate(fitter, best, len(effects))
         fitter, fit = _leapt_where_stamps_say_so(*_about(fitter, best, every), every, effects)
         names = frozenset(effect.name for effect in fit.effects)
         if names in seen_before:
             break
         seen_before.add(names)
-    fit = only_borne_out(fitter, only_called_for(fitter, fit, len(effects)), len(effects))
-    fit = in_gaps(fitter, once_where_borne_out(fitter, fit, every, effects))
+    fit = only_confirmed(fitter, eliminate(fitter, fit, len(effects)), len(effects))
+    fit = in_gaps(fitter, once_where_confirmed(fitter, fit, every, effects))
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
     fit = without_nothing(fitter, fit, len(effects))
     fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
     guesses = _beside_moving_clocks(fitter, fit, guesses)
-    told = tell_apart(fitter, fit, guesses, effects, alike)
+    told = identify_effects(fitter, fit, guesses, effects, alike)
     base = fitter.fit_kept(told.fit.hypothesis.with_effects([], len(recordings), {}), told.fit.noise)
     return EffectSelection(told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved)
 
@@ -253,7 +253,7 @@ def _leapt_where_stamps_say_so(
 
     Under the noise about a fit without it, what a leap leaves is noise.
     """
-    fits = [fitter.fit(hypothesis, fit.noise) for hypothesis in told_by_stamps(fitter, fit, effects, every)]
+    fits = [fitter.fit(hypothesis, fit.noise) for hypothesis in jumps_in_stamps(fitter, fit, effects, every)]
     if not fits:
         return fitter, fit
     leapt = _about(fitter, best_of(fits, effects), every)
@@ -264,12 +264,10 @@ def _leapt_where_stamps_say_so(
 
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
     """A fit with two clocks, or the same told by one of the three: what else it holds was only tried with the two."""
-    if not set(TWO_CLOCKS) <= set(fit.values) and not leaps_at_the_beginning(fitter, fit):
+    if not set(TWO_CLOCKS) <= set(fit.values) and not jumps_at_start(fitter, fit):
         return fit
-    others = [
-        fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in told_by_other_clocks(fitter, fit, effects)
-    ]
-    if others and leaps_at_the_beginning(fitter, fit):  # a clock that is late throughout has no time to choose
+    others = [fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in by_other_clocks(fitter, fit, effects)]
+    if others and jumps_at_start(fitter, fit):  # a clock that is late throughout has no time to choose
         throughout = best_of(others, effects)
         if throughout.deviance < fit.deviance + price_of_a_time(effects[LEAP], len(effects)):
             return throughout
@@ -283,7 +281,7 @@ def _with_what_is_shown_of_the_arm(
 
     every: effects with all that they have; effects: with what columns alone show.
     """
-    arm = without_faint(fitter.problem, fit)
+    arm = without_insignificant(fitter.problem, fit)
     if arm is not None:
         effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
         values = tuple(dict(each) for each in fit.values[ARM])  # what is not said of it is held where it is
@@ -307,7 +305,10 @@ def _with_all_of_the_arm(
     others = [effect for effect in fit.effects if effect.name != ARM]
     hypothesis = fit.hypothesis.with_effects([*others, every[ARM]], len(fit.seen), {ARM: values})
     whole = fitter.fit(hypothesis, fit.noise)
-    if criterion(whole, len(every)) >= criterion(fit, len(every)) or without_faint(fitter.problem, whole) is not None:
+    if (
+        criterion(whole, len(every)) >= criterion(fit, len(every))
+        or without_insignificant(fitter.problem, whole) is not None
+    ):
         return None
     about = _about(fitter, whole, every)
     return None if unexplained(*about).found else about
@@ -394,7 +395,7 @@ FEWEST = 30
 _PASSES = 3
 
 
-def without_contradicted(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
+def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
     """The recordings without samples of slow streams that neighbours and the other stream contradict; None if none is.
 
     Parameters

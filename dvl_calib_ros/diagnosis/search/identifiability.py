@@ -46,7 +46,7 @@ class Selected:
 
 
 @dataclass(frozen=True)
-class ToldApart:
+class Identifiability:
     """What is said of the effects of a fit: they, strongest first, and the fit with the clocks that are as likely.
 
     opened, moved: as `EffectSelection` has them.
@@ -58,9 +58,9 @@ class ToldApart:
     moved: Mapping[str, float]
 
 
-def tell_apart(
+def identify_effects(
     fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], alike: Mapping[str, str]
-) -> ToldApart:
+) -> Identifiability:
     """What is said of each effect of a fit. alike: by name of an effect, another that the fit has it as likely for."""
     called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
@@ -85,7 +85,7 @@ def tell_apart(
     fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
-    return ToldApart(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
+    return Identifiability(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
 
 
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:

@@ -23,7 +23,7 @@ SHOWN_FROM, USUAL_MPS = 0.2, 0.02
 ARM_FROM_M, FAINT = 0.6, 2.0
 
 
-def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
+def observable_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
     """Effects without the parameters that references which do not measure the vertical do not show."""
     if problem.measured[2]:
         return dict(effects)
@@ -31,7 +31,7 @@ def shown_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Ef
     return {name: _shown_part(each, problem, seen) for name, each in effects.items()}
 
 
-def unshown_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect]) -> tuple[Effect, ...]:
+def unobservable_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect]) -> tuple[Effect, ...]:
     """What is not shown of effects: who has what is shown of one has the other parts as well."""
     left_out = (effect.without({spec.name for spec in shown[name].parameters}) for name, effect in effects.items())
     return tuple(effect for effect in left_out if effect.parameters)
@@ -51,7 +51,7 @@ def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effec
     return effect.without(out)
 
 
-def without_faint(problem: Problem, fit: Fit) -> Effect | None:
+def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
     """The lever arm without what of it is no larger than what a model lacks makes (2 σ); None where all of it is."""
     known = _known_to(problem, fit)
     faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < FAINT * std}
@@ -59,7 +59,7 @@ def without_faint(problem: Problem, fit: Fit) -> Effect | None:
     return arm and arm.without(faint)
 
 
-def with_shown(problem: Problem, fit: Fit, covariance: Array) -> Array:
+def with_observable(problem: Problem, fit: Fit, covariance: Array) -> Array:
     """A covariance (6 + p, 6 + p) of a fit, its lever arm known no better than by what a model lacks."""
     found, known = covariance.copy(), _known_to(problem, fit)
     for number, each in enumerate(fit.hypothesis.parameters(), start=6):

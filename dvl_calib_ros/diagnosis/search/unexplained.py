@@ -19,8 +19,8 @@ from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
 from ..fit.cross_validation import stretch_of
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.parametric_bootstrap import made_up
-from ..fit.selection_criteria import FittedBeside
+from ..fit.parametric_bootstrap import simulated_recordings
+from ..fit.selection_criteria import NuisanceFit
 from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
@@ -100,7 +100,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
             return Unexplained(0.0, 0.0, "", nothing, nothing)
     recoloured: list[FollowTest] = []
     if noise.is_coloured:  # what changes with time alone may as well be noise
-        beside = FittedBeside.of_fit(problem, fit)
+        beside = NuisanceFit.of_fit(problem, fit)
         alone = _coloured_anew(noise, beside, nothing, fit.residual)
         for name, columns in raw.items():
             if name != "time":
@@ -188,7 +188,7 @@ def _looked(
     """
     noise = fit.noise
     own = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
-    known = FittedBeside.of(problem, fit.hypothesis, seen, own)
+    known = NuisanceFit.of(problem, fit.hypothesis, seen, own)
     q, white = _beside_prior(known, noise.whiten(known.columns), noise.whiten(residual))
     white = white - q @ (q.T @ white)
     unshown = known.columns.shape[2] - own.shape[2]
@@ -204,7 +204,7 @@ def _looked(
     return looks, white, raw, q
 
 
-def _beside_prior(known: FittedBeside, columns: Array, white: Array) -> tuple[Array, Array]:
+def _beside_prior(known: NuisanceFit, columns: Array, white: Array) -> tuple[Array, Array]:
     """Orthonormal basis of the columns (M A, k) of what is known, whitened, and a whitened series (M A,), each with the
     rows of the prior below: k more.
 
@@ -225,7 +225,7 @@ def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
 def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]:
     """By what factor each look's energy is larger than chi-square in made-up recordings, at least 1."""
     energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
-    for other, seen, residual in made_up(fitter.problem, fit, MADE_UP):
+    for other, seen, residual in simulated_recordings(fitter.problem, fit, MADE_UP):
         found, *_ = _looked(fitter, fit, other, seen, residual)
         energy += [look.energy for look in found]
         dof += [look.dof for look in found]
@@ -272,7 +272,7 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
 
 def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     """Deviance that what the rest follows most clearly explains where it was not fitted to (`told_elsewhere`)."""
-    noise, known = fit.noise, FittedBeside.of_fit(problem, fit)
+    noise, known = fit.noise, NuisanceFit.of_fit(problem, fit)
     if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
         noise = _coloured_anew(noise, known, rest.clearest, fit.residual).noise
     return told_elsewhere(problem, noise, known, rest.clearest, fit.residual)
@@ -287,7 +287,7 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     """(6 + p,) by how much the parameters of a fit move with what the rest follows most clearly fitted beside them."""
-    noise, raw, known = fit.noise, rest.clearest, FittedBeside.of_fit(problem, fit)
+    noise, raw, known = fit.noise, rest.clearest, NuisanceFit.of_fit(problem, fit)
     if noise.is_coloured:
         noise = _coloured_anew(noise, known, raw, fit.residual).noise
     both = known.and_rest(raw, fit.residual)
@@ -295,7 +295,7 @@ def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     return stands.step(noise, fit.residual).solution()[: fit.columns.shape[2]]
 
 
-def told_elsewhere(problem: Problem, noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> float:
+def told_elsewhere(problem: Problem, noise: Noise, known: NuisanceFit, raw: Array, residual: Array) -> float:
     """Whitened squares of a residual (M, A) that columns raw (M, A, c), beside known ones, explain on stretches of time
     that they were not fitted to.
 
@@ -328,7 +328,7 @@ def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: st
     return bool(((left**2).sum(axis=0) < OF_GROUP * (asked**2).sum(axis=0)).all())
 
 
-def surprise_elsewhere(problem: Problem, noise: Noise, fitted: FittedBeside, residual: Array) -> float:
+def surprise_elsewhere(problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array) -> float:
     """How unlikely a residual (M, A) is, as deviance, on stretches of time that columns were not fitted to: of the same
     data it is the lower, the better it is predicted.
 
@@ -342,7 +342,7 @@ def surprise_elsewhere(problem: Problem, noise: Noise, fitted: FittedBeside, res
 
 
 def _held_out(
-    problem: Problem, noise: Noise, fitted: FittedBeside, residual: Array
+    problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array
 ) -> Iterator[tuple[WhitenedLeastSquares, WhitenedLeastSquares]]:
     """Of each fold, the least squares of the stretches held out, and of those that are fitted to."""
     white, series = noise.whiten(fitted.columns), noise.whiten(residual)
@@ -359,9 +359,9 @@ def _chance(fitter: Fitter, fit: Fit, name: str) -> float:
     that is estimated anew bends to them; at least 1.
     """
     lowered, dof, sound = PRIOR_DOF, PRIOR_DOF, ~_upset(fitter, fit.noise)[:, None]
-    for other, seen, residual in made_up(fitter.problem, fit, MADE_UP // 2):
+    for other, seen, residual in simulated_recordings(fitter.problem, fit, MADE_UP // 2):
         columns = replace(fitter, problem=other).columns(fit.hypothesis, seen)
-        known = FittedBeside.of(other, fit.hypothesis, seen, columns)
+        known = NuisanceFit.of(other, fit.hypothesis, seen, columns)
         raw = _along_axes(dictionary(other, seen)[name] * sound, other.axes)
         alone = _coloured_anew(fit.noise, known, raw[:, :, :0], residual)
         drop, rank = alone.lowered_by(_coloured_anew(fit.noise, known, raw, residual))
@@ -383,7 +383,7 @@ class _Coloured(NamedTuple):
         return max(self.deviance - beside.deviance, 0.0), max(beside.rank - self.rank, 1)
 
 
-def _coloured_anew(noise: Noise, known: FittedBeside, raw: Array, residual: Array) -> _Coloured:
+def _coloured_anew(noise: Noise, known: NuisanceFit, raw: Array, residual: Array) -> _Coloured:
     """A residual (M, A) under columns (M, A, c) beside known ones, and noise like the given one."""
     joined = np.concatenate([known.columns, raw], axis=2)
     size = np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)

@@ -10,7 +10,7 @@ from runs import ONE_HERTZ, START_NS, MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.assessment.manoeuvre_planner import predicted_drift
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.checks.data_warnings import one_heading_advice, reference_advice
+from dvl_calib_ros.calibration.checks.data_warnings import one_heading_warnings, reference_warnings
 from dvl_calib_ros.calibration.filters.day_to_day_covariance import day_covariance
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -115,12 +115,12 @@ def test_a_constant_error_of_the_reference_is_found_over_several_headings():
 
 
 def test_a_reference_that_is_off_is_said_with_size_and_course_and_one_that_is_not_is_not():
-    (found,) = reference_advice(on_course((0.03, 0.0), True).estimate("G1"))
+    (found,) = reference_warnings(on_course((0.03, 0.0), True).estimate("G1"))
     assert found.code == "REFERENCE_OFFSET" and not found.numbers["where"]
     assert 27.0 < found.numbers["millimetres"] < 33.0 and 86.0 < found.numbers["course"] < 94.0
-    assert not reference_advice(on_course((0.0, 0.0), True).estimate("G1"))
-    assert not reference_advice(on_course((0.03, 0.0), False).estimate("G1"))
-    assert not reference_advice(on_course((0.03, 0.0), True).estimate("M3"))
+    assert not reference_warnings(on_course((0.0, 0.0), True).estimate("G1"))
+    assert not reference_warnings(on_course((0.03, 0.0), False).estimate("G1"))
+    assert not reference_warnings(on_course((0.03, 0.0), True).estimate("M3"))
 
 
 def test_on_one_heading_yaw_and_scale_are_no_better_known_than_the_reference_may_be_wrong():
@@ -163,10 +163,10 @@ def test_at_one_speed_a_bias_of_the_dvl_is_in_sigma_of_the_angles_where_it_is_ex
 
 
 def test_on_one_heading_it_is_said_what_a_constant_error_would_be():
-    (said,) = one_heading_advice(on_course((0.0, 0.0), headings=False).estimate("G1"), CLAIMED, 1.5)
+    (said,) = one_heading_warnings(on_course((0.0, 0.0), headings=False).estimate("G1"), CLAIMED, 1.5)
     assert said.code == "ONE_HEADING" and "0.02 m/s would be 0.8° or 1.3 %" in said.says
     for name, headings in (("G1", True), ("M3", False)):
-        assert one_heading_advice(on_course((0.0, 0.0), headings).estimate(name), CLAIMED, 1.5) == []
+        assert one_heading_warnings(on_course((0.0, 0.0), headings).estimate(name), CLAIMED, 1.5) == []
 
 
 def test_of_a_reference_in_the_body_frame_no_error_fixed_to_the_earth_is_assumed():

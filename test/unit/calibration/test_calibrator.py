@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from runs import ONE_HERTZ, SECOND, START_NS, STRETCH, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.checks.data_warnings import data_advice
+from dvl_calib_ros.calibration.checks.data_warnings import recording_warnings
 from dvl_calib_ros.calibration.filters import filter_bank
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
 from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
@@ -781,7 +781,9 @@ def test_a_model_whose_numbers_run_away_goes_on_from_its_last_good_state_and_is_
     counts = calibrator.counts["calibration"]
     assert counts["M1 restarted"] > 0
     restarted = {"model": "M1", "count": counts["M1 restarted"]}
-    assert [each.numbers for each in data_advice(calibrator.counts) if each.code == "MODEL_RESTARTED"] == [restarted]
+    assert [each.numbers for each in recording_warnings(calibrator.counts) if each.code == "MODEL_RESTARTED"] == [
+        restarted
+    ]
     np.testing.assert_array_equal(calibrator.state("M1").x, before.x)
     feed(calibrator, samples[1000:])
     assert calibrator.estimate("M1").used > used

@@ -9,7 +9,7 @@ import pytest
 from conftest import few
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.checks.heading_deviation import FIRST, heading_advice, heading_deviation, how_bad
+from dvl_calib_ros.calibration.checks.heading_deviation import FIRST, heading_deviation, heading_warnings, severity_of
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
@@ -61,7 +61,7 @@ def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
     assert found.rms == pytest.approx(size / math.sqrt(2.0), rel=0.25) and not found.by_time
     if cycles == 1:  # most at the heading next to yaw 90 degrees, which is north
         assert min(found.most_at, 2.0 * math.pi - found.most_at) < 0.25
-    said = heading_advice(found)
+    said = heading_warnings(found)
     assert said.code == "HEADING_DEVIATION" and "with the heading" in said.says and "compass first" not in said.remedy
 
 
@@ -89,9 +89,9 @@ def test_on_one_heading_sigma_of_yaw_holds_what_the_heading_may_be_off_by():
 
 def test_a_gyro_that_drifts_is_named_by_time_and_beyond_three_degrees_the_compass_comes_first():
     found = deviation(2, lambda yaw, _: math.radians(6.0) * math.sin(yaw))
-    assert found.rms > FIRST and "calibrate the compass first" in heading_advice(found).remedy
+    assert found.rms > FIRST and "calibrate the compass first" in heading_warnings(found).remedy
     drifts = deviation(2, lambda _, time: math.radians(5.0) * time / (16 * LEG_S))
-    assert drifts.by_time and "with time" in heading_advice(drifts).says
+    assert drifts.by_time and "with time" in heading_warnings(drifts).says
 
 
 @pytest.mark.parametrize("degrees, is_first", [(2.0, False), (6.0, True)])
@@ -101,10 +101,10 @@ def test_a_compass_whose_worst_headings_are_gated_comes_first_whatever_is_left(d
     calibrator, time, yaw = recorded(3, lambda yaw, _: size * math.sin(yaw + 1.2), every=math.pi)
     found, estimate = heading_deviation(time, yaw, calibrator.heading_deviation), calibrator.estimate("G1")
     assert found is not None and not found.by_time
-    severity = how_bad(found._replace(rms=math.radians(2.0)), estimate)
+    severity = severity_of(found._replace(rms=math.radians(2.0)), estimate)
     assert severity is (Severity.REJECT if is_first else Severity.WARNING)
     # where the reference is so good that 0.7 degrees are gated, σ of yaw holds them
-    severity = how_bad(found._replace(rms=math.radians(0.7)), estimate)
+    severity = severity_of(found._replace(rms=math.radians(0.7)), estimate)
     assert severity is (Severity.MARGINAL if is_first else Severity.WARNING)
 
 
@@ -113,7 +113,7 @@ def test_a_heading_that_drifts_is_not_accepted(degrees):
     """σ of yaw holds it, and nobody knows when it was right: 2.4 of it was accepted."""
     calibrator, time, yaw = recorded(2, lambda _, time: math.radians(degrees) * time / (16 * LEG_S))
     found, estimate = heading_deviation(time, yaw, calibrator.heading_deviation), calibrator.estimate("G1")
-    assert found.by_time and how_bad(found, estimate) is Severity.MARGINAL
+    assert found.by_time and severity_of(found, estimate) is Severity.MARGINAL
 
 
 def test_sigma_of_yaw_holds_a_drift_from_the_beginning_on():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.checks.residual_tests import left_over, left_over_advice, std_along
+from dvl_calib_ros.calibration.checks.residual_tests import residual_trend, residual_warnings, std_along
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
@@ -50,7 +50,7 @@ class Vehicle:
         moving = body - error
         lean = np.cross(moving, np.eye(3)[:, None]).transpose(1, 2, 0)
         x = np.linalg.lstsq(lean.reshape(-1, 3), error.reshape(-1), rcond=None)[0]
-        return left_over(self.time, turns, body, error - lean @ x, self.rates, interval_s)
+        return residual_trend(self.time, turns, body, error - lean @ x, self.rates, interval_s)
 
 
 def smoothed(values, seconds):
@@ -64,7 +64,7 @@ def smoothed(values, seconds):
 @pytest.mark.parametrize("wave_deg", [0.0, 0.2, 1.5, 5.0])
 @pytest.mark.parametrize("speeds", [(0.8, 1.2, 1.6), (1.2, 1.2, 1.2)])
 def test_where_all_is_right_only_what_does_not_show_is_said(rng, wave_deg, speeds):
-    found = left_over_advice(Vehicle(rng, wave_deg=wave_deg, speeds=speeds).found())
+    found = residual_warnings(Vehicle(rng, wave_deg=wave_deg, speeds=speeds).found())
     tilt, bias = ["TILT_NOT_SHOWN"] * (wave_deg < 1.0), ["ONE_SPEED"] * (len(set(speeds)) == 1)
     assert [each.code for each in found] == tilt + bias
     assert all(each.severity is Severity.WARNING for each in found)
@@ -75,9 +75,9 @@ def test_on_a_calm_vehicle_it_is_said_that_its_trim_may_be_in_the_mounting(rng):
     vehicle = Vehicle(rng, trim_deg=3.0, wave_deg=0.1)
     levelled = np.einsum("nji,nj->ni", vehicle.level, vehicle.earth)
     for dvl in (levelled, None):
-        (said,) = left_over_advice(vehicle.found(dvl=dvl))
+        (said,) = residual_warnings(vehicle.found(dvl=dvl))
         assert said.severity is Severity.WARNING and said.code == "TILT_NOT_SHOWN" and "3.0° of pitch" in said.says
-    assert left_over_advice(Vehicle(rng, trim_deg=0.2, wave_deg=0.1).found()) == []
+    assert residual_warnings(Vehicle(rng, trim_deg=0.2, wave_deg=0.1).found()) == []
 
 
 @pytest.mark.parametrize(("trim_deg", "word"), [(0.0, Severity.MARGINAL), (3.0, Severity.REJECT)])
@@ -86,7 +86,7 @@ def test_a_velocity_that_its_driver_has_levelled_does_not_turn_with_the_pitch(rn
     levelled = np.einsum("nji,nj->ni", vehicle.level, vehicle.earth)
     found = vehicle.found(dvl=levelled)
     assert found.tilt[1] == pytest.approx(1.0, abs=0.2)
-    (said,) = left_over_advice(found)
+    (said,) = residual_warnings(found)
     assert said.severity is word and said.code == "TILT_NOT_FOLLOWED" and said.numbers["axis"] == "pitch"
 
 
@@ -94,7 +94,7 @@ def test_a_pitch_of_the_other_sign_is_no_answer_whatever_the_trim(rng):
     vehicle = Vehicle(rng, trim_deg=0.0)
     yaw = np.arctan2(vehicle.turns[:, 1, 0], vehicle.turns[:, 0, 0])
     turned = [rotation_from_rpy(each) for each in zip(vehicle.roll, -vehicle.pitch, yaw, strict=True)]
-    (said,) = left_over_advice(vehicle.found(turns=np.array(turned)))
+    (said,) = residual_warnings(vehicle.found(turns=np.array(turned)))
     assert said.severity is Severity.REJECT and said.code == "TILT_NOT_FOLLOWED"
 
 
@@ -102,7 +102,7 @@ def test_a_bias_shows_at_several_speeds(rng):
     vehicle = Vehicle(rng)
     found = vehicle.found(dvl=vehicle.body + np.array([0.02, -0.025, 0.0]))
     assert found.bias[:2] == pytest.approx([0.02, -0.025], abs=0.01)
-    (said,) = left_over_advice(found)
+    (said,) = residual_warnings(found)
     assert said.severity is Severity.REJECT and said.code == "DVL_BIAS"
 
 
@@ -122,7 +122,7 @@ def test_a_bias_that_is_not_beyond_doubt_is_marginal(rng):
     found = Vehicle(rng).found()
     for bias, words in ((0.027, [Severity.MARGINAL]), (0.02, []), (0.03, [Severity.REJECT])):
         biased = found._replace(bias=np.array([0.0, bias, 0.0]), bias_std=np.full(3, 0.0067))
-        assert [each.severity for each in left_over_advice(biased) if each.code == "DVL_BIAS"] == words
+        assert [each.severity for each in residual_warnings(biased) if each.code == "DVL_BIAS"] == words
 
 
 def test_few_turns_show_a_bias_or_a_filter_no_more_surely_than_few_can():
@@ -137,7 +137,7 @@ def test_a_bias_as_large_as_the_answers_own_sigma_expects_is_no_reject(rng):
     """18 ± 3 mm/s ahead at 0.8 m/s, beside a scale of 1.7 ± 1.0 % that had been told of a bias, were a reject."""
     found = Vehicle(rng).found()._replace(bias=np.array([0.018, 0.0, 0.0]), bias_std=np.full(3, 0.003), speed=0.8)
     for along, word in ((0.0104, Severity.MARGINAL), (0.009, Severity.REJECT)):
-        (said,) = [each for each in left_over_advice(found, along=[along] * 3) if each.code == "DVL_BIAS"]
+        (said,) = [each for each in residual_warnings(found, along=[along] * 3) if each.code == "DVL_BIAS"]
         assert said.severity is word
 
 
@@ -148,9 +148,9 @@ def test_a_bias_that_sigma_of_its_own_axis_holds_is_said_and_no_reject(rng, axis
     bias[axis] = 0.028
     found = Vehicle(rng).found()._replace(bias=bias, bias_std=np.full(3, 0.002), speed=1.6)
     along = [0.002, 0.0146, 0.002]
-    (said,) = [each for each in left_over_advice(found, along=along) if each.code == "DVL_BIAS"]
+    (said,) = [each for each in residual_warnings(found, along=along) if each.code == "DVL_BIAS"]
     assert said.severity is word
-    (said,) = [each for each in left_over_advice(found) if each.code == "DVL_BIAS"]
+    (said,) = [each for each in residual_warnings(found) if each.code == "DVL_BIAS"]
     assert said.severity is Severity.REJECT
 
 
@@ -170,9 +170,9 @@ def test_a_reference_that_is_smoothed_is_named_with_how_long(rng):
     slow = smoothed(vehicle.earth, 1.5)
     in_time = np.column_stack([np.interp(vehicle.time + 1.5, vehicle.time, column) for column in slow.T])
     found = vehicle.found(reference=in_time)
-    (said,) = left_over_advice(found)
+    (said,) = residual_warnings(found)
     assert said.severity is Severity.REJECT and said.code == "VELOCITY_SMOOTHED" and said.numbers["name"] == "reference"
-    (said,) = left_over_advice(found, of_positions=True)
+    (said,) = residual_warnings(found, of_positions=True)
     assert said.severity is Severity.MARGINAL and said.code == "VELOCITY_SMOOTHED"
 
 
@@ -180,7 +180,7 @@ def test_an_attitude_without_tilt_and_a_short_run_say_nothing(rng):
     vehicle = Vehicle(rng, speeds=(1.0, 1.0, 1.0))
     found = vehicle.found(turns=vehicle.level)
     assert np.isinf(found.tilt_std).all() and math.isinf(found.smoothed_std)
-    assert Vehicle(rng, seconds=60.0).found() is None and left_over_advice(None) == []
+    assert Vehicle(rng, seconds=60.0).found() is None and residual_warnings(None) == []
 
 
 def past_noise(noise, seconds):
@@ -195,7 +195,7 @@ def test_a_reference_that_follows_the_noise_of_the_dvl_is_made_from_it(rng, seco
     vehicle.noise = 0.3 * vehicle.noise[0], vehicle.noise[1]
     found = vehicle.found(reference=vehicle.earth + np.einsum("nij,nj->ni", vehicle.turns, kept))
     assert found.circular > 0.0
-    (said,) = left_over_advice(found)
+    (said,) = residual_warnings(found)
     assert said.severity is Severity.REJECT and said.code == "CIRCULAR_REFERENCE"
 
 
@@ -211,7 +211,7 @@ def made_by_a_filter(vehicle):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_filter_of_the_dvl_is_named_where_its_lag_was_taken_for_a_late_clock(seed):
     found = made_by_a_filter(Vehicle(np.random.default_rng(seed)))
-    (said,) = left_over_advice(found)
+    (said,) = residual_warnings(found)
     assert said.severity is Severity.REJECT and said.code == "CIRCULAR_REFERENCE"
 
 
@@ -220,10 +220,10 @@ def test_a_filter_that_finds_nothing_of_the_dvl_may_be_its_own(rng):
     vehicle = Vehicle(rng)
     vehicle.noise = 2.0 * vehicle.noise[0], vehicle.noise[1]
     found = made_by_a_filter(vehicle)._replace(circular=0.05, circular_std=0.05)
-    assert [each.code for each in left_over_advice(found)] != ["FILTER_FINDS_NOTHING"]
-    assert [each.code for each in left_over_advice(found, lag_s=2.5, is_nil=True)] != ["FILTER_FINDS_NOTHING"]
-    assert [each.code for each in left_over_advice(found, lag_s=0.45)] != ["FILTER_FINDS_NOTHING"]
-    (said,) = left_over_advice(found, lag_s=0.45, is_nil=True)
+    assert [each.code for each in residual_warnings(found)] != ["FILTER_FINDS_NOTHING"]
+    assert [each.code for each in residual_warnings(found, lag_s=2.5, is_nil=True)] != ["FILTER_FINDS_NOTHING"]
+    assert [each.code for each in residual_warnings(found, lag_s=0.45)] != ["FILTER_FINDS_NOTHING"]
+    (said,) = residual_warnings(found, lag_s=0.45, is_nil=True)
     assert said.severity is Severity.REJECT and said.code == "FILTER_FINDS_NOTHING"
 
 
@@ -231,7 +231,7 @@ def test_a_filter_that_finds_nothing_of_the_dvl_may_be_its_own(rng):
 def test_that_it_lags_by_what_it_smooths_over_shows_a_filter_as_well(rng, lag_s, codes):
     """Legs with a filter of 0.5 s and 5 cm/s of noise: followed by 4.4 σ, smoothed by 2.2, and accepted."""
     found = Vehicle(rng).found()._replace(circular=0.13, circular_std=0.03, smoothed=0.13, smoothed_std=0.06)
-    assert [each.code for each in left_over_advice(found, lag_s=lag_s)] == codes
+    assert [each.code for each in residual_warnings(found, lag_s=lag_s)] == codes
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -272,7 +272,7 @@ def test_waves_between_samples_of_a_slow_reference_do_not_make_it_a_smoothed_one
     assert vehicle.found(reference=between).smoothed == pytest.approx(interval_s**2 / 12.0, abs=0.03)
     found = vehicle.found(reference=between, interval_s=interval_s)
     assert found.smoothed == pytest.approx(0.0, abs=0.03)
-    assert "VELOCITY_SMOOTHED" not in {each.code for each in left_over_advice(found)}
+    assert "VELOCITY_SMOOTHED" not in {each.code for each in residual_warnings(found)}
 
 
 def test_waves_between_samples_of_a_slow_reference_are_no_tilt_that_is_not_followed():
@@ -282,6 +282,6 @@ def test_waves_between_samples_of_a_slow_reference_are_no_tilt_that_is_not_follo
     vehicle.earth += 0.3 * np.outer(np.sin(vehicle.time * 0.9 + 1.0), [0.0, 0.0, 1.0])
     vehicle.body = np.einsum("nji,nj->ni", vehicle.turns, vehicle.earth)
     between = np.column_stack([np.interp(vehicle.time, vehicle.time[::5], each) for each in vehicle.earth[::5].T])
-    (said,) = left_over_advice(vehicle.found(reference=between))
+    (said,) = residual_warnings(vehicle.found(reference=between))
     assert said.code == "TILT_NOT_FOLLOWED"
-    assert left_over_advice(vehicle.found(reference=between, interval_s=1.0)) == []
+    assert residual_warnings(vehicle.found(reference=between, interval_s=1.0)) == []

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from dvl_calib_ros.calibration.filters.filter_bank import groups_of
 from dvl_calib_ros.calibration.filters.filter_setup import Assembler
-from dvl_calib_ros.calibration.filters.vertical_motion import HeaveRows, HeightOfLate, with_heave
+from dvl_calib_ros.calibration.filters.vertical_motion import HeaveRows, RelativeHeight, with_heave
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
 from dvl_calib_ros.calibration.models.base import Observations
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -237,7 +237,7 @@ def test_a_model_beside_others_in_its_group_is_the_model_alone(name, rng):
     group = next(each for each in groups_of(LINEAR_MODELS, parameters) if name in each.index)
     stamps_ns = 200_000_000 * np.arange(60)
     group.update(stamps_ns, seen, np.ones(60), np.ones(60, dtype=bool))
-    z, h = model.linearise(replace(seen, height=HeightOfLate().add(stamps_ns, seen.rising)))
+    z, h = model.linearise(replace(seen, height=RelativeHeight().add(stamps_ns, seen.rising)))
     m = model.n_measurement
     r = (seen.noise if model.noise is None else model.noise(seen))[:, :m, :m]
     weight = seen.motion_weight if model.motion_is_noise else np.ones(60)

@@ -19,7 +19,7 @@ from dvl_calib_ros.calibration.numerics.tests import holm
 from dvl_calib_ros.diagnosis.answer import confidence_intervals, held_out_validation
 from dvl_calib_ros.diagnosis.answer.compensation import compensated
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
-from dvl_calib_ros.diagnosis.answer.held_out_validation import borne_out
+from dvl_calib_ros.diagnosis.answer.held_out_validation import confirmed
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fit import gauss_newton
@@ -37,20 +37,20 @@ from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
     _is_late_before_a_leap,
     _only_smooths,
-    happening_again,
+    eliminate,
     is_taken_back,
-    once_where_borne_out,
-    only_called_for,
+    once_where_confirmed,
+    repeated_effects,
 )
-from dvl_calib_ros.diagnosis.search.candidates import coming_and_going, told_by_other_clocks
+from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks, intermittent_effects
 from dvl_calib_ros.diagnosis.search.clock_jumps import (
     DELAYS,
     PARTS,
     Delays,
     gaps,
     in_gaps,
+    jumps_in_stamps,
     time_by_stamps,
-    told_by_stamps,
 )
 from dvl_calib_ros.diagnosis.search.clock_jumps import _found as _delays
 from dvl_calib_ros.diagnosis.search.effect_selection import (
@@ -62,7 +62,11 @@ from dvl_calib_ros.diagnosis.search.effect_selection import (
 )
 from dvl_calib_ros.diagnosis.search.identifiability import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.search.initial_guess import first_guess, guess_beside
-from dvl_calib_ros.diagnosis.search.observable_parameters import shown_parts, with_shown, without_faint
+from dvl_calib_ros.diagnosis.search.observable_parameters import (
+    observable_parts,
+    with_observable,
+    without_insignificant,
+)
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.base import ActsOn
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -176,7 +180,7 @@ def test_what_comes_and_goes_does_so_at_another_time_by_another_clock():
     fitter = Mock(spec=Fitter, problem=Mock(spec=Problem, recordings=[Mock(seconds=0.0)]))
     found = [
         (each.values["water_lock"][0], each.values["time_offset_jump"][0], {*each.values} & {*CLOCKS})
-        for each in told_by_other_clocks(fitter, fit, effects)
+        for each in by_other_clocks(fitter, fit, effects)
     ]
     assert [its for *_, its in found[:2]] == [{"attitude_time_offset"}, {"dvl_time_offset"}]
     assert [its["from_s"] for its, *_ in found] == pytest.approx([110.9, 110.8, 110.9, 110.0])
@@ -187,11 +191,11 @@ def test_a_current_that_was_taken_for_noise_is_proposed_when_it_came_and_went():
     """With a memory of 15 s, it was for as long as it takes in least: all after it began. 0.4 m/s were unknown."""
     given = scenario(effects=["water_lock:east_mps=0.2,north_mps=-0.34,from_s=120,to_s=241"], gnss_std=0.02)
     fitter, fit, _ = fitted(given, {})
-    assert not coming_and_going(fitter, fit, EFFECTS)
+    assert not intermittent_effects(fitter, fit, EFFECTS)
     fitter, fit = _about(fitter, fit, {})
     assert max(arma.ratio for arma in fit.noise.axes) > 2.0
     effects = {name: EFFECTS[name].once for name in ("water_lock", "heading_error", "velocity_bias", "scale_drift")}
-    (best, *_) = coming_and_going(fitter, fit, effects)
+    (best, *_) = intermittent_effects(fitter, fit, effects)
     assert best.values["water_lock"][0]["to_s"] == pytest.approx(240.0, abs=1.0)
     assert best.values["water_lock"][0]["east_mps"] == pytest.approx(0.2, abs=0.05)
 
@@ -376,7 +380,7 @@ def test_what_is_not_shown_of_an_effect_is_its_where_it_is_named():
     problem, start, _, testable = started([recording], np.eye(3), np.zeros(3), every)
     tilt = every["tilt_coupling"]
     roll = tilt.without({spec.name for spec in tilt.parameters} - {"y_per_roll"})
-    problem = replace(problem, unshown=observable_parameters.unshown_parts({tilt.name: tilt}, {tilt.name: roll}))
+    problem = replace(problem, unshown=observable_parameters.unobservable_parts({tilt.name: tilt}, {tilt.name: roll}))
     seen = problem.all_seen(start)
     turns = problem.unshown_columns(start, seen)[0].shape[2]
     named = start.with_effects([*start.effects, roll], 1, {roll.name: ({"y_per_roll": -0.9},)})
@@ -452,7 +456,7 @@ def test_a_leap_of_which_the_stamps_tell_is_not_taken_for_noise(leap, of_leap):
     given = scenario(effects=["dvl_time_offset:seconds=0.5", "time_offset_jump:" + of_leap], gnss_std=0.02)
     late = {"dvl_time_offset": ({"seconds": 0.5},)}
     fitter, fit = about(given, as_sent(simulate(given)), Offsets(0.5, 0.0), [once["dvl_time_offset"]], late)
-    (hypothesis, *_) = told_by_stamps(fitter, fit, once, EFFECTS)
+    (hypothesis, *_) = jumps_in_stamps(fitter, fit, once, EFFECTS)
     assert hypothesis.values["time_offset_jump"][0] == {
         "seconds": pytest.approx(leap, abs=0.4),
         "at_s": pytest.approx(201.3 - 0.5, abs=0.5),
@@ -460,7 +464,7 @@ def test_a_leap_of_which_the_stamps_tell_is_not_taken_for_noise(leap, of_leap):
     _, found = _leapt_where_stamps_say_so(fitter, fit, EFFECTS, once)
     assert found.values["time_offset_jump"][0]["seconds"] == pytest.approx(leap, abs=0.1)
     assert found.noise.deviance(found.residual) < fit.noise.deviance(fit.residual) - 50.0
-    assert told_by_stamps(fitter, found, once, EFFECTS) == []
+    assert jumps_in_stamps(fitter, found, once, EFFECTS) == []
 
 
 def test_a_driver_that_begins_anew_has_not_leapt_though_its_stamps_show_it():
@@ -527,7 +531,7 @@ def test_a_clock_that_is_nearly_set_right_again_has_leapt_twice_where_nothing_el
     monkeypatch.setattr(
         backward_elimination, "unexplained", lambda *_: SimpleNamespace(clear_energy=instead, price=40.0)
     )
-    monkeypatch.setattr(backward_elimination, "is_shown_by_stamps", lambda *_: False)
+    monkeypatch.setattr(backward_elimination, "is_in_stamps", lambda *_: False)
     assert is_taken_back(SimpleNamespace(problem=problem), fit, leap.name, drop, Mock(spec=Fit)) is is_wanted
 
 
@@ -596,7 +600,7 @@ def test_of_two_leaps_that_a_late_clock_before_them_makes_one_taken_back_the_clo
     )
     taken_back = {name: per if name != "time_offset_jump" else (leaps,) for name, per in fit.values.items()}
     fit = replace(fit, hypothesis=replace(fit.hypothesis, values=taken_back), deviance=fit.deviance - 60.0)
-    assert [each.name for each in only_called_for(fitter, fit, len(EFFECTS)).effects] == ["time_offset_jump"]
+    assert [each.name for each in eliminate(fitter, fit, len(EFFECTS)).effects] == ["time_offset_jump"]
 
 
 def test_a_second_leap_that_is_not_there_is_taken_back():
@@ -605,7 +609,7 @@ def test_a_second_leap_that_is_not_there_is_taken_back():
         {"time_offset_jump": {"seconds": 0.8, "at_s": 100.0, "again_seconds": 0.02, "again_at_s": 200.0}},
     )
     once = {name: effect.once for name, effect in EFFECTS.items()}
-    (alone,) = happening_again(fitter, [fit], EFFECTS, once)
+    (alone,) = repeated_effects(fitter, [fit], EFFECTS, once)
     assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
 
@@ -617,7 +621,7 @@ def test_a_first_leap_that_the_blocks_do_not_bear_out_is_dropped_and_the_other_s
         {"time_offset_jump": {"seconds": 0.02, "at_s": 60.0, "again_seconds": 0.8, "again_at_s": 200.0}},
     )
     once = {name: effect.once for name, effect in EFFECTS.items()}
-    alone = once_where_borne_out(fitter, fit, EFFECTS, once)
+    alone = once_where_confirmed(fitter, fit, EFFECTS, once)
     assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
     assert alone.values["time_offset_jump"][0]["at_s"] == pytest.approx(200.0, abs=20.0)  # on a straight leg
@@ -752,7 +756,7 @@ def test_two_recordings_are_not_asked_for_a_second_leap_at_one_time_of_both():
     start = no_effect().with_effects([leap], 2, {leap.name: ({"seconds": 0.8, "at_s": 100.0},) * 2})
     fitter = Fitter(problem)
     fit = fitter.fit(start, white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval))
-    assert happening_again(fitter, [fit], EFFECTS, once) == []
+    assert repeated_effects(fitter, [fit], EFFECTS, once) == []
 
 
 @pytest.mark.parametrize("seconds", [-2.7, 0.3, 1.2])
@@ -1294,10 +1298,10 @@ def test_what_explains_much_may_be_told_by_one_stretch_alone(monkeypatch):
         fit, base = (Mock(spec=Fit, deviance=each) for each in (1000.0, 1000.0 + explained))
         none = SimpleNamespace(fit=base, fitter=Mock())
         selection: Any = SimpleNamespace(fit=fit, selected=[None], withdrawn=lambda none=none: none)
-        monkeypatch.setattr(held_out_validation, "is_borne_out", lambda *_: False)
+        monkeypatch.setattr(held_out_validation, "is_confirmed", lambda *_: False)
         monkeypatch.setattr(held_out_validation, "unexplained", lambda *_: "an unknown cause")
         monkeypatch.setattr(held_out_validation, "matters", lambda *_, is_there=is_there: is_there)
-        found = borne_out(selection, "nothing", replace(gap, shown_from=shown_from), 30)
+        found = confirmed(selection, "nothing", replace(gap, shown_from=shown_from), 30)
         assert found == ((selection, "nothing") if stands else (none, "an unknown cause"))
 
 
@@ -1369,18 +1373,18 @@ def test_a_height_is_looked_for_where_one_of_a_metre_shows_and_known_by_what_a_m
     columns[:, 0, 0] = columns[:, 1, 1] = 0.07
     columns[:, 0, 2] = by_metre
     problem = Mock(spec=Problem, measured=(True, True, False), recordings=[], columns=lambda *_: columns)
-    shown = shown_parts({arm.name: arm}, problem)[arm.name]
+    shown = observable_parts({arm.name: arm}, problem)[arm.name]
     assert [each.name for each in shown.parameters] == ["x_m", "y_m", "z_m"][: 2 + is_shown]
     hypothesis = no_effect().with_effects([arm], 1, {})
     fit = Mock(spec=Fit, hypothesis=hypothesis, values=hypothesis.values)
     fit.columns = np.concatenate([np.zeros((100, 2, 6)), columns], axis=2)
-    added = np.diag(with_shown(problem, fit, np.zeros((9, 9))))
+    added = np.diag(with_observable(problem, fit, np.zeros((9, 9))))
     assert np.sqrt(added) == pytest.approx([0.0] * 8 + [std])
-    assert not with_shown(Mock(spec=Problem, measured=(True, True, True)), fit, np.zeros((9, 9))).any()
+    assert not with_observable(Mock(spec=Problem, measured=(True, True, True)), fit, np.zeros((9, 9))).any()
     for times, stands in ((1.9, not std), (-2.1, True)):
         fit.values = {arm.name: ({"x_m": 0.0, "y_m": 0.0, "z_m": times * std},)}
         fit.effects = (arm,)
-        left = without_faint(problem, fit)
+        left = without_insignificant(problem, fit)
         assert left is None if stands else [each.name for each in left.parameters] == ["x_m", "y_m"]
 
 
@@ -1390,7 +1394,7 @@ def test_what_turns_show_best_of_an_arm_is_said_however_little_they_show():
     hypothesis = no_effect().with_effects([arm], 1, {arm.name: ({"x_m": 0.1, "y_m": 0.1, "z_m": 0.1},)})
     fit = Mock(spec=Fit, hypothesis=hypothesis, values=hypothesis.values, effects=(arm,))
     fit.columns = np.concatenate([np.zeros((100, 2, 6)), np.full((100, 2, 3), [0.005, 0.005, 0.0005])], axis=2)
-    left = without_faint(Mock(spec=Problem, measured=(True, True, False)), fit)
+    left = without_insignificant(Mock(spec=Problem, measured=(True, True, False)), fit)
     assert left is not None and [each.name for each in left.parameters] == ["x_m", "y_m"]
 
 

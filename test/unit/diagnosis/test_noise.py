@@ -24,7 +24,7 @@ from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise import noise_level
 from dvl_calib_ros.diagnosis.noise.noise_level import claims_of
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, white_noise
-from dvl_calib_ros.diagnosis.search.effect_selection import without_contradicted
+from dvl_calib_ros.diagnosis.search.effect_selection import without_slow_outliers
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
@@ -239,8 +239,8 @@ def test_a_sample_that_only_its_neighbours_contradict_is_kept():
         )
         for reference in (jerked, velocity)
     )  # fmt: skip
-    assert without_contradicted(problem, no_effect()) is None
-    (kept,) = without_contradicted(wild, no_effect())
+    assert without_slow_outliers(problem, no_effect()) is None
+    (kept,) = without_slow_outliers(wild, no_effect())
     assert sorted(set(time) - set(kept.dvl.time)) == [150.0]
 
 

@@ -12,11 +12,11 @@ from test_diagnosis import LEVER, fitted, recording_of, scenario, with_added
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.diagnosis.answer import held_out_validation
 from dvl_calib_ros.diagnosis.answer.gap_location import places
-from dvl_calib_ros.diagnosis.answer.held_out_validation import is_borne_out, settled
+from dvl_calib_ros.diagnosis.answer.held_out_validation import is_confirmed, settled
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fit.gauss_newton import NEARBY, SURELY, Fitter
-from dvl_calib_ros.diagnosis.fit.selection_criteria import FittedBeside
+from dvl_calib_ros.diagnosis.fit.selection_criteria import NuisanceFit
 from dvl_calib_ros.diagnosis.model.forward_model import make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.seen import columns_by_turn
@@ -64,7 +64,7 @@ def test_what_could_not_be_clear_enough_is_not_held_against_made_up_recordings(s
         whole.clear_energy,
         whole.about,
     )
-    monkeypatch.setattr(looking, "made_up", lambda *_: pytest.fail("asked for nothing"))
+    monkeypatch.setattr(looking, "simulated_recordings", lambda *_: pytest.fail("asked for nothing"))
     assert not unexplained(fitter, fit, asked=excess + 1000.0).found
 
 
@@ -177,7 +177,7 @@ def test_what_may_make_it_worse_where_it_was_not_fitted_to_does_not_stand_howeve
     fits = [SimpleNamespace(deviance=deviance) for deviance in (900.0, 300.0)]
     selection = SimpleNamespace(base=fits[0], fit=fits[1], selected=selected)
     gap = SimpleNamespace(before=0.049, after=0.048, interval=(low, 1.0))
-    assert is_borne_out(selection, gap, 20) is stands
+    assert is_confirmed(selection, gap, 20) is stands
 
 
 @pytest.mark.slow
@@ -213,7 +213,7 @@ def test_what_one_stretch_alone_tells_of_an_effect_is_not_held_against_it_where_
     column = np.where(dives, 1.0, 0.01) * rng.standard_normal(len(time))
     residual = (3.0 * column + rng.standard_normal(len(time)))[:, None]
     noise = white_noise(rng.standard_normal((len(time), 1)), (slice(0, len(time)),), None, 0.5)
-    known = FittedBeside(np.ones((len(time), 1, 1)), np.ones(1), np.zeros(1))
+    known = NuisanceFit(np.ones((len(time), 1, 1)), np.ones(1), np.zeros(1))
     problem, raw = SimpleNamespace(time=time), column[:, None, None]
     assert told_elsewhere(problem, noise, known, raw, residual) < 0.0
     left = noise.whiten(residual - 3.0 * column[:, None])

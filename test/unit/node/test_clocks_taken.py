@@ -11,7 +11,7 @@ from runs import ONE_HERTZ, MatchedRun, make_samples
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import Compression, Storage
-from dvl_calib_ros.calibration.assessor import Judge
+from dvl_calib_ros.calibration.assessor import Assessor
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -86,8 +86,8 @@ def test_when_a_clock_is_known_is_decided_by_stamps_however_busy_the_machine_is(
 
 def test_what_is_said_on_the_way_waits_for_no_block_and_is_thought_of_when_blocks_have_told_more(monkeypatch):
     """It waited for the block that was being solved, and messages with it; and was thought of with every status."""
-    thought, real = [], Judge.doubts
-    monkeypatch.setattr(Judge, "doubts", lambda *of, **how: thought.append(1) or real(*of, **how))
+    thought, real = [], Assessor.doubts
+    monkeypatch.setattr(Assessor, "doubts", lambda *of, **how: thought.append(1) or real(*of, **how))
     calibrator = Calibrator(Parameters(), worker=Later())
     feed = {DvlSample: calibrator.feed_dvl, ReferenceSample: calibrator.feed_reference, ImuSample: calibrator.feed_imu}
     for sample in make_samples(MatchedRun("box", 65.0, frame=VelocityFrame.ENU, gnss_std=0.01, **ONE_HERTZ)):
