@@ -55,6 +55,11 @@ def test_no_arrow_of_the_table_goes_up_so_that_there_is_no_circle():
     assert rooms.arrows_up() == []
 
 
+def test_each_room_has_a_paragraph_in_the_architecture_page():
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    assert [room for room in rooms.ROOMS if f"**{room.rpartition('.')[2].strip('_')}**" not in page] == ["__init__"]
+
+
 def test_no_two_modules_import_each_other():
     """Within functions and for types alone as well."""
     assert rooms.module_circles() == []
