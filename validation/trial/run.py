@@ -77,8 +77,7 @@ GENERATOR_VERSION = 7
 
 def diagnose_bags(paths: Sequence[Path], parameters: Parameters) -> Document:
     """What `dvl-calib diagnose` says of the bags."""
-    from dvl_calib_ros.diagnosis.answer.results import diagnosis_document
-    from dvl_calib_ros.diagnosis.diagnose import diagnose
+    from dvl_calib_ros.diagnosis.diagnose import diagnose, diagnosis_document
 
     return diagnosis_document(diagnose(paths, parameters))
 
