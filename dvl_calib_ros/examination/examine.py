@@ -10,27 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.assessment.model_selection import eligible
-from ..calibration.calibrator import Calibrator
-from ..calibration.filters.observability import OBSERVED_SHARE, scale_std_ahead
+from ..bag_replay.checked_replay import checked_replay
+from ..bag_replay.replay import Replayed
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import FRD, FROM_MESSAGE, Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
-from ..calibration.numerics.samples import Stream, VelocityFrame
+from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.frame_hypotheses import FITS
-from ..calibration.registration.registration import Registration
 from ..calibration.results.mounting_quantities import Quantity, quantities
-from ..calibration.results.results import Estimate, rpy_std
+from ..calibration.results.results import Estimate
 from ..calibration.streams.position_velocities import NOISY_MPS
 from ..discovery.discover import discover
 from ..discovery.discovery import Discovery, Given
-from ..messages.decode import MessageDecoder
+from ..errors import InputError
 from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topic_messages import Recorded
 from ..recordings.topic_preview import Look
-from ..recordings.topics import Topics
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
@@ -62,7 +59,10 @@ class Content:
 
 @dataclass(frozen=True, repr=False)
 class Examination(Answering):
-    """What the doctor says of a recording."""
+    """What the doctor says of a recording.
+
+    judged: the verdict of a replay, which decides; reasons: of that verdict. cannot: why there is no replay, else ''.
+    """
 
     paths: tuple[Path, ...]
     seconds: float
@@ -72,6 +72,9 @@ class Examination(Answering):
     speed_mps: float
     shown: tuple[Shown, ...]
     notes: tuple[str, ...]
+    judged: Severity
+    reasons: tuple[Reason, ...] = ()
+    cannot: str = ""
 
     @property
     def has_reference(self) -> bool:
@@ -80,11 +83,17 @@ class Examination(Answering):
 
     @property
     def verdict(self) -> str:
-        """Whether it can calibrate: yes, partly, or no."""
-        if _has_error(self.findings):
+        """Whether it can calibrate: yes, partly, or no. No where a replay rejects, yes only where it accepts."""
+        if self.judged is Severity.REJECT:
             return "no"
         needed = [each for each in self.shown if each.name in ("pitch", "yaw")]  # what turns a track and lifts it
-        return "yes" if needed and not any(each.needs for each in needed) else "partly"
+        all_shown = bool(needed) and not any(each.needs for each in needed)
+        return "yes" if self.judged is Severity.ACCEPT and all_shown else "partly"
+
+    @property
+    def against(self) -> tuple[Reason, ...]:
+        """Reasons of the replay's verdict that speak against its calibration."""
+        return tuple(each for each in self.reasons if each.severity in (Severity.REJECT, Severity.MARGINAL))
 
     @property
     def why(self) -> str:
@@ -92,15 +101,20 @@ class Examination(Answering):
         errors = [each for each in self.findings if each.severity is Severity.ERROR]
         if errors:
             return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
-        if not self.has_reference:
+        if not self.has_reference and self.verdict != "no":
             return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
-        missing = [each.name for each in self.shown if each.needs]
-        return f"Not shown yet: {' and '.join(missing)}." if missing else ""
+        if self.cannot or self.verdict == "no":
+            why = self.cannot or self.against[0].says
+            return f"{why[:1].upper()}{why[1:]}."
+        *others, last = ["", *(each.name for each in self.shown if each.needs)]
+        missing = " and ".join(filter(None, (", ".join(others[1:]), last)))
+        return f"Not shown yet: {missing}." if missing else ""
 
     def document(self) -> dict[str, Any]:
         """Plain data, for JSON."""
         return {
             "verdict": self.verdict,
+            "replay": {"verdict": self.judged.value, "reasons": [each.as_dict() for each in self.reasons]},
             "seconds": self.seconds,
             "topics": {
                 content.role.lower(): {
@@ -138,8 +152,13 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     seconds = 1e-9 * (end_ns - start_ns)
     velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
-    usable = "reference" in streams and not any(found.code == "DOCTOR_NO_ORIENTATION" for found in findings)
-    registration = None if discovery.clocks is None else discovery.clocks.registration
+    replayed, cannot = _replayed(recording, discovery)
+    verification = None if replayed is None else replayed.result.verifications.get(replayed.result.selected)
+    if replayed is not None:
+        discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
+    judged = Severity.REJECT if verification is None else verification.verdict
+    if judged is not Severity.REJECT:  # then nothing that was found stands in the way
+        findings = [each.weighed(Severity.WARNING) if _has_error([each]) else each for each in findings]
     return Examination(
         recording.paths,
         seconds,
@@ -150,9 +169,22 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         discovery,
         tuple(findings),
         float(np.median(np.linalg.norm(velocity, axis=1))) if len(velocity) else 0.0,
-        expected(recording, topics, discovery.parameters, registration) if usable else (),
+        () if replayed is None or "reference" not in streams else _shown(replayed),
         recording.notes,
+        judged,
+        () if verification is None else tuple(verification.reasons),
+        cannot,
     )
+
+
+def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | None, str]:
+    """Return the replay that `dvl-calib replay` makes, whose verdict is the doctor's; or why there can be none."""
+    guessed = bool(discovery.mounting_because)
+    try:
+        replayed = checked_replay(recording, discovery.parameters, discovery.topics, mounting_is_guessed=guessed)
+    except InputError as error:
+        return None, str(error).rstrip(".")
+    return replayed, ""
 
 
 def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> Content:
@@ -278,18 +310,15 @@ def _disagreement(discovery: Discovery, noise: float) -> list[Reason]:
     return [finding("DOCTOR_DISAGREE", left=discovery.agreement.best_left)]
 
 
-# Of a longer recording a calibration is made with so much of it: that shows what kind of motion there is.
-EXPECTED_FROM_S = 300.0
-BLOCK_SIZE = 8192
 _NAMES = ("roll", "pitch", "yaw", "scale")
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What the motion shows of one error.
+    """Observability of one error in a recording.
 
-    std: standard deviation to expect, degrees or per cent. share: of the way from knowing nothing (0) to fine (1).
-    needs: the manoeuvre that shows more, '' if it is shown.
+    std: standard deviation of the calibration, degrees or per cent. share: of the way from knowing nothing (0) to fine
+    (1). needs: the manoeuvre that shows more, '' if it is observable.
     """
 
     name: str
@@ -299,47 +328,21 @@ class Shown:
     needs: str
 
 
-def expected(
-    recording: Recording, topics: Topics, parameters: Parameters, registration: Registration | None
-) -> tuple[Shown, ...]:
-    """Of roll, pitch, yaw and scale; none where no sample can be used. registration: as it was found, where it was."""
-    topics = topics.found_in(recording.types)
-    p = recording.of_types(topics, parameters).replace(prior_source="fixed")
-    calibrator = Calibrator(
-        p, block_size=BLOCK_SIZE, recordings_ns=recording.between_ns, models=eligible(p), registration=registration
-    )
-    named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
-    start_ns, end_ns = recording.span_ns
-    share = min(1.0, EXPECTED_FROM_S / max(1e-9 * (end_ns - start_ns), 1e-9))
-    decoder = MessageDecoder(p)
-    decoder.on_fix = calibrator.feed_fix
-    for stretch in recording.stretches(named, decoder, share):
-        calibrator.feed(stretch.streams)
-    calibrator.finish()
-    result = calibrator.result()
+def _shown(replayed: Replayed) -> tuple[Shown, ...]:
+    """Return the observability of roll, pitch, yaw and scale; nothing where no sample could be used."""
+    result = replayed.result
     if not result.estimate.used:
         return ()
-    return tuple(_shown(each, result.estimate, p, share) for each in quantities(result) if each.name in _NAMES)
+    parameters = Parameters.from_mapping(result.parameters)
+    return tuple(_one_shown(each, result.estimate, parameters) for each in quantities(result) if each.name in _NAMES)
 
 
-def _shown(found: Quantity, estimate: Estimate, parameters: Parameters, share: float) -> Shown:
-    """By a calibration with a share of the recording; what is the same however much there is stays as it is."""
-    model = MODELS[estimate.model]
-    stays = estimate.covariance - estimate.velocity_covariance + estimate.left_open
-    # more of the recording shows more of a bias where speeds show it, and no more at one speed: between the two
-    of_all = stays - (1.0 - math.sqrt(share)) * estimate.of_bias.covariance
+def _one_shown(found: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:
     if found.name == "scale":
         unit, prior, fine = 100.0, parameters.initial_std_scale, parameters.fine_std_scale
-        part, floor = (float(scale_std_ahead(model, each, parameters)[0]) for each in (stays, of_all))
     else:
         unit, prior, fine = math.degrees(1.0), parameters.initial_std_misalignment, parameters.fine_std_misalignment
-        axis = _NAMES.index(found.name)
-        part, floor = (float(rpy_std(estimate.misalignment, each, parameters)[axis]) for each in (stays, of_all))
-    of_share = max((found.std / unit) ** 2 - part**2, 1e-12)
-    told = max(1.0 / of_share - prior**-2, 0.0) / share
-    std = math.sqrt(floor**2 + min(of_share, 1.0 / (told + prior**-2)))
-    is_shown = found.shown or std <= OBSERVED_SHARE * prior
     missing = (each.missing for each in estimate.observability if each.axis == found.name and each.missing)
-    needs = "" if is_shown else next(missing, model.shown_by[found.name])
-    way = min(1.0, max(0.0, math.log(prior / std) / math.log(prior / fine)))
-    return Shown(found.name, found.unit.strip(), std * unit, way, needs)
+    needs = "" if found.shown else next(missing, MODELS[estimate.model].shown_by[found.name])
+    way = math.log(prior * unit / max(found.std, 1e-12)) / math.log(prior / fine)
+    return Shown(found.name, found.unit.strip(), found.std, min(1.0, max(0.0, way)), needs)

@@ -26,6 +26,7 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
     names = ", ".join(path.name or str(path) for path in examined.paths)
     found, discovery = examined.findings, examined.discovery
     lead, found = (found[0], found[1:]) if found and found[0].code.startswith(NO_IMU) else (None, found)
+    found = (*found, *examined.against)
     notes = (note.sentence for note in discovery.notes)
     said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"What the motion shows of the DVL (median speed {examined.speed_mps:.2f} m/s)"
@@ -61,7 +62,7 @@ CONTENTS: Columns[Content] = {
 SHOWN: Columns[Shown] = {
     "": lambda each: each.name,
     "shown": lambda each: bar(each.share, "good" if each.share >= 1.0 else "off" if not each.needs else "bad"),
-    "expected ±1σ": lambda each: f"±{each.std:.2f} {each.unit}",
+    "±1σ": lambda each: f"±{each.std:.2f} {each.unit}",
     "needs": lambda each: each.needs,
 }
 

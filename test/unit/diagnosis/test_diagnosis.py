@@ -736,7 +736,9 @@ def test_what_is_not_known_of_the_time_of_a_leap_is_in_the_intervals_of_all_size
 def test_what_fits_to_made_up_recordings_are_off_by_is_in_the_intervals_where_it_is_no_chance(monkeypatch):
     """At 1 Hz a flexure of the mount was 4 standard deviations off, which recordings made up from the fit showed."""
     monkeypatch.setattr(
-        confidence_intervals, "simulated_recordings", lambda problem, fit, count: ((None, [], None) for _ in range(count))
+        confidence_intervals,
+        "simulated_recordings",
+        lambda problem, fit, count: ((None, [], None) for _ in range(count)),
     )
     scatter = np.tile([1.0, -1.0], confidence_intervals.MADE_UP // 2)
     steps = np.column_stack([0.3 + 0.5 * scatter, 4.0 + 0.5 * scatter, 3.0 * scatter])
