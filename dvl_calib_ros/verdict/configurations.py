@@ -41,9 +41,9 @@ CONFIGURATIONS = (
     ),
     _Said(
         "DVL_LEFT_HANDED",
-        "the DVL's axes look left-handed",
-        "The data fit much better with y negated alone, which no rotation does.",
-        "correct the DVL's driver",
+        "the DVL's axes look left-handed: {axis} points the other way",
+        "The data fit much better with this one axis negated, which no rotation does.",
+        "negate this axis in the DVL's driver; of z, check the sign of the reference's vertical velocity as well",
     ),
     _Said(
         "MOUNTING_FITS",

@@ -76,8 +76,7 @@ def fitting_configuration(
         as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
     if as_given < WRONG_FROM:
         assert given is not None
-        asked = motion, curves, nominal, lever_arm, given
-        return _flipped(*asked) or _mirrored(*asked)
+        return _other_signs(motion, curves, nominal, lever_arm, given)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
@@ -96,6 +95,8 @@ def fitting_configuration(
     best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
     if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
+    if given is not None and (axis := _mirrored(motion, curves, nominal, lever_arm, given, found[best].level)):
+        return finding("DVL_LEFT_HANDED", axis=axis)
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
 
 
@@ -141,10 +142,21 @@ def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame)
     return replace(motion, reference=reference, in_earth=frame is not VelocityFrame.BODY)
 
 
-def _flipped(
+def _other_signs(
     motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration
 ) -> Reason | None:
-    """Whether y and z turned round explain more without a lever arm than the axes given do with any.
+    """Return the finding of the signs of the DVL's axes that explain most, where others than those given do."""
+    turned = _turned_round(motion, curves, nominal, lever_arm, registered)
+    axis = _mirrored(motion, curves, nominal, lever_arm, registered, math.inf if turned is None else turned.level)
+    if axis:
+        return finding("DVL_LEFT_HANDED", axis=axis)
+    return None if turned is None else finding("DVL_AXES_FRD")
+
+
+def _turned_round(
+    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration
+) -> Fitted | None:
+    """Return the fit with y and z turned round, where without a lever arm it explains more than those given with any.
 
     A vehicle that swims ahead shows its axes only in the sway of turns and the heave of dives, which are small beside
     its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm. registered: the axes
@@ -167,28 +179,35 @@ def _flipped(
         return None
     # read at other times, the DVL's noise is another one: what is left differs by that alone
     by_chance = math.sqrt(6.0 * turned.rows) if abs(given.dvl_late - turned.dvl_late) > ALIKE_S else 0.0
-    return finding("DVL_AXES_FRD") if _gain(given, turned) > CLEARLY + by_chance else None
+    return turned if _gain(given, turned) > CLEARLY + by_chance else None
 
 
 def _mirrored(
-    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration
-) -> Reason | None:
-    """Whether a DVL whose y points the other way explains more, each with any lever arm.
+    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration, most: float
+) -> str:
+    """Return the axis of a left-handed DVL, of which the other sign explains more, with any lever arm; '' for none.
 
-    Then the sway of turns is the other way round, which at one speed is a lever arm of the other sign.
+    The sign of y is that of the sway of turns, which at one speed is a lever arm of the other sign; the sign of z is
+    that of the heave. most: level, m/s, that another explanation leaves.
     """
-    other = replace(motion, dvl=motion.dvl._replace(velocity=motion.dvl.velocity * MIRRORED))
-    near = nearest(MotionFit(other, lever_arm, curves.mirrored(), FEW_ROWS), nominal, (REFERENCE,), registered.spread)
-    if near is None or near.level > registered.spread:
-        return None
     held = (REFERENCE,)
-    turned = MotionFit(other, lever_arm, curves.mirrored(), MOST_ROWS)(0.0, near.dvl_late, nominal, held)
-    given = MotionFit(motion, lever_arm, curves, MOST_ROWS)(0.0, registered.dvl.late, nominal, held)
-    if turned is None or given is None:
-        return None
-    gain = _gain(given, turned)
-    gain /= max(given.inflation, turned.inflation) ** 2  # noise that lasts is that of fewer samples (survey 34211)
-    return finding("DVL_LEFT_HANDED") if gain > CLEARLY + math.sqrt(6.0 * turned.rows) else None
+    given: Fitted | None = None
+    levels: dict[str, float] = {}
+    for axis, signs in MIRRORED.items():
+        other = replace(motion, dvl=motion.dvl._replace(velocity=motion.dvl.velocity * signs))
+        of_other = curves.mirrored(axis)
+        near = nearest(MotionFit(other, lever_arm, of_other, FEW_ROWS), nominal, held, registered.spread)
+        if near is None or near.level > registered.spread:
+            continue
+        turned = MotionFit(other, lever_arm, of_other, MOST_ROWS)(0.0, near.dvl_late, nominal, held)
+        given = given or MotionFit(motion, lever_arm, curves, MOST_ROWS)(0.0, registered.dvl.late, nominal, held)
+        if turned is None or given is None or turned.level > most:
+            continue
+        # noise that lasts is that of fewer samples (survey 34211)
+        gain = _gain(given, turned) / max(given.inflation, turned.inflation) ** 2
+        if gain > CLEARLY + math.sqrt(6.0 * turned.rows):
+            levels[axis] = turned.level
+    return min(levels, key=levels.__getitem__, default="")
 
 
 def _gain(given: Fitted, turned: Fitted) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -148,8 +149,8 @@ GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
 GAP_S = 2.0
 
 
-# A left-handed driver's axes.
-MIRRORED: Array = np.array([1.0, -1.0, 1.0])
+# Axes of left-handed drivers, by the one that is negated. x is not: a vehicle that goes ahead shows its sign.
+MIRRORED: Mapping[str, Array] = {"y": np.array([1.0, -1.0, 1.0]), "z": np.array([1.0, 1.0, -1.0])}
 
 
 class Curves:
@@ -175,10 +176,10 @@ class Curves:
             rates = [angular_velocity_at(motion.turns, grid[at], GAP_S)[0] for at in _parts(len(grid))]
             self._turns = np.nan_to_num(np.concatenate(rates))
 
-    def mirrored(self) -> Curves:
-        """The same of a DVL whose y points the other way."""
+    def mirrored(self, axis: str) -> Curves:
+        """Return the same of a DVL of which an axis of `MIRRORED` points the other way."""
         made = copy(self)
-        made._velocity = self._velocity * MIRRORED[[0, 1, 2, 0, 1, 2, 0]]
+        made._velocity = self._velocity * MIRRORED[axis][[0, 1, 2, 0, 1, 2, 0]]
         return made
 
     def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
