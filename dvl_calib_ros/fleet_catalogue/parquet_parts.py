@@ -1,13 +1,15 @@
 """The catalogue on the disk: a Parquet file a recording, all of one schema, which readers take as one table.
 
 Each is written whole or not at all, under a name that follows from where the recording is: a run that is killed loses
-what it was at, and none has a row twice. What a run needs to go on is in the file's own metadata.
+what it was at, and none has a row twice. What a run needs to go on is in the file's own metadata, together with a
+checksum of the whole file, which is compared before a parser sees any of it.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -15,13 +17,18 @@ from pathlib import Path
 from typing import Any
 
 from ..disk.atomic import check_folder_writable, save_bytes
+from ..disk.text_files import read_file
 from ..errors import InputError
 from .recording_entry import Entry, Row
 
-ROWS, PAGE = "rows", "index.html"
+# What is set aside lies in a folder of its own: readers take every file of rows/
+ROWS, PAGE, ASIDE = "rows", "index.html", "set_aside"
 # Version of the schema: part of what says whether a recording is done
-SCHEMA = 2
-_KEY = b"dvl_calib"
+SCHEMA = 3
+_KEY, _CHECKSUM_KEY = b"dvl_calib", b"dvl_calib checksum"
+# Before the checksum, in the file's metadata
+_CHECKSUM = b"sha256 of this file with zeros here: "
+_ZEROS = b"0" * 64
 
 
 @dataclass(frozen=True)
@@ -36,11 +43,15 @@ class CataloguePart:
 
 
 class Catalogue:
-    """A folder with ``rows/*.parquet``. Raises InputError where it cannot be written, or without pyarrow."""
+    """A folder with ``rows/*.parquet``. Raises InputError where it cannot be written, or without pyarrow.
+
+    notes: of the files that `parts` has set aside, a sentence each.
+    """
 
     def __init__(self, folder: Path):
         self._arrow = _arrow()
         self.folder = folder
+        self.notes: list[str] = []
         self.rows = folder / ROWS
         check_folder_writable(folder)
         try:
@@ -87,24 +98,61 @@ class Catalogue:
         self._save(own, [{**row, "vehicle": vehicle} for row in rows])
 
     def parts(self) -> Iterator[CataloguePart]:
-        """All recordings; what is no part, damaged, or of another schema is passed over, and so done again."""
-        from pyarrow import parquet
+        """Yield each recording's part, and set aside what is none; a part of another schema is passed over.
 
+        Raises InputError if a file cannot be set aside.
+        """
         for path in sorted(self.rows.glob("*.parquet")):
             try:
-                told = json.loads(parquet.read_schema(path).metadata[_KEY])
-                part = CataloguePart(**told)
-            except (OSError, KeyError, TypeError, ValueError, self._arrow.ArrowException):
+                part = self._part(path)
+            except InputError as error:
+                self._set_aside(path, str(error))
                 continue
             if part.schema == SCHEMA:
                 yield part
 
     def rows_of(self, recording: str) -> list[Row]:
-        """Rows of a recording."""
+        """Return the rows of a recording. Raises InputError if its part is damaged."""
         from pyarrow import parquet
 
-        found: list[Row] = parquet.read_table(self._path(recording), partitioning=None).to_pylist()
+        content = self._whole(self._path(recording))
+        found: list[Row] = parquet.read_table(self._arrow.BufferReader(content)).to_pylist()
         return found
+
+    def _part(self, path: Path) -> CataloguePart:
+        """Read what a file says of itself. Raises InputError if it is no part, damaged, or another's by its name."""
+        from pyarrow import parquet
+
+        content = self._whole(path)
+        try:
+            told = json.loads(parquet.read_schema(self._arrow.BufferReader(content)).metadata[_KEY])
+            part = CataloguePart(**told)
+        except (OSError, KeyError, TypeError, ValueError, self._arrow.ArrowException) as error:
+            raise InputError(f"{path}: was not written by this version of dvl-calib fleet") from error
+        if path != self._path(part.recording):
+            raise InputError(f"{path}: belongs to {part.recording}, whose part has another name")
+        return part
+
+    def _whole(self, path: Path) -> bytes:
+        """Read a file. Raises InputError if any bit of it is not as it was written."""
+        content = read_file(path, "part of a catalogue")
+        if _CHECKSUM not in content or _with_checksum(content) != content:
+            raise InputError(f"{path}: is damaged, or was not written by this version of dvl-calib fleet")
+        return content
+
+    def _set_aside(self, path: Path, why: str) -> None:
+        aside = self.folder / ASIDE
+        place = aside / path.name
+        try:
+            aside.mkdir(exist_ok=True)
+            number = 1
+            while os.path.lexists(place):
+                number += 1
+                place = aside / f"{path.name}.{number}"
+            os.rename(path, place)
+        except OSError as error:
+            raise InputError(f"{why}; it cannot be moved to {place} ({error.strerror}): remove it") from error
+        self.notes.append(f"{why}; it is kept as {place}, and its recording, if found, is calibrated again")
 
     def _path(self, recording: str) -> Path:
         name = re.sub(r"[^\w.-]+", "_", recording.rpartition("/")[2])[:60]
@@ -113,11 +161,19 @@ class Catalogue:
     def _save(self, part: CataloguePart, rows: list[Row]) -> None:
         from pyarrow import parquet
 
-        told = {_KEY: json.dumps(vars(part))}
+        told = {_KEY: json.dumps(vars(part)), _CHECKSUM_KEY: _CHECKSUM + _ZEROS}
         table = self._arrow.Table.from_pylist(rows, schema=self._schema.with_metadata(told))
         sink = self._arrow.BufferOutputStream()
-        parquet.write_table(table, sink)
-        save_bytes(self._path(part.recording), sink.getvalue().to_pybytes(), keep=lambda _: [])
+        parquet.write_table(table, sink, write_page_checksum=True)  # for other readers
+        content = _with_checksum(sink.getvalue().to_pybytes())
+        save_bytes(self._path(part.recording), content, keep=lambda _: [])
+
+
+def _with_checksum(content: bytes) -> bytes:
+    """Return a part with the checksum that it should have, in the place of the one that it has."""
+    at = content.rfind(_CHECKSUM) + len(_CHECKSUM)  # the last: metadata follow the rows, and the checksum all other
+    before, after = content[:at], content[at + len(_ZEROS) :]
+    return before + hashlib.sha256(before + _ZEROS + after).hexdigest().encode() + after
 
 
 def _stamped(row: Row) -> Row:

@@ -119,7 +119,7 @@ def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence
         unchanged=unchanged,
         vehicles=tuple(histories(left)),
         persons=(*doubled, *need_person(left)),
-        notes=tuple(notes),
+        notes=(*notes, *catalogue.notes),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import struct
 import tempfile
 from collections.abc import Callable, Iterator
@@ -36,6 +37,8 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.urdf import read_urdf
+from dvl_calib_ros.fleet_catalogue.parquet_parts import ASIDE, Catalogue, CataloguePart
+from dvl_calib_ros.fleet_catalogue.recording_entry import Entry
 from dvl_calib_ros.logs.dvl_logs import read_dvl_log
 from dvl_calib_ros.logs.nmea import read_rmc
 from dvl_calib_ros.logs.trajectories import read_columns
@@ -47,6 +50,15 @@ from dvl_calib_ros.recordings.recording import open_recording
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(tempfile.mkdtemp(prefix="fuzz", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
+
+
+class Part(NamedTuple):
+    """A part of a fleet's catalogue, whole."""
+
+    catalogue: Catalogue
+    path: Path
+    recording: str
+    whole: bytes
 
 
 class Target(NamedTuple):
@@ -210,6 +222,19 @@ def run_log(data: bytes) -> None:
     assert stamps == sorted(set(stamps)) and all(np.isfinite(each.velocity).all() for each in samples)
 
 
+def run_part(data: bytes) -> None:
+    """A part of a fleet's catalogue is read as it was written, or set aside: nobody can change a bit of it."""
+    _PART.catalogue.notes.clear()
+    shutil.rmtree(_PART.catalogue.folder / ASIDE, ignore_errors=True)
+    _PART.path.write_bytes(data)
+    parts = list(_PART.catalogue.parts())
+    if data == _PART.whole:
+        assert [each.recording for each in parts] == [_PART.recording]
+        assert _PART.catalogue.rows_of(_PART.recording)[0]["value"] == 2.187
+    else:
+        assert not parts and len(_PART.catalogue.notes) == 1 and not _PART.path.exists()
+
+
 def run_override(data: bytes) -> None:
     text = data.decode("utf-8", "replace")
     parse_scalar(text)
@@ -343,6 +368,14 @@ def _override_seeds() -> Iterator[bytes]:
     yield from (b"[0.0, 1e-3, -2]", b"M3", b"min_speed:=0.5", b"{a: [1, 2]}", b"1:30:00", b"0x1F", b"!!python/name:os")
 
 
+def _part() -> Part:
+    catalogue, recording = Catalogue(FOLDER / "catalogue"), "/dives/auv1/dive0"
+    rows = [{"recording": recording, "parameter": "yaw", "unit": "deg", "value": 2.187, "codes": ["FEW_TURNS"]}]
+    catalogue.write(CataloguePart(recording, "auv1", "0" * 64, {"model": "M5"}), Entry(rows))
+    (path,) = catalogue.rows.iterdir()
+    return Part(catalogue, path, recording, path.read_bytes())
+
+
 _ALIASES = b"a: &a [1.0e-3, .nan]\nb: *a\nc: {d: !!binary aGFsbG8=, <<: {x: 1}}\n"
 _CALIBRATOR = Calibrator(Parameters())
 _SMALLEST_BAG = _small_mcap()
@@ -365,6 +398,9 @@ TARGETS = {
     "settings": Target(run_settings, settings_seeds),
     "names": Target(partial(run_names, names=Names(FOLDER, _SMALLEST_BAG)), names_seeds),
 }
+with suppress(InputError):  # without pyarrow there is no catalogue
+    _PART = _part()
+    TARGETS["part"] = Target(run_part, lambda: iter([_PART.whole]))
 with suppress(ImportError):  # without ROS 2 there is no live node
     from live import live_seeds, run_live
 

@@ -28,6 +28,7 @@ from dvl_calib_ros.fleet_catalogue.parquet_parts import Catalogue
 from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
 
+pa = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 PARAMETERS = {"roll", "pitch", "yaw"}
@@ -200,6 +201,71 @@ def test_a_part_of_another_schema_is_not_read(made, dives, tmp_path):
     parquet.write_table(old.replace_schema_metadata({"dvl_calib": json.dumps(told)}), part)
     result = dc.fleet(dives, out, jobs=1)
     assert (result.calibrated, result.unchanged) == (1, 4)
+
+
+def test_no_flipped_bit_of_a_part_is_read_as_another_value(made, tmp_path):
+    catalogue = Catalogue(tmp_path / "out")
+    (source,) = (made[1] / "rows").glob("dive0*")
+    whole, rng, place = source.read_bytes(), np.random.default_rng(7), catalogue.rows / source.name
+    for number in range(1, 601):
+        flipped = bytearray(whole)
+        flipped[rng.integers(len(whole))] ^= 1 << rng.integers(8)
+        place.write_bytes(flipped)
+        assert list(catalogue.parts()) == [] and not place.exists()
+        assert len(catalogue.notes) == number and "is damaged" in catalogue.notes[-1]
+    assert len(list((tmp_path / "out" / "set_aside").iterdir())) == 600
+    place.write_bytes(whole)
+    (part,) = catalogue.parts()
+    assert catalogue.rows_of(part.recording) == Catalogue(made[1]).rows_of(part.recording)
+
+
+def test_pages_of_a_part_have_checksums_for_other_readers(made):
+    """A number that is another is seen by a reader that compares them."""
+    (part,) = (made[1] / "rows").glob("dive0*")
+    values = parquet.read_table(part)["value"].to_numpy()
+    flipped = bytearray(part.read_bytes())
+    flipped[flipped.index(values[2].tobytes()[:7])] ^= 1
+    assert (parquet.read_table(pa.BufferReader(bytes(flipped)))["value"].to_numpy() != values).any()
+    with pytest.raises(OSError, match="CRC"):
+        parquet.read_table(pa.BufferReader(bytes(flipped)), page_checksum_verification=True)
+
+
+def test_a_damaged_or_foreign_part_is_set_aside_and_its_recording_done_again(made, dives, tmp_path, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(made[1], out)
+    rows = out / "rows"
+    before, expected = contents(out), made[0].recordings
+    names = {name[:5]: name for name in before}
+    flipped = bytearray(before[names["dive0"]])
+    flipped[len(flipped) // 3] ^= 4
+    (rows / names["dive0"]).write_bytes(flipped)
+    (rows / names["dive1"]).rename(rows / "another.parquet")
+    shutil.copy(rows / names["dive2"], rows / "copy.parquet")
+    os.mkfifo(rows / "pipe.parquet")
+    (rows / "folder.parquet").mkdir()
+    (rows / "link.parquet").symlink_to("pipe.parquet")
+    (rows / "nowhere.parquet").symlink_to("nowhere")
+    (rows / "large.parquet").touch()
+    os.truncate(rows / "large.parquet", 1 << 40)
+    result = dc.fleet(dives, out, jobs=1)
+    assert (result.calibrated, result.unchanged, result.recordings) == (2, expected - 2, expected)
+    assert contents(out).keys() == before.keys()
+    strange = ("another", "copy", "pipe", "folder", "link", "nowhere", "large")
+    aside = {names["dive0"], *(f"{name}.parquet" for name in strange)}
+    assert {path.name for path in (out / "set_aside").iterdir()} == aside
+    assert all(
+        any(f"rows/{name}: " in note and str(out / "set_aside") in note for note in result.notes) for name in aside
+    )
+    again = dc.fleet(dives, out, jobs=1)
+    assert (again.calibrated, again.notes) == (0, ())
+
+
+def test_what_cannot_be_set_aside_is_said_in_one_line(made, dives, tmp_path, capsys):
+    out = tmp_path / "out"
+    shutil.copytree(made[1], out)
+    (out / "rows" / "bad.parquet").write_text("no part")
+    (out / "set_aside").write_text("a file")
+    assert "bad.parquet" in (said := fail(capsys, "fleet", dives, "--out", out, "--jobs", "1")) and "remove it" in said
 
 
 def test_the_same_data_in_two_places_is_used_once(dives, tmp_path):
