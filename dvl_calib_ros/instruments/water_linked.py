@@ -9,13 +9,15 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from ..errors import InputError, printable
+from ..errors import InputError
 from .settings import Setting
 
 PORT = 16171
 ADDRESS = re.compile(r"(?:\[(?P<ipv6>[0-9A-Fa-f:.%\w]+)\]|(?P<host>[^:\[\]]+))(?::(?P<port>\d{1,5}))?", re.ASCII)
 # A DVL that has not answered for so long, s, is none; a line of its reports is no longer than this, bytes.
 PATIENCE_S, LONGEST_LINE = 10.0, 1 << 20
+# Of what it says why it refuses, characters are shown.
+LONGEST_REASON = 200
 # It is set with two digits; firmware before 2.2.1, with whole degrees and m/s, is told to be set by hand.
 AS_SET = 0.0051
 
@@ -29,7 +31,8 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
     parts = ADDRESS.fullmatch(address)
     port = int(parts["port"] or PORT) if parts is not None else 0
     if parts is None or not 0 < port < 65536:
-        raise InputError(f"--send {printable(address)}: is not HOST or HOST:PORT (IPv6 in brackets: [::1])")
+        raise InputError(f"--send {address}: is not HOST or HOST:PORT (IPv6 in brackets: [::1])")
+    is_sent = False
     try:
         with socket.create_connection((parts["ipv6"] or parts["host"], port), timeout=PATIENCE_S) as connection:
             dvl = _Dvl(connection, address)
@@ -39,40 +42,50 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
             for each in settings:
                 if each.now is None or not _is(before, each.name, each.now):
                     raise InputError(
-                        f"{printable(address)}: {each.name} is {_held(before, each.name)}, and was {each.now} when the "
+                        f"{address}: {each.name} is {_held(before, each.name)}, and was {each.now} when the "
                         "data were recorded (--now), which is what the calibration is relative to; record anew, or set "
                         "it yourself"
                     )
             if dry_run:
                 return False
+            is_sent = True
             dvl.ask({"command": "set_config", "parameters": {each.name: each.new for each in settings}})
             after = dvl.ask({"command": "get_config"})
+    except UnicodeError as error:
+        raise InputError(f"--send {address}: is no name that a host can have; give its name or address") from error
     except OSError as error:
         why = error.strerror or "no answer"
-        raise InputError(f"{printable(address)}: {why}; is the DVL on, and the address right?") from error
+        if is_sent:
+            raise InputError(
+                f"{address}: {why} after set_config was sent, so the DVL may be set or not; give the same line again, "
+                "which reads what it is set to first"
+            ) from error
+        raise InputError(f"{address}: {why}; is the DVL on, and the address right?") from error
     for each in settings:
         if not _is(after, each.name, each.new):
             raise InputError(
-                f"{printable(address)}: {each.name} was set to {each.new:g} and is {_held(after, each.name)}; look at "
-                "the DVL's own page"
+                f"{address}: {each.name} was set to {each.new:g} and is {_held(after, each.name)}; look at the DVL's "
+                "own page"
             )
     return False
 
 
-def _held(config: Any, name: str) -> Any:
-    return config.get(name) if isinstance(config, dict) else None
+def _held(config: Any, name: str) -> float | str:
+    """Return the number that a DVL holds under a name."""
+    held = config.get(name) if isinstance(config, dict) else None
+    return held if isinstance(held, float) else "no number"
 
 
 def _is(config: Any, name: str, value: float) -> bool:
     held = _held(config, name)
-    return isinstance(held, (int, float)) and abs(held - value) <= AS_SET
+    return isinstance(held, float) and abs(held - value) <= AS_SET
 
 
 class _Dvl:
     """A connection, over which reports come between the answers."""
 
     def __init__(self, connection: socket.socket, address: str) -> None:
-        self._connection, self._address, self._pending = connection, printable(address), b""
+        self._connection, self._address, self._pending = connection, address, b""
 
     def ask(self, command: dict[str, Any]) -> Any:
         """The result of a command. Raises InputError where it is refused, OSError where no answer comes."""
@@ -81,13 +94,14 @@ class _Dvl:
         while True:
             line = self._line(until)
             try:
-                answer = json.loads(line)
-            except ValueError:
+                answer = json.loads(line, parse_int=float)  # an int may be too large for one
+            except (ValueError, RecursionError):
                 continue
             if not isinstance(answer, dict) or answer.get("response_to") != command["command"]:
                 continue
             if answer.get("success") is not True:
-                why = printable(str(answer.get("error_message") or "no reason given"))
+                told = answer.get("error_message")
+                why = told[:LONGEST_REASON] if told and isinstance(told, str) else "no reason given"
                 raise InputError(f"{self._address}: refuses {command['command']} ({why})")
             return answer.get("result")
 

@@ -149,9 +149,11 @@ class WaterLinked:
     """A DVL that answers over TCP as the protocol says, with reports in between."""
 
     def __init__(
-        self, config: dict[str, float], *, whole: bool = False, refuses: bool = False, family=socket.AF_INET
-    ) -> None:
+        self, config: dict[str, float], *, whole: bool = False, refuses: bool = False, family=socket.AF_INET,
+        between: bytes = b"no json", why: object = "not now", closes: str = "",
+    ) -> None:  # fmt: skip
         self.config, self._whole, self._refuses = dict(config), whole, refuses
+        self._between, self._why, self._closes = between, why, closes
         host, written = ("::1", "[::1]") if family == socket.AF_INET6 else ("127.0.0.1",) * 2
         self._server = socket.create_server((host, 0), family=family)
         self.address = f"{written}:{self._server.getsockname()[1]}"
@@ -160,18 +162,24 @@ class WaterLinked:
 
     def _serve(self) -> None:
         connection, _ = self._server.accept()
+        before = dict(self.config)
         with connection, connection.makefile("rwb") as stream:
             for line in stream:
                 asked = json.loads(line)
                 answer = {"response_to": asked["command"], "success": True, "error_message": "", "type": "response"}
                 if asked["command"] == "set_config" and self._refuses:
-                    answer |= {"success": False, "error_message": "not now"}
+                    answer |= {"success": False, "error_message": self._why}
                 elif asked["command"] == "set_config":
                     wanted = asked["parameters"]
                     self.config |= {name: round(value) if self._whole else value for name, value in wanted.items()}
+                    if self._closes == "at once":
+                        return
+                elif self.config != before and self._closes == "when it is read":
+                    return
                 else:
                     answer["result"] = self.config
-                stream.write(b'{"type": "velocity", "vx": 0.1}\nno json\n' + json.dumps(answer).encode() + b"\n")
+                between = b'{"type": "velocity", "vx": 0.1}\n' + self._between
+                stream.write(between + b"\n" + json.dumps(answer).encode() + b"\n")
                 stream.flush()
 
     def ended(self) -> dict[str, float]:
@@ -233,6 +241,50 @@ def test_a_dvl_that_refuses_rounds_or_is_not_there_is_said(saved, capsys):
         refusing.address = address
         assert send(saved, refusing) == 2
         assert "is not HOST or HOST:PORT" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("address", ["a..b", ".local", "a" * 64, f"{'b' * 64}.local:16171", "\udcff", "ä" * 63])
+def test_a_host_that_is_no_name_is_said_in_one_line(saved, address, capsys):
+    dvl = WaterLinked(NOW)
+    dvl.address = address
+    assert send(saved, dvl) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("dvl-calib apply: --send ") and "is no name that a host can have" in error
+
+
+@pytest.mark.parametrize("between", [b"[" * 100_000, b'{"a":' * 20_000 + b"1" + b"}" * 20_000, b"9" * 5000, b"\xff"])
+def test_what_is_no_answer_is_passed_over(saved, between):
+    dvl = WaterLinked(NOW, between=between)
+    assert send(saved, dvl) == 0 and dvl.ended() != NOW
+
+
+@pytest.mark.parametrize("held", [10**400, None, True, "20", [[20.0]], math.nan, -math.inf], ids=lambda _: "")
+def test_a_setting_that_is_no_number_is_not_taken_for_one(saved, held, capsys):
+    dvl = WaterLinked({**NOW, "mounting_rotation_offset": held})
+    assert send(saved, dvl) == 2
+    assert "when the data were recorded" in capsys.readouterr().err
+    dvl.ended()
+
+
+def test_a_dvl_that_refuses_without_a_sentence_is_said(saved, capsys):
+    nested: list[object] = []
+    for _ in range(500):
+        nested = [nested]
+    for why, said in ((nested, "(no reason given)"), ("x" * 100_000, f"({'x' * 200})"), ("\x1b[2J", "(\\x1b[2J)")):
+        dvl = WaterLinked(NOW, refuses=True, why=why)
+        assert send(saved, dvl) == 2
+        assert said in capsys.readouterr().err and dvl.ended() == NOW
+
+
+@pytest.mark.parametrize("closes", ["at once", "when it is read"])
+def test_a_connection_that_ends_after_the_dvl_may_have_been_set_is_said(saved, closes, capsys):
+    dvl = WaterLinked(NOW, closes=closes)
+    assert send(saved, dvl) == 2
+    error, kept = capsys.readouterr().err, dvl.ended()
+    assert "the DVL may be set or not; give the same line again" in error and kept != NOW
+    again = WaterLinked(kept)  # which the same line then tells
+    assert send(saved, again) == 0 and again.ended() == kept
+    assert "is so already" in capsys.readouterr().out
 
 
 def test_a_dry_run_shows_what_files_would_change_and_changes_none(saved, tmp_path, capsys):
