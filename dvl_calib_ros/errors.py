@@ -21,4 +21,9 @@ def needing_ros(what: str) -> Iterator[None]:
 
 def printable(text: str) -> str:
     """Text for a terminal: control characters, which names in a bag may hold, shown as escapes."""
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def as_cell(value: object) -> object:
+    """Return a value for a spreadsheet's cell: a text that would be run as a formula is quoted, all else as it is."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@")) else value

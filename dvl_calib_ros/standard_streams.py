@@ -28,8 +28,18 @@ def open_streams() -> None:
 
 def say(line: str) -> None:
     """Print a line on standard error, if there is somebody to read it."""
+    from .errors import printable
+
     with suppress(OSError, ValueError):
-        print(line, file=sys.stderr, flush=True)
+        print(printable(line), file=sys.stderr, flush=True)
+
+
+def show(*lines: str) -> None:
+    """Print lines, each of which is one whatever is in it, on standard output."""
+    from .errors import printable
+
+    for line in lines:
+        print(printable(line))
 
 
 def give_up(stream: TextIO) -> None:

@@ -33,7 +33,7 @@ _DIAGNOSIS = ("diagnosis.model", "diagnosis.noise", "diagnosis.fit", "diagnosis.
 ROOMS: Mapping[str, tuple[str, ...]] = {
     "errors": (),
     "version": (),
-    "standard_streams": (),
+    "standard_streams": ("errors",),
     "parallel": ("errors",),
     "verdict": (),
     "calibration.numerics": (),

@@ -16,7 +16,7 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.results.mounting_quantities import Quantity, quantities
 from ..discovery.discovery import Discovery
-from ..errors import InputError
+from ..errors import InputError, printable
 from ..verdict.reasons import Reason
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Mounting:
             f"{name} {angle:.2f}° ± {std:.2f}°"
             for name, angle, std in zip(("roll", "pitch", "yaw"), self.rpy_deg, self.std_deg, strict=True)
         )
-        return f"{self.dvl_frame} in {self.base_frame}: {', '.join(angles)}"
+        return printable(f"{self.dvl_frame} in {self.base_frame}: {', '.join(angles)}")
 
     __repr__ = __str__
 

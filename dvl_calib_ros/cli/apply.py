@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..standard_streams import show
 from . import common
 
 if TYPE_CHECKING:
@@ -74,7 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     if arguments.rollback:
         for path, kept in roll_back(targets).items():
-            print(f"{path}: as before; what it was is now {kept.name}")
+            show(f"{path}: as before; what it was is now {kept.name}")
         return
     if arguments.result is None:
         raise InputError("name a result file, as ~/save and dvl-calib replay --save write them")
@@ -85,17 +86,16 @@ def run(arguments: argparse.Namespace) -> None:
         _set(calibrated, arguments)
         return
     applied = write_calibration(calibrated, targets, arguments.force, arguments.dry_run)
-    for note in applied.notes:
-        print(f"note: {note}")
+    show(*(f"note: {note}" for note in applied.notes))
     is_refused = calibrated.objections and not arguments.force
     refused = ["nothing to apply; --force shows and writes it anyway"]
     _show(calibrated, refused if is_refused else _mounting_lines(calibrated))
     if arguments.dry_run:
-        print(applied.changes or "nothing would change", end="" if applied.changes else "\n")
+        show(*(applied.changes.splitlines() or ["nothing would change"]))
         return
     for path in targets.paths:
         before = f"; the one before is {applied.kept[path].name}" if path in applied.kept else ""
-        print(f"{path}: written{before}" if path in applied.written else f"{path}: is so already")
+        show(f"{path}: written{before}" if path in applied.written else f"{path}: is so already")
 
 
 def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
@@ -116,11 +116,11 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
     _show(calibrated, _settings_lines(chosen))
     if arguments.settings and not arguments.dry_run:
         save_bytes(arguments.settings, chosen.text.encode())
-        print(f"{arguments.settings}: written")
+        show(f"{arguments.settings}: written")
     if arguments.send:
         is_so = configure(arguments.send, chosen.settings, arguments.dry_run)
         done = "would be set" if arguments.dry_run else "set, and read back"
-        print(f"{arguments.send}: {'is so already' if is_so else done}")
+        show(f"{arguments.send}: {'is so already' if is_so else done}")
 
 
 def _told_settings(words: Sequence[str]) -> dict[str, float]:
@@ -141,7 +141,7 @@ def _settings_lines(chosen: InstrumentSettings) -> list[str]:
     return [
         f"{chosen.instrument}, by: {chosen.document}",
         *(f"  {setting}" for setting in chosen.settings),
-        chosen.text.rstrip("\n"),
+        *chosen.text.splitlines(),
         *(f"note: {note}" for note in chosen.notes),
     ]
 
@@ -149,7 +149,6 @@ def _settings_lines(chosen: InstrumentSettings) -> list[str]:
 def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     import numpy as np
 
-    from ..errors import printable
     from ..files.mounting import POSITION_UNKNOWN, scale_advice
     from ..files.urdf import numbers
 
@@ -165,7 +164,7 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
         f"scale:  {scale_advice(calibrated)}",
     ]
     if calibrated.cause_of_scale is not None:
-        lines.append(f"water:  {printable(calibrated.cause_of_scale.sentence)}")
+        lines.append(f"water:  {calibrated.cause_of_scale.sentence}")
     if any(calibrated.lever_arm):
         found = "found" if calibrated.lever_arm_found else "as lever_arm says"
         lines.append(f"lever arm: {_metres(calibrated.lever_arm)} from the reference point, {found}")
@@ -186,9 +185,5 @@ def _metres(values: Sequence[float]) -> str:
 
 def _show(calibrated: CalibratedMounting, lines: Sequence[str]) -> None:
     """Lines as they are, after what is to be known of the calibration."""
-    from rich.markup import escape
-
     common.print_warnings([f"{calibrated.path}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
-    out = common.console()
-    for line in lines:
-        out.print(escape(line), soft_wrap=True)
+    show(*lines)

@@ -99,7 +99,7 @@ def _terminated_as_interrupted() -> Iterator[None]:
 def _run(argv: Sequence[str]) -> int:
     arguments = build_parser(argv).parse_args(argv)
     from ..calibration.models.parameter_spec import ParameterError
-    from ..errors import InputError, printable
+    from ..errors import InputError
 
     recordings = recordings_now(arguments)
     try:
@@ -108,7 +108,7 @@ def _run(argv: Sequence[str]) -> int:
         code = int(arguments.run(arguments) or 0)
         sys.stdout.flush()
         for sentence in changed(recordings, recordings_now(arguments)):
-            say(f"warning: {printable(sentence)}")
+            say(f"warning: {sentence}")
         return code
     except (InputError, ParameterError) as error:
         return _fail(arguments.command, str(error))
@@ -130,8 +130,6 @@ def _complete() -> NoReturn:
 
 
 def _fail(command: str, message: str) -> int:
-    from ..errors import printable
-
     try:
         sys.stdout.flush()  # what was printed before, which the interpreter could only complain of
     except OSError:
@@ -140,7 +138,7 @@ def _fail(command: str, message: str) -> int:
         os.getcwd()
     except OSError:
         message += "; the folder that this was started in is gone, change to another"
-    say(f"dvl-calib {command}: {printable(' '.join(message.splitlines()))}")
+    say(f"dvl-calib {command}: {' '.join(message.splitlines())}")
     return 2
 
 

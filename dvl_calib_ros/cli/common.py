@@ -84,12 +84,10 @@ def print_found(discovery: Discovery, bags: Sequence[Path]) -> None:
     """What was found in recordings, and where; on standard output, dim."""
     from rich.markup import escape
 
-    from ..errors import printable
-
     out = console()
     names = ", ".join(bag.name or str(bag) for bag in bags)
     for sentence in (f"{names}: {discovery.found[0]}", *discovery.found[1:]):
-        out.print(f"[dim]{escape(printable(sentence))}[/]")
+        out.print(f"[dim]{escape(sentence)}[/]")
 
 
 def add_storage_options(parser: argparse.ArgumentParser) -> None:
@@ -162,10 +160,15 @@ def check_outputs(
 
 
 def console(stderr: bool = False) -> Console:
-    """A rich console; plain text where the output is no terminal."""
+    """A rich console; plain text where the output is no terminal. What it prints as a string is one line."""
     from rich.console import Console as RichConsole
 
+    from ..errors import printable
+
     class Console(RichConsole):
+        def print(self, *objects: Any, **options: Any) -> None:
+            super().print(*(printable(each) if isinstance(each, str) else each for each in objects), **options)
+
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # main knows what to do; rich would exit with 1
 
@@ -181,12 +184,10 @@ def print_warnings(notes: Sequence[str]) -> None:
     """What the user should know, on standard error."""
     from rich.markup import escape
 
-    from ..errors import printable
-
     errors = console(stderr=True)
     try:
         for note in notes:
-            errors.print(f"[yellow]warning:[/] {escape(printable(note))}", soft_wrap=True)
+            errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
     except OSError:
         give_up(sys.stderr)  # who does not read warnings gets the result all the same
 
@@ -209,10 +210,13 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
     if not sys.stderr.isatty():
         yield lambda _: None
         return
+    from rich.markup import escape
     from rich.progress import Progress
 
+    from ..errors import printable
+
     with Progress(console=console(stderr=True), transient=True) as bar:
-        task = bar.add_task(what, total=1.0)
+        task = bar.add_task(escape(printable(what)), total=1.0)
         yield lambda share: bar.update(task, completed=share)
 
 

@@ -93,7 +93,8 @@ def _show_live(out: Any, bag: Path, speed: float) -> None:
 
     watcher = Watcher([bag], _truth())
     out.print(f"[bold]1. Live[/]: node and player are two processes, ROS domain {os.environ['ROS_DOMAIN_ID']}")
-    out.print(f"   playing {bag} at {speed:g} times real time, GNSS drops out on the way\n")
+    out.print(f"   playing {bag} at {speed:g} times real time, GNSS drops out on the way")
+    out.print()
     with Live(console=out, refresh_per_second=5, get_renderable=watcher.render, transient=False) as live:
         watcher.run(speed, switch_at_s=470.0, switch_to="M4", back_at_s=500.0)
         live.refresh()
@@ -129,7 +130,8 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     from ..present.error_terms import estimate_table
     from ..present.terminal import rich_table
 
-    out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`\n")
+    out.print("[bold]2. Offline[/]: the same bag through `dvl-calib replay`")
+    out.print()
     _, live = load_result(saved)
     found = estimate_table(offline, list(offline.estimates))
     truth = ("truth", *(f"{value:+.2f}" for value in _truth().values()))
@@ -153,7 +155,9 @@ def _show_diagnosis(out: Any, bag: Path) -> None:
     from ..calibration.models.parameters import Parameters
     from ..diagnosis.diagnose import diagnose
 
-    out.print("\n[bold]3. Diagnosis[/]: what a simulator would lack beside this bag, `dvl-calib diagnose`\n")
+    out.print()
+    out.print("[bold]3. Diagnosis[/]: what a simulator would lack beside this bag, `dvl-calib diagnose`")
+    out.print()
     diagnosis = diagnose([bag], Parameters(min_speed=0.0))
     out.print(f"[bold]{diagnosis.verdict.value}[/]: {diagnosis.sentence}", soft_wrap=True)
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..standard_streams import show
 from . import common
 
 
@@ -61,4 +62,4 @@ def run(arguments: argparse.Namespace) -> None:
     written = import_files(arguments.dvl, arguments.gnss, arguments.attitude, arguments.output, options)
     common.print_warnings([note for imported in written.values() for note in imported.notes])
     for path, (counts, _) in written.items():
-        print(f"{path}: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count))
+        show(f"{path}: " + ", ".join(f"{count} {name}" for name, count in counts.items() if count))

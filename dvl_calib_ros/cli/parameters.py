@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..standard_streams import show
+
 # Tables of what is said, by their names in `verdict.reasons`.
 _TABLES = {
     "findings": "every warning with its meaning and remedy",
@@ -46,31 +48,33 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.effects:
         from ..effects.registry import effect_table
 
-        print(effect_table(), end="")
+        show(*effect_table().splitlines())
         return
     if arguments.drivers:
         from ..messages.drivers import driver_table
 
-        print(driver_table(), end="")
+        show(*driver_table().splitlines())
         return
     if arguments.commands:
-        print(command_table(), end="")
+        show(*command_table().splitlines())
         return
     if asked := next((name for name in _TABLES if getattr(arguments, name)), None):
         from ..verdict.reasons import TABLES, table
 
-        print(table(TABLES[asked]), end="")
+        show(*table(TABLES[asked]).splitlines())
         return
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters
         from ..files.urdf import read_urdf
 
-        print(urdf_parameters(read_urdf(arguments.urdf), arguments.base_frame, "dvl_link", arguments.joint), end="")
+        show(
+            *urdf_parameters(read_urdf(arguments.urdf), arguments.base_frame, "dvl_link", arguments.joint).splitlines()
+        )
         return
     from ..files.parameter_files import model_table, parameter_file_text, parameter_table
 
     make = parameter_file_text if arguments.yaml else model_table if arguments.models else parameter_table
-    print(make(), end="")
+    show(*make().splitlines())
 
 
 def command_table() -> str:

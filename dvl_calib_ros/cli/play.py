@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..standard_streams import say
+from ..standard_streams import say, show
 from . import common
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> None:
                 total += sum(player.play(arguments.rate, on_time, start, duration, has_ended).values())
                 if not arguments.loop:
                     break
-        print(f"published {total} messages of {len(targets)} topics")
+        show(f"published {total} messages of {len(targets)} topics")
 
 
 def _wait_for_subscribers(player: BagPlayer, has_ended: Callable[[], bool]) -> None:

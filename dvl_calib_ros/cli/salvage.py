@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..standard_streams import show
 from . import common
 
 
@@ -19,7 +20,6 @@ def run(arguments: argparse.Namespace) -> None:
     """Read everything, write it, say what was lost."""
     from ..bags.recover import recover
     from ..bags.writer import Compression, Storage
-    from ..errors import printable
 
     common.check_outputs(arguments, folders=["output"])
     storage, compression = Storage(arguments.storage), Compression(arguments.compression)
@@ -27,5 +27,5 @@ def run(arguments: argparse.Namespace) -> None:
         recovered = recover(arguments.bags, arguments.output, storage, compression, on_progress)
     common.print_warnings(recovered.notes)
     for topic, count in recovered.counts.items():
-        print(printable(f"{topic}: {count} messages"))
-    print(f"{arguments.output}: {sum(recovered.counts.values())} messages")
+        show(f"{topic}: {count} messages")
+    show(f"{arguments.output}: {sum(recovered.counts.values())} messages")

@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..standard_streams import show
 from . import common
 
 if TYPE_CHECKING:
@@ -145,7 +146,7 @@ def run(arguments: argparse.Namespace) -> None:
         return
     storage, compression = Storage(arguments.storage), Compression(arguments.compression)
     write_bag(scenario, arguments.output, storage, compression, with_truth=arguments.truth)
-    print(f"wrote {arguments.output}")
+    show(f"wrote {arguments.output}")
 
 
 # Options that say of the DVL what a diagnosis says
@@ -274,4 +275,4 @@ def run_live(arguments: argparse.Namespace, scenario: Scenario) -> None:
         outputs = Outputs(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic, arguments.dvl_type)
         ros_args = ["--ros-args", *arguments.ros_args] if arguments.ros_args else []
         sent = run_until(ending, scenario, outputs, ros_args, arguments.follow, arguments.speed, arguments.wait)
-        print(f"published {sent} messages")
+        show(f"published {sent} messages")

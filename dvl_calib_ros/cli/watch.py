@@ -330,4 +330,4 @@ def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], 
         what = (status.get("model"), status.get("convergence"), str(status.level))
         if what != said or now_s - said_s > LINE_S:
             said, said_s = what, now_s
-            yield printable(line(status))
+            yield line(status)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.numerics.frames import Array
+from ..errors import as_cell
 from .convergence import curves_document
 from .protocol import MANOEUVRING
 from .results import Coverage, EachStudy, Evaluation
@@ -62,7 +63,7 @@ def evaluation_csv(evaluation: Evaluation) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(CSV_COLUMNS)
-    writer.writerows(_csv_rows(evaluation))
+    writer.writerows(map(as_cell, row) for row in _csv_rows(evaluation))
     return text.getvalue()
 
 

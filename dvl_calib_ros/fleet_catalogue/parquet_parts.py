@@ -18,7 +18,7 @@ from typing import Any
 
 from ..disk.atomic import check_folder_writable, save_bytes
 from ..disk.text_files import read_file
-from ..errors import InputError
+from ..errors import InputError, as_cell
 from .recording_entry import Entry, Row
 
 # What is set aside lies in a folder of its own: readers take every file of rows/
@@ -161,6 +161,7 @@ class Catalogue:
     def _save(self, part: CataloguePart, rows: list[Row]) -> None:
         from pyarrow import parquet
 
+        rows = [{name: as_cell(value) for name, value in row.items()} for row in rows]
         told = {_KEY: json.dumps(vars(part)), _CHECKSUM_KEY: _CHECKSUM + _ZEROS}
         table = self._arrow.Table.from_pylist(rows, schema=self._schema.with_metadata(told))
         sink = self._arrow.BufferOutputStream()

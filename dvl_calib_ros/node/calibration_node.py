@@ -37,7 +37,7 @@ from ..calibration.streams.position_velocities import check_model
 from ..discovery.gravity import believed_heading
 from ..discovery.transforms import Frames, not_default, placement
 from ..disk.atomic import check_writable
-from ..errors import InputError
+from ..errors import InputError, printable
 from ..files.output_paths import check_outputs
 from ..files.parameter_files import NODE_NAME
 from ..files.result_file import (
@@ -185,7 +185,7 @@ class CalibrationNode(AnsweringNode):
         discovery, parameters = found
         self._found = [finding("TOPICS_FOUND", own=self._inputs["dvl/twist"].topic_name, found=discovery.found[0])]
         for sentence in discovery.found[1:]:
-            self.get_logger().info(sentence)
+            self.get_logger().info(printable(sentence))
         self._warn(str(self._found[0]))
         for doubt in discovery.doubts:
             self._warn(doubt)
@@ -245,7 +245,9 @@ class CalibrationNode(AnsweringNode):
         if parameters.replace(**found.values) == parameters.replace(**place):  # which nothing was learnt with
             self._calibrator.set_parameters(parameters.replace(**place))
             return
-        self.get_logger().info(f"{found.said}; the calibration begins with it (use_transforms: false does without)")
+        self.get_logger().info(
+            f"{printable(found.said)}; the calibration begins with it (use_transforms: false does without)"
+        )
         self._begin_anew(parameters.replace(**found.values))
 
     def _begin_anew(self, parameters: Parameters, feed: MessageFeed | None = None) -> None:
@@ -260,7 +262,7 @@ class CalibrationNode(AnsweringNode):
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def _warn(self, sentence: str) -> None:
-        self.get_logger().warning(sentence)
+        self.get_logger().warning(printable(sentence))
 
     def _log_configuration(self) -> None:
         default = Parameters().as_dict()

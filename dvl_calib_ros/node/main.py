@@ -102,10 +102,9 @@ def parameter_files(args: Sequence[str]) -> list[Path]:
 
 
 def _refused(error: Exception | str) -> int:
-    from ..errors import printable
     from ..standard_streams import say
 
-    say(f"calibration_node: {printable(' '.join(str(error).split()))}")
+    say(f"calibration_node: {' '.join(str(error).split())}")
     return 2
 
 

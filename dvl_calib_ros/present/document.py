@@ -2,17 +2,19 @@
 
 What a result says is laid out once, by the module of this room that is called as the result is. Terminal
 (`terminal.py`), page (`page.py`) and data frame (`Table.frame`) are made of that; JSON is the result's own plain data.
+Names in it are of recordings, files and instruments: each text is made `printable` as it is put into a document.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import Enum
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ..errors import printable
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
 
@@ -39,8 +41,27 @@ class Where(Enum):
     PAGE = "page"
 
 
+class _Printable:
+    """A part of a document, with texts that neither steer a terminal nor turn a line around."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):  # type: ignore[arg-type]  # those who inherit are dataclasses
+            object.__setattr__(self, each.name, _printable(getattr(self, each.name)))
+
+
+def _printable(value: Any) -> Any:
+    """Return a value with every text in it, also in lists, mappings and reasons, made printable."""
+    if type(value) is str:
+        return printable(value)
+    if type(value) in (list, tuple):
+        return type(value)(map(_printable, value))
+    if isinstance(value, Mapping):
+        return {_printable(name): _printable(each) for name, each in value.items()}
+    return replace(value, numbers=_printable(value.numbers)) if isinstance(value, Reason) else value
+
+
 @dataclass(frozen=True)
-class Cell:
+class Cell(_Printable):
     """Text of a table. kind: a class of the style sheet, such as good, off, far, bad.
 
     below: small, on a second line.
@@ -52,7 +73,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Table:
+class Table(_Printable):
     """Rows of cells under a head; the first column names the row.
 
     Parameters
@@ -136,7 +157,7 @@ def columns_for(keys: Mapping[str, Key], cell: Callable[[T, Key], str | Cell]) -
 
 
 @dataclass(frozen=True)
-class Sentence:
+class Sentence(_Printable):
     """A sentence. soft: less than the others."""
 
     text: str
@@ -144,7 +165,7 @@ class Sentence:
 
 
 @dataclass(frozen=True)
-class Figures:
+class Figures(_Printable):
     """Pictures, which only a page has drawn: by a function of a module of this room, from what it is given.
 
     title, alt, caption: of the one picture whose figure the function draws; none where it makes pictures itself.
@@ -191,14 +212,14 @@ def figure(function: str, title: str, alt: str, *given: Any, caption: str = "") 
 
 
 @dataclass(frozen=True)
-class FindingLine:
+class FindingLine(_Printable):
     """Something that was found, with its remedy."""
 
     reason: Reason
 
 
 @dataclass(frozen=True)
-class Commands:
+class Commands(_Printable):
     """What to type, or to paste: a line each, with what it is called. on_page: further ones, for a page alone."""
 
     lines: Sequence[tuple[str, str]]
@@ -206,7 +227,7 @@ class Commands:
 
 
 @dataclass(frozen=True)
-class Facts:
+class Facts(_Printable):
     """Short texts by name; an empty one is left out."""
 
     facts: Mapping[str, str]
@@ -218,7 +239,7 @@ def facts_by(facts: Mapping[str, Callable[[T], str]], of: T) -> Facts:
 
 
 @dataclass(frozen=True)
-class Number:
+class Number(_Printable):
     """A quantity that was found, in its unit. std: its σ. nominal: as configured. note: what is to be known of it.
 
     is_shown: whether the data show it.
@@ -249,7 +270,7 @@ class Numbers:
 
 
 @dataclass(frozen=True)
-class Worth:
+class Worth(_Printable):
     """Drift of dead reckoning, m per km, without and with what was found: the largest on a page."""
 
     before: str
@@ -284,7 +305,7 @@ Item = (
 
 
 @dataclass(frozen=True)
-class Section:
+class Section(_Printable):
     """What stands under one heading."""
 
     title: str
@@ -298,7 +319,7 @@ def section(title: str, *items: Item | None, where: Where = Where.BOTH) -> Secti
 
 
 @dataclass(frozen=True)
-class Answer:
+class Answer(_Printable):
     """What a result says first: a word, how good or bad that is, and sentences. advice: what to do."""
 
     word: str
@@ -308,7 +329,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Document:
+class Document(_Printable):
     """A result as it is said.
 
     warnings: what to know beside it. sections: in order; those without items are left out. parameters: what it was made

@@ -11,7 +11,6 @@ from rich.table import Column
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from ..errors import printable
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
 from .document import Cell, Commands, Document, Facts, FindingLine, Map, Numbers, Sentence, Table, Where
@@ -134,7 +133,7 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
         yield from _found(document.lead)
     answer = document.answer
     if answer is not None:
-        sentences = list(map(printable, answer.sentences))
+        sentences = list(answer.sentences)
         if answer.advice:  # what to do and why, as one
             sentences = [" ".join([answer.advice, *sentences])]
         yield Text.assemble((answer.word, f"bold {COLOURS[answer.severity]}"), ": ", sentences[0])
@@ -145,19 +144,19 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
         if section.title or not isinstance(section.items[0], Sentence):
             yield ""
         if section.title:
-            yield Text(printable(section.title), "bold")
+            yield Text(section.title, "bold")
         for item in section.items:
             if isinstance(item, Table):
                 yield rich_table(item)
             elif isinstance(item, Sentence):
-                yield Text(printable(item.text), "dim" if item.soft else "")
+                yield Text(item.text, "dim" if item.soft else "")
             elif isinstance(item, FindingLine):
                 yield from _found(item.reason)
             elif isinstance(item, Commands):
                 for name, line in item.lines:  # to be copied: never broken
                     yield Text(f"{name:5} {line}", no_wrap=True)
             elif isinstance(item, Facts):
-                yield from (Text(printable(f"{name}: {value}")) for name, value in item.facts.items() if value)
+                yield from (Text(f"{name}: {value}") for name, value in item.facts.items() if value)
             elif isinstance(item, Numbers):
                 yield rich_table(item.table)
             elif isinstance(item, Map) and width is not None:
@@ -168,8 +167,8 @@ def _found(reason: Reason) -> Iterator[Padding]:
     from rich.padding import Padding
     from rich.text import Text
 
-    yield Padding(Text(printable(reason.says), COLOURS[reason.severity]), (0, 0, 0, 2))
-    yield Padding(Text.assemble(printable(reason.remedy), " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
+    yield Padding(Text(reason.says, COLOURS[reason.severity]), (0, 0, 0, 2))
+    yield Padding(Text.assemble(reason.remedy, " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
 
 
 def rich_table(table: Table) -> Folding:
@@ -178,10 +177,10 @@ def rich_table(table: Table) -> Folding:
 
     made = RichTable(
         show_header=any(_cell(name).plain for name in table.head),
-        title=table.title or None,
+        title=Text(table.title, "table.title") if table.title else None,
         title_justify="left",
         box=box.SIMPLE_HEAD,
-        caption=" ".join(table.notes) or None,
+        caption=Text(" ".join(table.notes), "table.caption") if table.notes else None,
         caption_justify="left",
     )
     for index, name in enumerate(table.head):
@@ -196,6 +195,6 @@ def _cell(cell: str | Cell) -> Text:
     from rich.text import Text
 
     if isinstance(cell, str):
-        return Text(printable(cell))
-    text = Text(printable(cell.text), _STYLES.get(cell.kind.removeprefix("bar "), ""))
-    return text.append(f" {printable(cell.below)}", "dim") if cell.below else text
+        return Text(cell)
+    text = Text(cell.text, _STYLES.get(cell.kind.removeprefix("bar "), ""))
+    return text.append(f" {cell.below}", "dim") if cell.below else text
