@@ -8,6 +8,7 @@ from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterType
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from ..calibration.models.parameter_spec import ParameterSpec
 from ..calibration.models.parameters import SCHEMA, Parameters
@@ -43,8 +44,8 @@ def declare_parameters(node: Node, files: Sequence[Path] = ()) -> Parameters:
     """Declare every parameter, with the values given at the start. Raises ParameterError and InputError.
 
     The node must have declared its overrides by itself; so names that do not exist are seen (ROS 2 would ignore
-    them), and whole numbers are taken where a double is meant. files: the parameter files that the node was started
-    with; what they set for all nodes alike, and is no parameter of ours, is another's.
+    them), and whole numbers are taken where a double is meant, here and later. files: the parameter files that the
+    node was started with; what they set for all nodes alike, and is no parameter of ours, is another's.
     """
     others: set[str] = set()
     for path in files:
@@ -60,4 +61,18 @@ def declare_parameters(node: Node, files: Sequence[Path] = ()) -> Parameters:
     parameters = Parameters.from_mapping({name: value for name, value in given.items() if name not in others})
     for name, spec in SCHEMA.items():
         node.declare_parameter(name, parameters.as_dict()[name], descriptor(spec), ignore_override=True)
+    node.add_pre_set_parameters_callback(_as_declared)
     return parameters
+
+
+def _as_declared(parameters: Sequence[Parameter]) -> list[Parameter]:
+    """Return parameters that are to be set with doubles for whole numbers, which ROS 2 would refuse by their type."""
+    found = []
+    for each in parameters:
+        kind = SCHEMA[each.name].kind if each.name in SCHEMA else ""
+        if kind == "double" and each.type_ is Parameter.Type.INTEGER:
+            each = Parameter(each.name, Parameter.Type.DOUBLE, float(each.value))
+        elif kind == "double_array" and each.type_ is Parameter.Type.INTEGER_ARRAY:
+            each = Parameter(each.name, Parameter.Type.DOUBLE_ARRAY, [*map(float, each.value)])
+        found.append(each)
+    return found

@@ -322,6 +322,28 @@ def test_whole_numbers_are_accepted_for_doubles_at_the_start(world):
         assert list(node.get_parameter("lever_arm").value) == [1.0, 0.0, 2.0]
 
 
+def test_whole_numbers_are_accepted_for_doubles_in_a_file_and_live(world, tmp_path):
+    """By ``NAME: 5`` in a file and ``ros2 param set NAME 5`` it is an integer."""
+    file = tmp_path / "whole.yaml"
+    file.write_text("/**: {ros__parameters: {min_speed: 1, lever_arm: [1, 0, -2], result_backups: 7}}")
+    with node_here(world, [file], cli_args=["--ros-args", "--params-file", str(file)]) as node:
+        started = node._calibrator.parameters
+        assert (started.min_speed, started.lever_arm, started.result_backups) == (1.0, (1.0, 0.0, -2.0), 7.0)
+        numbers = [name for name, spec in SCHEMA.items() if spec.kind == "double" and not spec.read_only]
+        assert "result_backups" in numbers
+        for name in numbers:
+            value = next((n for n in (5, 1, 0) if SCHEMA[name].low <= n <= SCHEMA[name].high), None)
+            if value is None:  # its range holds no whole number
+                continue
+            answer = world.set_parameter(name, value)
+            assert answer.successful, answer.reason
+            kept = world.parameter(name), getattr(node._calibrator.parameters, name)
+            assert kept == (value, value) and {type(each) for each in kept} == {float}
+        assert not world.set_parameter("result_backups", 101).successful
+        assert not world.set_parameter("result_backups", True).successful
+        assert "read-only" in world.set_parameter("min_speed", 2).reason
+
+
 def test_services_reset_and_save_answer_in_words(world, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with node_here(world) as node:
