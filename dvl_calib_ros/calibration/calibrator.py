@@ -183,7 +183,8 @@ class Calibrator:
 
     def _restart(self, back_s: float) -> None:
         self.restarts += 1
-        self._on_event(f"DVL stamps went back by {back_s:.1f} s: the calibration starts anew")
+        how = f"back by {back_s:.1f} s" if back_s > 0.0 else f"ahead by {-back_s / 86_400.0:.0f} days"
+        self._on_event(f"DVL stamps went {how}: the calibration starts anew")
         self._on_restart()
         self._start()
 

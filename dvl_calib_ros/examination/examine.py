@@ -15,7 +15,7 @@ from ..bag_replay.replay import Replayed
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import FRD, FROM_MESSAGE, Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
-from ..calibration.numerics.samples import VelocityFrame
+from ..calibration.numerics.samples import Stream, VelocityFrame
 from ..calibration.registration.frame_hypotheses import FITS
 from ..calibration.results.mounting_quantities import Quantity, quantities
 from ..calibration.results.results import Estimate
@@ -223,8 +223,9 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     dvl, reference, imu = streams["dvl"], streams.get("reference"), streams.get("imu")
     over_legs = reference is not None and _is_compared_over_legs(reference)
     found: list[Reason] = []
-    for topic in streams.values():
-        found += topic_checks.stamp_findings(topic) + topic_checks.gap_findings(topic)
+    for role, topic in streams.items():
+        found += topic_checks.stamp_findings(topic, Stream(role), discovery.parameters)
+        found += topic_checks.gap_findings(topic)
     # where velocities and turns show how the clocks stand, it does not matter when messages arrived
     if not _has_error(found) and not _are_clocks_known(discovery):
         found += topic_checks.clock_findings(streams, discovery.parameters)

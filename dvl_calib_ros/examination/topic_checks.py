@@ -6,10 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..calibration.checks.data_warnings import STREAMS
 from ..calibration.models.parameters import SCHEMA, Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import Stream
 from ..calibration.registration.clock_domains import arrival_offset
+from ..calibration.streams.stream_order import strays
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Recorded
 from ..verdict.reasons import Reason, finding
@@ -44,8 +46,8 @@ def interval_s(topic: Recorded) -> float:
     return float(np.median(np.diff(topic.log_ns))) * 1e-9 if len(topic) > 1 else 0.0
 
 
-def stamp_findings(topic: Recorded) -> list[Reason]:
-    """Too few messages, zero stamps, stamps of reception, stamps that go back, jump or repeat."""
+def stamp_findings(topic: Recorded, stream: Stream, parameters: Parameters) -> list[Reason]:
+    """Too few messages, zero stamps, stamps of reception, stamps that stray, go back, jump or repeat."""
     if len(topic) < ENOUGH:
         return [finding("DOCTOR_TOO_FEW", topic=topic.topic, count=len(topic))]
     found = []
@@ -55,12 +57,17 @@ def stamp_findings(topic: Recorded) -> list[Reason]:
     stamps, log = topic.stamps_ns[~zero], topic.log_ns[~zero]
     if len(stamps) < ENOUGH:
         return found
+    stray = strays(stamps, round(parameters.max_time_jump * SECOND_NS))
+    if stray.any():  # which a calibration leaves out
+        found.append(finding("STAMP_STRAY", count=int(stray.sum()), stream=STREAMS[stream.value]))
+        stamps, log = stamps[~stray], log[~stray]
     steps, log_steps = np.diff(stamps) * 1e-9, np.diff(log) * 1e-9
     back = steps < 0.0
     if back.any():
         seconds = float(-steps[back].min())
         found.append(finding("DOCTOR_STAMP_BACK", topic=topic.topic, count=int(back.sum()), seconds=seconds))
-    ahead = steps - log_steps
+    comes_back = strays(stamps, round(SET_CLOCK * SECOND_NS))
+    ahead = np.where(comes_back[1:] | comes_back[:-1], 0.0, steps - log_steps)
     if ahead.max() > SET_CLOCK:
         found.append(finding("DOCTOR_STAMP_JUMP", topic=topic.topic, seconds=float(ahead.max())))
     repeated = float((steps == 0.0).mean())

@@ -30,6 +30,7 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
     notes = (note.sentence for note in discovery.notes)
     said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"What the motion shows of the DVL (median speed {examined.speed_mps:.2f} m/s)"
+    also = "else " if lead or examined.notes else ""
     nothing = "Without a reference only pitch shows, and yaw on opposite headings."
     return Document(
         title="What is in a recording",
@@ -39,7 +40,7 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
         sections=[
             Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *said]),
             Section(
-                f"Findings: {len(found)}" if found else f"Nothing {'else ' if lead else ''}wrong was found",
+                f"Findings: {len(found)}" if found else f"Nothing {also}wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
             ),
             Section(

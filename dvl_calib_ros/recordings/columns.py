@@ -18,7 +18,7 @@ from ..bags.channels import Channel, Decoder, DecodingError
 from ..bags.columns import MessageColumns, Part
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
-from ..calibration.numerics.samples import Codes, Covariances, Index, Stamps
+from ..calibration.numerics.samples import Codes, Covariances, Index, Mask, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES, VelocityType
 
@@ -83,6 +83,10 @@ _DTYPES: Mapping[str, Any] = {
 }  # fmt: skip
 
 
+# Bytes up to the end of a header's stamp: those that say how a message is encoded, seconds and nanoseconds.
+STAMP_END = 12
+
+
 @dataclass(frozen=True)
 class Singles:
     """M messages that are decoded one by one, in their order of arrival.
@@ -117,6 +121,44 @@ class Singles:
             except DecodingError as error:
                 yield arrival, log_ns, None, str(error)
 
+    def part(self, at: Index) -> Singles:
+        """Return the rows of indices."""
+        starts = np.concatenate([[0], self.end[:-1]])[at]
+        lengths = self.end[at] - starts
+        end = np.cumsum(lengths)
+        content = self.content[np.repeat(starts - (end - lengths), lengths) + np.arange(int(lengths.sum()))]
+        return replace(
+            self, arrival=self.arrival[at], log_ns=self.log_ns[at], channel=self.channel[at], end=end, content=content
+        )
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """(M,) of the headers, 0 where there is none or a message cannot be decoded."""
+        stamps_ns = np.zeros(len(self), dtype=np.int64)
+        for number, channel in enumerate(self.channels):
+            own = np.flatnonzero(self.channel == number)
+            kind = VELOCITY_TYPES.get(channel.msgtype)
+            if kind is not None and kind.adapted is not None:  # a message without header
+                stamps_ns[own] = [_stamp_or_none(message) for _, _, message, _ in self.messages(own)]
+            else:
+                stamps_ns[own] = self._header_stamps_ns(own)
+        return stamps_ns
+
+    def _header_stamps_ns(self, at: Index) -> Stamps:
+        """Return the stamps of messages that begin with a header, which is all that is read of them (CDR)."""
+        starts = np.where(at > 0, self.end[at - 1], 0)
+        whole = self.end[at] - starts >= STAMP_END
+        head = self.content[np.where(whole, starts, 0)[:, None] + np.arange(STAMP_END if whole.any() else 0)]
+        stamps_ns = np.zeros(len(at), dtype=np.int64)
+        for order, of_order in (("<", head[:, 1:2] % 2 == 1), (">", head[:, 1:2] % 2 == 0)):
+            own = whole & of_order.any(axis=1)
+            seconds, nanoseconds = (
+                np.ascontiguousarray(head[own, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
+                for first, kind in ((STAMP_END - 8, "i"), (STAMP_END - 4, "u"))
+            )
+            stamps_ns[own] = seconds * 1_000_000_000 + nanoseconds
+        return stamps_ns
+
 
 @dataclass(frozen=True)
 class TopicColumns:
@@ -138,6 +180,22 @@ class TopicColumns:
         arrival = np.concatenate([self.laid.arrival, self.singles.arrival])
         order = np.argsort(arrival, kind="stable")
         return arrival[order], np.concatenate([self.laid.log_ns, self.singles.log_ns])[order]
+
+    @property
+    def stamps_ns(self) -> Stamps:
+        """Stamps of all messages in the order of `arrivals`; the log time where there is none."""
+        _, log_ns = self.arrivals
+        stamps_ns: Stamps = self.laid.stamps_ns
+        if len(self.singles):
+            order = np.argsort(np.concatenate([self.laid.arrival, self.singles.arrival]), kind="stable")
+            stamps_ns = np.concatenate([stamps_ns, self.singles.stamps_ns])[order]
+        return stamps_ns if stamps_ns.all() else np.where(stamps_ns == 0, log_ns, stamps_ns)
+
+    def part(self, kept: Mask) -> TopicColumns:
+        """Return the messages of a mask (N,), in the order of `arrivals`."""
+        arrival = self.arrivals[0][kept]
+        laid, singles = (np.flatnonzero(np.isin(each.arrival, arrival)) for each in (self.laid, self.singles))
+        return replace(self, laid=self.laid.part(laid), singles=self.singles.part(singles))
 
     def arriving(self, renumbered: Callable[[Stamps], Stamps]) -> TopicColumns:
         """The same, at other places among all that was read."""
@@ -246,7 +304,7 @@ class Collector:
             channels=tuple(self._channels), decoder=self._decoder,
         )  # fmt: skip
         if (singles.arrival[1:] < singles.arrival[:-1]).any():
-            singles = _in_order(singles)
+            singles = singles.part(np.argsort(singles.arrival, kind="stable"))
         return TopicColumns(self._topic, self._msgtype, laid, singles)
 
 
@@ -294,17 +352,8 @@ def _broken(kind: VelocityType, columns: MessageColumns, parameters: Parameters)
     return broken
 
 
-def _in_order(singles: Singles) -> Singles:
-    """Messages of several channels in turn, by arrival."""
-    order = np.argsort(singles.arrival, kind="stable")
-    starts = np.concatenate([[0], singles.end[:-1]])[order]
-    lengths = singles.end[order] - starts
-    end = np.cumsum(lengths)
-    at = np.repeat(starts - (end - lengths), lengths) + np.arange(len(singles.content))
-    return replace(
-        singles, arrival=singles.arrival[order], log_ns=singles.log_ns[order], channel=singles.channel[order], end=end,
-        content=singles.content[at],
-    )  # fmt: skip
+def _stamp_or_none(message: Any) -> int:
+    return 0 if message is None else stamp_ns(message.header.stamp)
 
 
 def stamped(message: Any, log_ns: int) -> int:

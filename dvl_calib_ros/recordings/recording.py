@@ -28,6 +28,7 @@ from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, VELOCITY_TYPES
 from ..messages.type_recognition import recognised
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from .columns import Collector, TopicColumns, is_kept
+from .far_stamps import without_far
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, recorded
 from .topic_preview import Survey, look_of
@@ -321,14 +322,17 @@ def _read(
                 elif message is not None:
                     descriptions.append(message.data)
         on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
+    columns = {topic: collector.columns() for topic, collector in collectors.items()}
+    kept, file_spans_ns, aside = without_far(columns, bag.file_spans_ns)
+    counts.subtract({topic: len(columns[topic]) - len(own) for topic, own in kept.items()})
     return Recording(
         (path,),
         types,
         {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types},
         counts,
-        tuple(bag.file_spans_ns),
-        tuple(bag.notes),
-        {topic: (collector.columns(),) for topic, collector in collectors.items()},
+        file_spans_ns,
+        (*bag.notes, *map(str, aside)),
+        {topic: (own,) for topic, own in kept.items()},
         tuple(transforms),
         tuple(dict.fromkeys(descriptions)),
         waters=tuple(reading for each in waters.values() for reading in each.readings()),

@@ -65,8 +65,9 @@ FINDINGS = (
     ),
     Kind(
         "CLOCK_WENT_BACK",
-        "DVL stamps went back and the calibration started anew",
-        "A clock was set back, or a bag looped. What was learnt before is gone.",
+        "DVL stamps jumped and the calibration started anew",
+        "A clock was set back, a bag looped, or the first stamp alone was more than a week early. What was learnt "
+        "before is gone.",
         "set clocks before the node is started",
     ),
     Kind(
@@ -80,6 +81,13 @@ FINDINGS = (
         "{count} messages had no header stamp, the time at which they were recorded is used",
         "As STAMP_MISSING, counted over a whole bag.",
         "let the driver fill header.stamp",
+    ),
+    Kind(
+        "STAMPS_FAR",
+        "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, absurdly far from the others",
+        "A computer without a clock battery that began in 1970, or a broken stamp. Set aside is what is more than a "
+        "year away, and of less than a tenth of a topic's messages what is more than a week away.",
+        "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording",
     ),
     Kind(
         "STAMP_STRAY",

@@ -28,7 +28,7 @@ SAID_FROM_M, SAID_FROM_S = 0.05, 0.05
 # So many losses of GNSS are flapping.
 FLAPPING = 3
 
-_STREAMS = {"dvl": "DVL", "reference": "GNSS", "imu": "IMU"}
+STREAMS = {"dvl": "DVL", "reference": "GNSS", "imu": "IMU"}
 _MESSAGE_FAULTS = {
     "invalid": "SAMPLES_INVALID",
     "duplicate": "STAMP_REPEATED",
@@ -43,7 +43,7 @@ def message_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     """What is wrong with messages of each stream that were not used; from `Calibrator.counts`."""
     return [
         finding(code, count=counts[stream][fault], stream=name)
-        for stream, name in _STREAMS.items()
+        for stream, name in STREAMS.items()
         for fault, code in _MESSAGE_FAULTS.items()
         if counts[stream].get(fault)
     ]

@@ -160,6 +160,10 @@ class AttitudeRates:
 
 def _spans(times: Array) -> Index:
     """Numbers of the first and the last sample (2, S) of spans of about SPAN_S, of times (M > 1,) s."""
-    wanted = np.searchsorted(times, np.arange(times[0], times[-1] + SPAN_S, SPAN_S)).clip(max=len(times) - 1)
-    at = wanted[np.flatnonzero(np.diff(wanted, prepend=-1))]
+    # those that are the first after a multiple of SPAN_S, in the arithmetic of np.arange, without its room for pauses
+    start, step = times[0], (times[0] + SPAN_S) - times[0]
+    number = np.floor((times - start) / step)
+    number += start + (number + 1.0) * step <= times
+    number -= start + number * step > times
+    at = np.unique(np.append(np.flatnonzero(np.diff(number, prepend=-1.0)), len(times) - 1))
     return np.stack([at[:-1], at[1:]])

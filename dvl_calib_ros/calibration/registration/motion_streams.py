@@ -31,6 +31,7 @@ from ..streams.interpolation import (
 from ..streams.outliers import without_spikes
 from ..streams.position_velocities import are_positions, of_moments
 from ..streams.screening import measured_axes, screen_columns, unit_quaternions
+from ..streams.stream_order import strays
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,8 @@ class MotionStreams:
 
 def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     """What samples say, each stream's clock corrected as the parameters have it; None where two have too little."""
+    jump_ns = round(parameters.max_time_jump * 1e9)
+    streams = Streams(*(block.part(~strays(block.stamps_ns, jump_ns)) for block in streams))
     dvl, reference = (_valid(block, parameters) for block in (streams.dvl, streams.reference))
     imu = ImuAlignment(parameters).block(streams.imu.part(streams.imu.refused == 0))
     if len(dvl) < 2 or len(reference) < 2:
@@ -145,6 +148,8 @@ def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
 
 # Curves are smoothed on a grid of this step, s, and of a long recording of so many times; of so many at once.
 GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
+# So long before and after the DVL turn rates are of use, s: no clock is searched for as far away.
+TURNS_BEYOND_S = 3600.0
 # Attitudes and rates further apart than this tell nothing between, s.
 GAP_S = 2.0
 
@@ -170,8 +175,11 @@ class Curves:
         self._velocity = np.concatenate([np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]]) for fit in fits])
         self._found = np.concatenate([fit.found for fit in fits])
         self._turns, self._turns_start = np.zeros((2, 3)), 0.0
-        if len(motion.turns.times) > 1:
-            grid = np.arange(motion.turns.times[0], motion.turns.times[-1] + self._step, self._step)
+        # only where there is a DVL as well: else the grid would be as long as the IMU's stamps are apart
+        own = motion.turns.times
+        own = own[(own >= times[0] - TURNS_BEYOND_S) & (own <= times[-1] + TURNS_BEYOND_S)]
+        if len(own) > 1:
+            grid = np.arange(own[0], own[-1] + self._step, self._step)
             self._turns_start = float(grid[0])
             rates = [angular_velocity_at(motion.turns, grid[at], GAP_S)[0] for at in _parts(len(grid))]
             self._turns = np.nan_to_num(np.concatenate(rates))

@@ -6,6 +6,7 @@ and what it finds there would be believed.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
-from ..streams.interpolation import attitude_at
+from ..streams.interpolation import attitude_at, shortened
 from .delay_search import HOLE_S, LONGEST_S
 from .motion_streams import MotionStreams
 
@@ -23,6 +24,8 @@ from .motion_streams import MotionStreams
 BELIEVED = 0.25
 # Time step of the series, s; and the share of the shorter one that must overlap, and so many seconds of it
 STEP_S, OVERLAP, FEWEST_S = 0.5, 0.4, 60.0
+# Series last a day, or so many steps for each sample: else memory would grow with pauses, s and 1
+LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE = 86_400.0, 16
 # Steps of the running median that takes spikes out of a speed
 SPIKE_STEPS = 9
 # Slower, a course says nothing of the heading
@@ -51,6 +54,7 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Unregist
 
     rotation_dvl_from_body: (3, 3), the nominal mounting.
     """
+    motion = _without_long_pauses(motion)
     dvl_times, velocity = motion.dvl
     body = velocity @ rotation_dvl_from_body
     reference_times, reference = motion.reference_times, motion.reference
@@ -75,6 +79,24 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Unregist
     moving = ((np.abs(course) > MOVING_MPS**2) & covered(reference_times, at)).astype(float)
     late, is_far = lag(_unit(ahead), motion.imu.times[0], _unit(course), at[0], moving)
     return UnregistrableClocks("the IMU's", "those of DVL and reference", late) if is_far else None
+
+
+def _without_long_pauses(motion: MotionStreams) -> MotionStreams:
+    """Return a motion whose streams last no longer than their samples are worth, pauses that they share cut alike."""
+    streams = motion.dvl.times, motion.reference_times, motion.imu.times
+    every = np.unique(np.concatenate(streams))
+    most = max(LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE * STEP_S * len(every))
+    if not len(every) or max(own[-1] - own[0] for own in streams if len(own)) <= most:
+        return motion
+    gaps = np.diff(every)
+    # what lies between one clock and another is what is looked for
+    is_pause = np.any([(own[0] <= every[:-1]) & (own[-1] >= every[1:]) for own in streams if len(own)], axis=0)
+    gaps[is_pause] = shortened(gaps[is_pause], most)
+    moved = every[0] + np.append(0.0, np.cumsum(gaps))
+    dvl, reference, imu = (np.interp(own, every, moved) for own in streams)
+    return replace(
+        motion, dvl=motion.dvl._replace(times=dvl), reference_times=reference, imu=motion.imu._replace(times=imu)
+    )
 
 
 def _unit(series: Series) -> Series:

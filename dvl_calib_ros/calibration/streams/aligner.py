@@ -125,17 +125,17 @@ class Aligner(LiveAlignment):
             unmeasured = valid.reference_unmeasured[at]
             values, axes = valid.reference_values[at], self.parameters.gnss_axes
             self.reference.append(chunk.reference_ns, values, reference.frames[at], unmeasured, late, axes)
-            self.orders[Stream.REFERENCE].last_ns = int(chunk.reference_ns[-1])
+            self.orders[Stream.REFERENCE].follow(chunk.reference_ns)
         if len(chunk.imu_ns):
             late = chunk.imu_ns < late_before_ns[events.imu_at]
             self._append_imu(len(chunk.imu_ns), chunk.imu_ns, valid.imu_values[chunk.imu_at], late)
-            self.orders[Stream.IMU].last_ns = int(chunk.imu_ns[-1])
+            self.orders[Stream.IMU].follow(chunk.imu_ns)
         if len(chunk.dvl_ns):
             if self._first_stamp_ns is None:
                 self._first_stamp_ns = int(dvl.stamps_ns[valid.dvl][0])
             at, late = chunk.dvl_at, chunk.dvl_ns < late_before_ns[events.dvl_at]
             self._append_rows(chunk.dvl_ns, self._n_messages + at, dvl.values[at], valid.dvl_covariance[at], late)
-            self.orders[Stream.DVL].last_ns = int(chunk.dvl_ns[-1])
+            self.orders[Stream.DVL].follow(chunk.dvl_ns)
 
 
 def align(

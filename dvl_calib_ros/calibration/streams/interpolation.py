@@ -103,6 +103,16 @@ class TurnRates(NamedTuple):
         return TurnRates(np.concatenate(times), np.concatenate(rates), np.concatenate(variance), Parts.of(times))
 
 
+def shortened(pauses: Array, most: float) -> Array:
+    """Return pauses (N,), the longest of them cut to one length so that all together last `most` at most."""
+    if pauses.sum() <= most:
+        return pauses
+    in_order = np.sort(pauses)
+    before = np.cumsum(in_order) - in_order
+    cut = (most - before) / np.arange(len(pauses), 0, -1)
+    return np.minimum(pauses, cut[np.argmax(in_order > cut)])
+
+
 def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
     """Means of times (N,) s and columns (N, ...) over bins of BIN_S, of those bins that hold any;
     as they are if they come no faster than FASTER_THAN_S."""

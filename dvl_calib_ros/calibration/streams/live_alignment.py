@@ -49,8 +49,9 @@ class LiveAlignment:
     reference, imu: their samples of late. dropouts: of the DVL. lag_ns: by how much (in stamps) one stream may lag
     another, a wrong clock included. day_rows, day_starts_ns: numbers and stamps of rows that a new day begins with.
     tally: by stream and for pairing, see `Calibrator.counts`. on_restart: told by how much (s) the DVL's stamps went
-    back when all is to start anew; everything here has then been forgotten. before_clearing: called before the past of
-    a track is forgotten whose stamps went back, so that who needs it takes it then, whatever stretch it came in.
+    back (ahead: negative) when all is to start anew; everything here has then been forgotten. before_clearing: called
+    before the past of a track is forgotten whose stamps went back, so that who needs it takes it then, whatever stretch
+    it came in.
     """
 
     def __init__(
@@ -290,7 +291,7 @@ class LiveAlignment:
             tally[order.value] += 1
 
     def _restart(self, stamp_ns: int) -> None:
-        """DVL stamps went back: a bag loops, or the clock was set. Start anew with this sample."""
+        """Start anew with this sample: DVL stamps went back (a bag loops, a clock was set), or the first was stray."""
         back_s = ((self.last_ns or stamp_ns) - stamp_ns) * 1e-9
         self.tally["dvl"] = Counter(received=2)  # the two samples that showed it
         for name in ("reference", "imu", "pairing"):

@@ -32,6 +32,10 @@ LONGEST_NS = 600_000_000_000
 MOST_KEPT = 240_000
 
 
+# Stamps further apart belong to different segments of time: no recording is longer without a break.
+SEGMENT_GAP_NS = 7 * 86_400 * SECOND_NS
+
+
 class Stamped(Protocol):
     """Anything with a header stamp."""
 
@@ -67,12 +71,16 @@ class Sequencer(Generic[S]):
 
     One wrong stamp must not poison the timeline, and a real jump (a dropout, a clock set, a bag that loops) must not
     stop it. So a sample more than `max_jump_ns` away is held until the next sample confirms it (a gap or, back in
-    time, a restart) or contradicts it (the held one was stray and is dropped).
+    time, a restart) or contradicts it (the held one was stray and is dropped). Nothing confirms the very first sample:
+    if the next ones are more than `SEGMENT_GAP_NS` ahead, that is a restart as well.
+
+    is_alone: whether there was one sample so far.
     """
 
     def __init__(self, max_jump_ns: int) -> None:
         self._max_jump_ns = max_jump_ns
         self.last_ns: int | None = None
+        self.is_alone = False
         self.held: S | None = None
         self.stray = 0
 
@@ -82,27 +90,37 @@ class Sequencer(Generic[S]):
         if last is None or self.held is not None or not last < stamp_ns <= last + self._max_jump_ns:
             return False
         self.last_ns = stamp_ns
+        self.is_alone = False
         return True
+
+    def follow(self, stamps_ns: Stamps) -> None:
+        """Take note of a column of stamps (N > 0,) that `admit_columns` let through."""
+        self.is_alone = self.last_ns is None and len(stamps_ns) == 1
+        self.last_ns = int(stamps_ns[-1])
 
     def admit(self, sample: S) -> tuple[Order, tuple[S, ...]]:
         """What the sample is, and the samples that may now go on (the held one before it, once confirmed)."""
         stamp, last = sample.stamp_ns, self.last_ns
         if last is None:
             self.last_ns = stamp
+            self.is_alone = True
             return Order.NEXT, (sample,)
         if -self._max_jump_ns <= stamp - last <= self._max_jump_ns:
             self._drop_held()
             if stamp > last:
                 self.last_ns = stamp
+                self.is_alone = False
                 return Order.NEXT, (sample,)
             return (Order.DUPLICATE if stamp == last else Order.OUT_OF_ORDER), ()
         held = self.held
         if held is not None and 0 <= stamp - held.stamp_ns <= self._max_jump_ns:
             if stamp == held.stamp_ns:
                 return Order.DUPLICATE, ()
-            order = Order.CONFIRMED_GAP if held.stamp_ns > last else Order.CONFIRMED_RESTART
+            is_gap = last < held.stamp_ns and not (self.is_alone and held.stamp_ns - last > SEGMENT_GAP_NS)
+            order = Order.CONFIRMED_GAP if is_gap else Order.CONFIRMED_RESTART
             self.held = None
             self.last_ns = stamp
+            self.is_alone = False
             return order, (held, sample)
         self._drop_held()
         self.held = sample
@@ -129,6 +147,16 @@ class Sequencer(Generic[S]):
         rows = step > 0
         duplicate = int(np.count_nonzero(step == 0))
         return Admitted(rows, duplicate, len(step) - int(np.count_nonzero(rows)) - duplicate)
+
+
+def strays(stamps_ns: Stamps, max_jump_ns: int) -> Mask:
+    """Return which stamps (N,) are far from both neighbours on the same side, where these are near each other."""
+    stray = np.zeros(len(stamps_ns), dtype=bool)
+    if len(stamps_ns) > 2:
+        before, after = stamps_ns[1:-1] - stamps_ns[:-2], stamps_ns[2:] - stamps_ns[1:-1]
+        far = (np.abs(before) > max_jump_ns) & (np.abs(after) > max_jump_ns) & (np.sign(before) != np.sign(after))
+        stray[1:-1] = far & (np.abs(stamps_ns[2:] - stamps_ns[:-2]) <= max_jump_ns)
+    return stray
 
 
 class Bracket(NamedTuple):

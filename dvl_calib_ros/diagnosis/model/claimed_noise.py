@@ -68,7 +68,8 @@ def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: N
     inverse = np.linalg.pinv(np.einsum("mac,mad->cd", x, x))
     slopes = inverse @ np.einsum("mac,ma->c", x, y)
     scores = np.einsum("mac,ma->mc", x, y - x @ slopes)
-    sums = np.stack([np.bincount(stretch, column) for column in scores.T], axis=1)
+    _, number = np.unique(stretch, return_inverse=True)  # of a pause there are none
+    sums = np.stack([np.bincount(number, column) for column in scores.T], axis=1)
     n = len(sums)
     covariance = inverse @ (sums.T @ sums) @ inverse * n / max(n - len(slopes) - 1, 1)
     return Claims(tuple(names), 0.5 * slopes, 0.5 * np.sqrt(np.maximum(np.diag(covariance), 1e-300)))

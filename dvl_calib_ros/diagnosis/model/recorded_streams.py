@@ -20,6 +20,7 @@ from ...calibration.registration.registration import Registration
 from ...calibration.streams.clock_correction import Clocks
 from ...calibration.streams.position_velocities import NOISY_MPS
 from ...calibration.streams.screening import SMALLEST_VARIANCE
+from ...calibration.streams.stream_order import strays
 from ...effects.base import EffectNeeds
 from ...errors import InputError
 from ...messages.decode import MessageDecoder
@@ -468,12 +469,7 @@ def _in_order(block: SampleBlock, parameters: Parameters, notes: list[str]) -> S
     """Rows of the longest stretch without a restart, in strictly increasing order of stamps."""
     stamps = block.stamps_ns
     jump_ns = round(parameters.max_time_jump * SECOND_NS)
-    stray = np.zeros(len(stamps), dtype=bool)
-    if len(stamps) > 2:
-        before, after = stamps[1:-1] - stamps[:-2], stamps[2:] - stamps[1:-1]
-        far = (np.abs(before) > jump_ns) & (np.abs(after) > jump_ns) & (np.sign(before) != np.sign(after))
-        stray[1:-1] = far & (np.abs(stamps[2:] - stamps[:-2]) <= jump_ns)
-    kept = np.flatnonzero(~stray)
+    kept = np.flatnonzero(~strays(stamps, jump_ns))
     parts = np.split(kept, np.flatnonzero(np.diff(stamps[kept]) < -jump_ns) + 1)
     longest = max(parts, key=len)
     if len(parts) > 1:

@@ -16,6 +16,8 @@ from .recorded_streams import RecordedStreams
 from .settings import SETTINGS
 from .stream_curve import FAST_ENOUGH_S
 
+# A longer silence (s) is a pause, which makes no bin wider
+PAUSE_S = 60.0
 # Passes in which an effect is undone that acts on the very motion it changes: it is small against that motion
 PASSES = 3
 # Seconds between the times of a motion that a filter follows as it was, where it is looked at more seldom than
@@ -103,7 +105,8 @@ def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
     by_dvl = float(np.linalg.norm(recording.dvl.roughness)) > float(np.linalg.norm(recording.reference.roughness))
     base, clock = (recording.dvl, ActsOn.DVL_CLOCK) if by_dvl else (recording.reference, ActsOn.REFERENCE_CLOCK)
     base_late = offsets.dvl if by_dvl else offsets.reference
-    seconds = max(base.time[-1] - base.time[0], base.interval)
+    steps = np.diff(base.time)
+    seconds = max(base.time[-1] - base.time[0] - steps[steps > PAUSE_S].sum(), base.interval)
     width = max(settings.bins_per_interval * base.interval, settings.shortest_bin, seconds / settings.max_bins)
     per_bin = max(2, round(width / base.interval))
     streams = (recording.dvl, offsets.dvl), (recording.reference, offsets.reference)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ...calibration.numerics.distributions import chi2_isf, chi2_logsf
 from ...calibration.numerics.frames import Array
+from ...calibration.streams.interpolation import shortened
 from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
 from ..fit.cross_validation import stretch_of
@@ -31,6 +32,8 @@ from .alternative_regressors import ALTERNATIVES, dictionary
 LEVEL = 0.001
 # Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has
 SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
+# The series whose spectrum is taken has so many steps for each bin at most: memory must not grow with pauses
+STEPS_OF_A_BIN = 16
 # Standard deviations that were taken off an outlier
 OUTLYING = 5.0
 # Made-up recordings that tell what is chance, and degrees of freedom of the belief that this is as it should be
@@ -253,7 +256,13 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
     for index, recording in enumerate(problem.recordings):
         at = problem.recording_of == index
         step = SHORTEST_PERIOD_S / 5.0
-        position = ((problem.time[at] - problem.time[at][0]) / step).astype(int)
+        time = problem.time
+        steps = np.diff(time[at])
+        shorter = shortened(steps, STEPS_OF_A_BIN * step * np.count_nonzero(at))
+        if shorter is not steps:
+            time = time.copy()
+            time[at] = time[at][0] + np.append(0.0, np.cumsum(shorter))
+        position = ((time[at] - time[at][0]) / step).astype(int)
         sums = np.stack([np.bincount(position, series) for series in innovations[at].T])
         n = 2 * sums.shape[1]  # twice as fine as independent frequencies are
         frequency = np.fft.rfftfreq(n, step)
@@ -264,7 +273,7 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
         log_p = np.vstack([chi2_logsf(power, 2), chi2_logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, inside]
         best = int(np.argmin(log_p.min(axis=0)))
         period = 1.0 / float(frequency[inside][best])
-        phase = 2.0 * np.pi * problem.time / period
+        phase = 2.0 * np.pi * time / period
         waves = np.where(at[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
         found.append(SpectralLine(period, float(log_p.min() + np.log(log_p.size)), waves))
     return found

@@ -18,11 +18,19 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import Stream
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS
-from dvl_calib_ros.recordings import columns
+from dvl_calib_ros.recordings import columns, far_stamps
 from dvl_calib_ros.recordings import sample_columns as kept_streams
 from dvl_calib_ros.recordings.recording import open_recording
 
 TOPICS = {"dvl/twist": Stream.DVL, "gnss/twist": Stream.REFERENCE, "imu/data": Stream.IMU}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def nothing_is_set_aside():
+    """Stamps are any here; what is set aside for them is tested in test_far_stamps.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(far_stamps, "SEGMENT_GAP_NS", 2**64)
+        yield
 
 
 def plain(decoded):
