@@ -353,8 +353,7 @@ class Calibrator:
     def _forget_rows(self) -> None:
         """Give up the rows that all have had."""
         rows = self._aligner.rows
-        done = min(self._n_selected, *(group.next_row for group in self._groups))
-        done = min(done, self._further.n_taken)
+        done = min(self._n_selected, self._further.n_taken, *(group.next_row for group in self._groups))
         done = done if self._headings.shown else min(done, self._n_headings)
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
@@ -362,10 +361,7 @@ class Calibrator:
             rows.forget_before(done - rows.base)
 
     def finish(self) -> None:
-        """No samples come any more: update all models with what is decided, and tell on_rows of the rest.
-
-        That may still wait for partners.
-        """
+        """Update all models with what is decided at the end, and tell on_rows of the rest, which may still wait."""
         for each in self._further:
             each.finish()
         for group in self._groups:
@@ -466,10 +462,8 @@ class Calibrator:
     def states_at(
         self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps
     ) -> tuple[GaussianState, Counts, Array]:
-        """One model after E rows of a trace, with their stamps (E,).
-
-        Returns states x (E, n), P (E, n, n), samples used (E,), and the sum of νᵀS⁻¹ν over them (E,).
-        """
+        """Return states x (E, n), P (E, n, n), samples used (E,) and their sum of νᵀS⁻¹ν (E,) of one model after E rows
+        of a trace, with their stamps (E,)."""
         return self._estimators[name].states_at(trace, numbers, stamps_ns)
 
     def estimate(self, name: str | None = None) -> Estimate:
@@ -483,8 +477,7 @@ class Calibrator:
         return self._judge.verification(name, judge.moments)
 
     def navigation(self, name: str) -> Navigation | None:
-        """What one model's calibration is worth to dead reckoning, on data that it had not seen; for one made
-        ``verified``. None without reference, or with hardly any motion."""
+        """Return the drift of dead reckoning on unseen data, None without motion or reference; for ``verified``."""
         return self._judge.navigation(name, self.heading_deviation)
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
@@ -537,6 +530,11 @@ class Calibrator:
         known = {each.code for each in verification.reasons}
         against = [each for each in doubts if each.severity is not Severity.WARNING and each.code not in known]
         return {self.selected: verification.with_objections(against)}
+
+    @property
+    def verdict_so_far(self) -> Severity:
+        """Verdict on the selected model's calibration, by what the worker looked at a little ago."""
+        return self._judge.so_far(self.selected, fresh=False).verdict
 
     def doubts(self, *, fresh: bool) -> list[Reason]:
         """What the data say against the calibration, as bad as that is to a verdict; of one with a worker.

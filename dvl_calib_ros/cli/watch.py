@@ -167,20 +167,21 @@ def rendered(status: Status | None, now_s: float, log: Sequence[str] = (), said:
     if status.level:
         lines.append(Text(printable(status.message), style=colour))
     lines += [text("   ".join(_stream(status, *each) for each in STREAMS)), text("")]
-    is_usable = status.get("usable") != "no"
-    lines.append(text("mounting now") if is_usable else text("mounting: not to be used, see above", colour))
+    is_usable, code = status.get("usable") != "no", status.get("next code")
+    unusable = "see above" if code == "NEXT_REJECTED" else "the data do not show it yet"
+    lines.append(text("mounting now") if is_usable else text(f"mounting: not to be used, {unusable}", colour))
     lines += [text("  ".join(_quantity(status, *each) for each in row), "" if is_usable else "dim") for row in MOUNTING]
     if is_usable and (sound := status.values.get("speed of sound", "")):
         lines.append(text(f"speed of sound  {sound}"))
     lines.append(text(""))
     lines += [_goal(status, *each) for each in GOALS if f"goal {each[0]} [%]" in status.values]
     lines.append(text(_rose(status)))
-    if is_usable:
+    if is_usable or not ("REJECTED" in code or "GOOD" in code):
         if taken_back := status.values.get("taken back", ""):
             lines.append(text(taken_back, "yellow"))
         seconds = status.get("seconds")
         about = "" if seconds == "-" else f", about {_duration(seconds)} until good enough"
-        style = "bold green" if "GOOD" in status.get("next code") else "bold"
+        style = "bold green" if "GOOD" in code else "bold"
         lines.append(text(f"next: {status.get('next')}{about}", style))
     lines += [text(""), text(f"{KEYS}   {said}".rstrip(), "dim")]
     return Group(*lines, *tail)

@@ -18,12 +18,14 @@ from ..calibration.checks.data_warnings import (
     reference_warnings,
 )
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale
+from ..calibration.filters.observability import Convergence
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
 from ..calibration.registration.clock_domains import arrival_offset
 from ..calibration.results.results import Estimate, scale_and_delay
+from ..calibration.streams.aligner import whereabouts
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
@@ -151,6 +153,7 @@ def diagnose(
         found.append(finding("CONFIGURATION_WRONG", says=says))
     doubts = calibrator.doubts_so_far
     rejected = bool(says) or any(each.severity is Severity.REJECT for each in doubts)
+    verdict = Severity.REJECT if rejected else calibrator.verdict_so_far
     # what a replay rejects is an error here
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
@@ -162,10 +165,11 @@ def diagnose(
         "gnss": selection.gnss.reason.sentence,
         "gnss available": str(int(selection.gnss.available)),
         "convergence": estimate.convergence.value,
-        "usable": "no" if rejected else "yes",
+        "verdict": verdict.value,
+        "usable": "no" if verdict is Severity.REJECT or estimate.convergence is Convergence.COLLECTING else "yes",
         **_estimate_values(estimate),
         **_beside_the_pose(estimate, calibrator.parameters),
-        **_count_values(estimate, counts),
+        **_count_values(calibrator, estimate, counts),
         "dvl longest dropout [s]": f"{1e-9 * calibrator.longest_dropout_ns:.1f}",
         **_cause_values(cause_of_scale(MODELS[estimate.model], estimate.of_recording, calibrator.parameters, water)),
         **({} if card is None else card.values(calibrator, estimate, counts, now_s, rejected)),
@@ -240,8 +244,11 @@ def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
     }
 
 
-def _count_values(estimate: Estimate, counts: Counts) -> dict[str, str]:
-    values = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}
+def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) -> dict[str, str]:
+    values, model = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}, MODELS[estimate.model]
+    if not model.from_positions:  # which are no samples of the DVL
+        where = whereabouts(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
+        values |= {f"samples {name}": str(count) for name, count in where.items()}
     for stream, tally in counts.items():
         for name, count in tally.items():
             values[f"{stream} {name}"] = str(count)

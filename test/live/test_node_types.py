@@ -22,9 +22,10 @@ from test_node import PATIENT, as_arguments, assert_agree, diagnosed, node_here,
 
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models import WITH_POSITIONS
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.samples import DvlSample
+from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.drivers import POSE_TYPE, VELOCITY_TYPES
@@ -34,6 +35,8 @@ from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
 from dvl_calib_ros.node.message_types import message_class
 from validation.positions import Truth, driven
+
+WHEREABOUTS = ("refused", "unusable", "unpaired", "waiting", "gathered", "used", "gated")
 
 
 @pytest.mark.parametrize(
@@ -153,6 +156,32 @@ def test_a_dvl_that_sends_nothing_but_refused_messages_is_silent_and_what_is_wro
     assert "no usable DVL message for 7 s" in status.message
     assert "8 DVL messages are not used: beam_velocities_valid is false" in status.message
     assert {item.key: item.value for item in status.values}["dvl flagged_invalid"] == "8"
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_is_usable_follows_the_verdict(turned):
+    """Of two DVLs on one topic, of which one is turned by 180°, no angle is known; of two that agree one is."""
+    calibrator, silence, recent = Calibrator(Parameters(), worker=AtOnce()), Silence(0.0, {}), RecentCounts()
+    take = {DvlSample: calibrator.feed_dvl, ReferenceSample: calibrator.feed_reference, ImuSample: calibrator.feed_imu}
+    said, at_s = [], 0.0
+    for sample in run(91.0):
+        take[type(sample)](sample)
+        if not isinstance(sample, DvlSample):
+            continue
+        x, y, z = sample.velocity
+        second = sample._replace(
+            stamp_ns=sample.stamp_ns + 20_000_000, velocity=(-x, -y, z) if turned else sample.velocity
+        )
+        calibrator.feed_dvl(second)
+        at_s += 0.2
+        if round(at_s * 5) % 150 == 1:
+            status = diagnose(calibrator, VELOCITY_TYPES[TWIST], [], silence, recent, at_s)
+            values = {each.key: each.value for each in status.values}
+            said.append(values["usable"])
+            assert values["usable"] == "no" or values["verdict"] != "reject"
+            received = sum(int(values[f"samples {name}"]) for name in WHEREABOUTS)
+            assert received == int(values["dvl received"])
+    assert said == (["no"] * 4 if turned else ["no", "yes", "yes", "yes"])
 
 
 def test_a_package_or_class_that_is_not_there_is_named_with_the_remedy():

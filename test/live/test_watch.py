@@ -72,6 +72,8 @@ def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_
     assert "not to be used" not in drawn(status(2, "no DVL message for 7 s"), 100.0)
     wrong = drawn(status(2, "the data contradict the configuration", usable="no", **GOOD), 100.0)
     assert "not to be used" in wrong and "good enough: save" not in wrong
+    early = drawn(status(usable="no"), 100.0)
+    assert "not to be used, the data do not show it yet" in early and "next: drive straight" in early
 
 
 def test_the_speed_of_sound_is_said_in_a_line_where_the_water_is_known():

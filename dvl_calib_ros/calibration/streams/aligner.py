@@ -18,6 +18,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from ..models import Needs
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.samples import AlignedBlock, Stream, Streams
@@ -186,3 +187,40 @@ def counted(
     counts["calibration"] = {"restarts": restarts}
     counts["calibration"] |= {f"{name} restarted": number for name, number in restarted.items() if number}
     return counts
+
+
+def whereabouts(
+    counts: Mapping[str, Mapping[str, int]], needs: Needs, given: int, used: int, gated: int
+) -> dict[str, int]:
+    """Return for one model where each DVL sample that was received is; they add up to ``received`` at any time.
+
+    refused: no sample, or not in order. unusable: slow, frozen or turning. unpaired: without the reference or attitude
+    that the model needs. waiting: for the sample that confirms its stamp, or for its partners. gathered: given to the
+    model, which has not used it yet, or for its prior alone. used, gated: by the model.
+
+    Parameters
+    ----------
+    counts
+        As of `counted`.
+    needs
+        What the model needs of a sample.
+    given
+        How many samples the model was given.
+    used, gated
+        How many of them it used and gated.
+    """
+    dvl, pairing = counts["dvl"], counts["pairing"]
+    unusable, unpaired, waiting = dvl["accepted"] - dvl["usable"] - dvl["awaiting_imu"], 0, 0
+    if needs is Needs.REFERENCE:  # rows are paired whether they are usable or not
+        unusable, unpaired, waiting = pairing["paired"] - given, pairing["unpaired"], pairing["awaiting_reference"]
+    elif needs is Needs.ATTITUDE:
+        unpaired, waiting = pairing["not_oriented"], pairing["awaiting_attitude"]
+    return {
+        "refused": dvl["received"] - dvl["accepted"] - dvl["held"],
+        "unusable": unusable,
+        "unpaired": unpaired,
+        "waiting": dvl["held"] + dvl["awaiting_imu"] + waiting,
+        "gathered": given - used - gated,
+        "used": used,
+        "gated": gated,
+    }

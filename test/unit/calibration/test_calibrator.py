@@ -19,6 +19,7 @@ from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
 from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
 from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.streams.aligner import whereabouts
 
 PHI, SCALE = (2e-5, -3e-5, 4e-5), 3e-5
 EXACT = MatchedRun(phi=PHI, scale=SCALE)
@@ -424,6 +425,50 @@ def check_sums(calibrator: Calibrator):
         if not model.aided:
             assert given_to == given[model.needs]
     assert dvl["usable"] == sum(pairing[key] for key in ("oriented", "not_oriented", "awaiting_attitude"))
+
+
+@searched(20)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([1, 50]))
+def test_at_any_time_each_dvl_sample_that_came_is_in_one_place(seed, block_size):
+    source, restarted = random.Random(seed), []
+    calibrator = Calibrator(
+        Parameters(max_turn_rate=source.choice([0.0, 0.5]), lever_arm=source.choice([(0.0,) * 3, (1.0, 0.0, 0.0)])),
+        block_size=block_size,
+        on_restart=lambda: restarted.append(True),
+    )
+    at, sent, steps = START_NS, 0, [SECOND // 5] * 12 + [0, -SECOND, 3 * SECOND, 10**12, -(10**12)]
+
+    def where(name: str) -> dict[str, int]:
+        estimate = calibrator.estimate(name)
+        given = calibrator.n_given(name)
+        return whereabouts(calibrator.counts, MODELS[name].needs, given, estimate.used, estimate.gated)
+
+    for _ in range(400):
+        at += source.choice(steps)
+        velocity = (source.choice([1.5, 1.5, 1.2, 0.0, float("nan")]), source.choice([0.1, 0.0, 2.0]), 0.0)
+        kind, restarted[:] = source.randrange(7), []
+        if kind == 0:
+            calibrator.refuse("dvl", "wrong_frame")
+        elif kind < 4:
+            calibrator.feed_dvl(DvlSample(at, velocity))
+        elif kind < 6:
+            frame = source.choice([VelocityFrame.BODY, VelocityFrame.BODY, VelocityFrame.ENU])
+            calibrator.feed_reference(ReferenceSample(at, velocity, None, frame))
+        else:
+            calibrator.feed_imu(ImuSample(at, (0.0, 0.0, 0.0, 1.0), source.choice([None, (0.0, 0.0, 0.1)])))
+        sent += kind < 4
+        sent = 2 if restarted else sent  # the two that showed it
+        for name in source.sample(BY_VELOCITY, 2):
+            found = where(name)
+            assert sum(found.values()) == sent and min(found.values()) >= 0
+    # what can still come has come: nothing waits but for a sample that confirms the last one's stamp
+    for step in range(1, 30):
+        calibrator.feed_dvl(DvlSample(at + step * SECOND, (1.5 + 0.01 * step, 0.0, 0.0)))
+        calibrator.feed_reference(ReferenceSample(at + step * SECOND, (1.5, 0.0, 0.0)))
+        calibrator.feed_imu(ImuSample(at + step * SECOND, (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1)))
+    for name in ("M1", "M3", "M7", "A1", "F1"):
+        found = where(name)
+        assert found["gathered"] == 0 and found["waiting"] <= 1, (name, found)
 
 
 # ---------------------------------------------------------------- restarts
