@@ -1,0 +1,125 @@
+"""Doctor, replay and diagnose on recordings with absurd stamps: as on sound ones, in as little memory."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from io_fixtures import TOPICS, write_bag
+
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
+from dvl_calib_ros.simulation.sensors import DvlErrors
+
+S, DAY = 10**9, 86_400 * 10**9
+IN_1970, IN_2038 = 5 * S, 2_145_916_800 * S
+# All address space that the three commands may take, in one process: they take a quarter of a GiB without any stray
+# stamp, most of it libraries, and a single stamp thirty days off took 0.7 GiB more.
+MOST_BYTES = 900 << 20
+COMMANDS = """
+import json, resource, sys
+resource.setrlimit(resource.RLIMIT_DATA, (int(sys.argv[2]),) * 2)
+from dvl_calib_ros.cli.main import main
+for command in ("doctor", "replay", "diagnose"):
+    print(f"== {command}", flush=True)
+    code = main([command, sys.argv[1], "--json", f"{sys.argv[1]}.{command}.json"])
+    sys.stdout.flush()
+    assert code == 0, (command, code)
+"""
+Change = Callable[[str, int, int, int, int], tuple[int, int]]
+"""Topic, log time, stamp, number of the message on its topic and how many there are -> log time and stamp."""
+
+
+def one(topic: str, place: float, stamp: Callable[[int], int]) -> Change:
+    """One stamp of a topic is another. place: of its message, as a share of them all."""
+    return lambda of, log, own, i, n: (log, stamp(own) if of == topic and i == round(place * (n - 1)) else own)
+
+
+def without_clock_battery(_: str, log: int, own: int, i: int, n: int) -> tuple[int, int]:
+    back = START_NS - IN_1970 if log < START_NS + 20 * S else 0
+    return log - back, own - back
+
+
+CASES: dict[str, tuple[Change, dict[str, int]]] = {
+    "first 20 s in 1970": (without_clock_battery, {"dvl/twist": 100, "gnss/twist": 100, "imu/data": 200}),
+    "first DVL message in 1970": (one("dvl/twist", 0.0, lambda _: IN_1970), {"dvl/twist": 1}),
+    "first IMU message in 1970": (one("imu/data", 0.0, lambda _: IN_1970), {"imu/data": 1}),
+    "DVL in 2038 in the middle": (one("dvl/twist", 0.5, lambda _: IN_2038), {"dvl/twist": 1}),
+    "IMU in 2038 in the middle": (one("imu/data", 0.5, lambda _: IN_2038), {"imu/data": 1}),
+    "DVL in 2038 at the end": (one("dvl/twist", 1.0, lambda _: IN_2038), {"dvl/twist": 1}),
+    "a span of a year": (one("dvl/twist", 0.0, lambda own: own - 365 * DAY), {"dvl/twist": 1}),
+    "a span of 30 days": (one("gnss/twist", 0.0, lambda own: own - 30 * DAY), {"gnss/twist": 1}),
+    "DVL an hour ahead in the middle": (one("dvl/twist", 0.5, lambda own: own + 3600 * S), {}),
+}
+
+
+@pytest.fixture(scope="module")
+def messages(tmp_path_factory) -> list[tuple[str, int, Any]]:
+    """Topic, log time and message of a sound recording."""
+    errors = DvlErrors((0.02, -0.03, 0.05), (0.004,) * 3, beam_std=0.01)
+    samples = simulate(Scenario(seconds=120.0, errors=errors, imu_rate=10.0))
+    path = tmp_path_factory.mktemp("far") / "sound"
+    write_bag(path, sorted([*samples.imu, *samples.gnss, *samples.dvl], key=lambda sample: sample.stamp_ns))
+    with BagReader([path]) as bag:
+        return [(topic, log_ns, message) for topic, log_ns, message, _ in bag.messages(TOPICS)]
+
+
+def changed(path: Path, messages: list[tuple[str, int, Any]], change: Change) -> Path:
+    count = {topic: sum(of == topic for of, _, _ in messages) for topic in TOPICS}
+    number = dict.fromkeys(TOPICS, 0)
+    rows = []
+    for topic, log_ns, message in messages:
+        stamp = message.header.stamp
+        own = stamp.sec, stamp.nanosec
+        log_ns, at = change(topic, log_ns, own[0] * S + own[1], number[topic], count[topic])
+        number[topic] += 1
+        rows.append((log_ns, at, topic, message, own))
+    with BagWriter(path) as bag:
+        for log_ns, at, topic, message, own in sorted(rows, key=lambda row: row[0]):
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(at, S)
+            bag.message(topic, TOPICS[topic], log_ns, message)
+            message.header.stamp.sec, message.header.stamp.nanosec = own
+    return path
+
+
+def answers(bag: Path) -> tuple[dict[str, Any], tuple[str, str]]:
+    """What the commands answer, in little memory: by command, and what they print on either stream, without spaces."""
+    done = subprocess.run(
+        [sys.executable, "-c", COMMANDS, str(bag), str(MOST_BYTES)], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr[-1000:]
+    found = {name: json.loads(Path(f"{bag}.{name}.json").read_text()) for name in ("doctor", "replay", "diagnose")}
+    return found, ("".join(done.stdout.split()), "".join(done.stderr.split()))
+
+
+def verdicts(found: dict[str, Any]) -> tuple[str, str, str]:
+    replayed = found["replay"]
+    model = replayed["selected"][-1]["model"]
+    return found["doctor"]["verdict"], replayed["verification"][model]["verdict"], found["diagnose"]["verdict"]
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory, messages) -> tuple[str, str, str]:
+    found, _ = answers(changed(tmp_path_factory.mktemp("far") / "bag", messages, lambda _, log, own, i, n: (log, own)))
+    return verdicts(found)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_commands_say_what_they_say_without_it(tmp_path, messages, sound, case):
+    change, aside = CASES[case]
+    found, printed = answers(changed(tmp_path / "bag", messages, change))
+    assert verdicts(found) == sound
+    assert sound[:2] == ("yes", "accept")
+    assert found["replay"]["counts"]["calibration"]["restarts"] == 0
+    for topic, count in aside.items():
+        words = f"{topic}: {count} of {sum(of == topic for of, *_ in messages)} messages are set aside:"
+        assert sum(each.count("".join(words.split())) for each in printed) == 3, "one note of each command"
+    if not aside:  # a stamp that is an hour off is in no other segment: it strays
+        for command in ("doctor", "replay"):
+            assert "STAMP_STRAY" in [each["code"] for each in found[command]["findings"]], command
