@@ -91,8 +91,11 @@ def _without_long_pauses(motion: MotionStreams) -> MotionStreams:
     gaps = np.diff(every)
     # what lies between one clock and another is what is looked for
     is_pause = np.any([(own[0] <= every[:-1]) & (own[-1] >= every[1:]) for own in streams if len(own)], axis=0)
-    gaps[is_pause] = shortened(gaps[is_pause], most)
-    moved = every[0] + np.append(0.0, np.cumsum(gaps))
+    cut = np.zeros(len(gaps))
+    cut[is_pause] = gaps[is_pause] - shortened(gaps[is_pause], most)
+    removed = np.append(0.0, np.cumsum(cut))
+    first = np.maximum.accumulate(np.where(np.append(True, ~is_pause), np.arange(len(every)), 0))
+    moved = every - (removed - removed[first])
     dvl, reference, imu = (np.interp(own, every, moved) for own in streams)
     return replace(
         motion, dvl=motion.dvl._replace(times=dvl), reference_times=reference, imu=motion.imu._replace(times=imu)

@@ -116,11 +116,10 @@ def test_a_recorder_without_a_clock_does_not_make_the_recording_decades_long(tmp
 
 @pytest.mark.parametrize("kind", TYPES)
 def test_stamps_of_messages_that_are_decoded_one_by_one_are_those_of_their_headers(tmp_path, kind):
-    zero = lambda stamp: setattr(stamp, "sec", 0) or setattr(stamp, "nanosec", 0)  # noqa: E731
-    changes = {3: lambda message: zero(message.header.stamp)}
-        3: lambda message: setattr(message.header.stamp, "sec", 0) or setattr(message.header.stamp, "nanosec", 0)
-    }
-    bag = write_driver_bag(tmp_path / "bag", run(10.0), kind, TWIST, changes=changes)
+    def without_stamp(message) -> None:
+        message.header.stamp.sec = message.header.stamp.nanosec = 0
+
+    bag = write_driver_bag(tmp_path / "bag", run(10.0), kind, TWIST, changes={3: without_stamp})
     recording = open_recording([bag], parameters=Parameters(dvl_type=kind))
     [part] = next(parts for parts in recording.columns.values() if parts[0].msgtype == kind)
     with BagReader([bag], KNOWN_DEFINITIONS) as reader:
