@@ -165,5 +165,6 @@ def _spans(times: Array) -> Index:
     number = np.floor((times - start) / step)
     number += start + (number + 1.0) * step <= times
     number -= start + number * step > times
-    at = np.unique(np.append(np.flatnonzero(np.diff(number, prepend=-1.0)), len(times) - 1))
+    at, last = np.flatnonzero(np.diff(number, prepend=-1.0)), len(times) - 1
+    at = at if at[-1] == last else np.append(at, last)
     return np.stack([at[:-1], at[1:]])

@@ -84,7 +84,7 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Unregist
 def _without_long_pauses(motion: MotionStreams) -> MotionStreams:
     """Return a motion whose streams last no longer than their samples are worth, pauses that they share cut alike."""
     streams = motion.dvl.times, motion.reference_times, motion.imu.times
-    every = np.unique(np.concatenate(streams))
+    every = np.sort(np.concatenate(streams))
     most = max(LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE * STEP_S * len(every))
     if not len(every) or max(own[-1] - own[0] for own in streams if len(own)) <= most:
         return motion
