@@ -41,7 +41,7 @@ from .search.arm_clock_ambiguity import (
     with_moved,
     with_open,
 )
-from .search.effect_selection import EffectSelection, select
+from .search.effect_selection import EffectSelection, TooFewBinsError, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
 from .search.observable_parameters import somewhere, with_observable
@@ -96,16 +96,16 @@ def diagnose_recordings(
         check_clocks(recording, parameters.rotation_dvl_from_body)
     available = frozenset.intersection(*(recording.available for recording in recordings))
     untestable = {name: why for name, effect in effects.items() if (why := _lacks(effect, available, recordings))}
-    selection = select(
-        recordings,
-        parameters.rotation_dvl_from_body,
-        np.array(parameters.lever_arm),
-        {name: effect for name, effect in effects.items() if name not in untestable},
-    )
+    try:
+        selection = select(
+            recordings,
+            parameters.rotation_dvl_from_body,
+            np.array(parameters.lever_arm),
+            {name: effect for name, effect in effects.items() if name not in untestable},
+        )
+    except TooFewBinsError as error:
+        return _nothing_to_say(_too_short(error.samples, sum(each.seconds for each in recordings)), notes)
     testable = selection.testable
-    if len(selection.fitter.problem.time) < SETTINGS.min_bins:
-        samples, seconds = len(selection.fitter.problem.bin_of), sum(each.seconds for each in recordings)
-        return _nothing_to_say(_too_short(samples, seconds), notes)
     _check_bounds(selection)
     selection, rest = settled(selection, len(testable))
     residuals = held_out(selection)

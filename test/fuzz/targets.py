@@ -12,6 +12,7 @@ from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from io_fixtures import mcap_bytes, raw, run, write_bag
@@ -20,7 +21,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
-from wholes import Names, names_seeds, run_names, run_settings, settings_seeds
+from wholes import Names, names_seeds, run_names, run_settings, run_stamps, settings_seeds, stamps_seeds
 
 from dvl_calib_ros.bags.channels import Definition, DefinitionError, typestore
 from dvl_calib_ros.bags.reader import BagReader
@@ -45,6 +46,7 @@ from dvl_calib_ros.logs.trajectories import read_columns
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.messages.live_feed import MessageFeed
+from dvl_calib_ros.recordings import far_stamps
 from dvl_calib_ros.recordings.recording import open_recording
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -140,7 +142,9 @@ def run_columns(data: bytes) -> None:
     path = _file("columns.mcap", mcap_bytes(messages))
     found, singly = [], []
     decoder = MessageDecoder(Parameters())
-    for stretch in open_recording([path]).stretches(topics, decoder):
+    with patch.object(far_stamps, "SEGMENT_GAP_NS", 2**64):  # stamps are any: nothing is set aside for them
+        recording = open_recording([path])
+    for stretch in recording.stretches(topics, decoder):
         found += [(stream, isinstance(each, str)) for stream, each in stretch.streams.in_order()]
     decoder = MessageDecoder(Parameters())
     take = {"dvl/twist": decoder.dvl, "gnss/twist": decoder.reference, "imu/data": decoder.imu}
@@ -396,6 +400,7 @@ TARGETS = {
     "trajectory": Target(run_trajectory, _trajectory_seeds),
     "log": Target(run_log, _log_seeds),
     "settings": Target(run_settings, settings_seeds),
+    "stamps": Target(partial(run_stamps, folder=FOLDER), stamps_seeds),
     "names": Target(partial(run_names, names=Names(FOLDER, _SMALLEST_BAG)), names_seeds),
 }
 with suppress(InputError):  # without pyarrow there is no catalogue

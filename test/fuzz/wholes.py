@@ -4,25 +4,86 @@ from __future__ import annotations
 
 import os
 import shutil
+import struct
+import tempfile
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from drawn import Drawn
+from io_fixtures import mcap_bytes, raw, run, write_bag
 
+from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
+from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.disk.atomic import backup_of, check_writable, save_bytes
 from dvl_calib_ros.errors import InputError
+from dvl_calib_ros.examination.examine import examine
 from dvl_calib_ros.files.output_paths import check_outputs
 from dvl_calib_ros.files.result_file import result_document
+from dvl_calib_ros.recordings.recording import open_recording
+from dvl_calib_ros.recordings.topics import Topics
 
 _STEPS_NS = (0, 1, 50_000_000, 200_000_000, 199_000_000, -50_000_000, 10**9, 3 * 10**9, -(10**9), 60 * 10**9, 10**17)
 _MOST_ROWS = 60
+
+# ---------------------------------------------------------------------- stamps
+
+_WILD = struct.Struct("<HBi")
+
+
+@cache
+def _messages() -> tuple[tuple[str, int, bytes], ...]:
+    """Topic, log time and bytes of a small recording, in which each stream has its rate."""
+    samples = [sample for i, sample in enumerate(run(40.0)) if not isinstance(sample, ImuSample) or i % 4 == 0]
+    with tempfile.TemporaryDirectory() as folder:
+        return tuple(raw(write_bag(Path(folder) / "bag", samples)))
+
+
+def run_stamps(data: bytes, folder: Path) -> None:
+    """Stamps and log times that are wild for one message, or from one on: memory is that of the messages.
+
+    Of each seven bytes two say which message, one what is changed, and four by how many seconds, or to which second.
+    """
+    messages = list(_messages())
+    for place, what, seconds in _WILD.iter_unpack(data[: len(data) // _WILD.size * _WILD.size][: 12 * _WILD.size]):
+        first = place % len(messages)
+        for at in range(first, len(messages) if what & 8 else first + 1):
+            topic, log_ns, content = messages[at]
+            if what & 16 and topic != messages[first][0]:
+                continue
+            order = "little" if content[1] & 1 else "big"
+            stamp_s = seconds if what & 4 else int.from_bytes(content[4:8], order, signed=True) + seconds
+            if what & 1:
+                stamp = max(-(2**31), min(stamp_s, 2**31 - 1)).to_bytes(4, order, signed=True)
+                content = content[:4] + stamp + content[8:]
+            if what & 2:
+                log_ns = max(0, (0 if what & 4 else log_ns) + seconds * 10**9)
+            messages[at] = topic, log_ns, content
+    path = folder / "stamps.mcap"
+    path.write_bytes(mcap_bytes(sorted(messages, key=lambda message: message[1])))
+    parameters = Parameters()
+    for command in (examine, replay, diagnose):
+        recording = open_recording([path], parameters=parameters)
+        try:
+            command(recording, parameters, *([Topics()] if command is diagnose else []))
+        except InputError as error:
+            assert str(error)
+
+
+def stamps_seeds() -> Iterator[bytes]:
+    yield _WILD.pack(0, 1 | 4, 5)
+    yield _WILD.pack(300, 1 | 4, 2_145_916_800)
+    yield _WILD.pack(100, 1 | 2 | 8, 86_400 * 30) + _WILD.pack(200, 1 | 2 | 8, -3600)
+    # streams that are known together for seconds: a diagnosis fell over the few bins
+    yield _WILD.pack(7, 1 | 8 | 16, 400) + _WILD.pack(900, 2, -86_400 * 8)
+
 
 # ---------------------------------------------------------------------- parameters and data
 

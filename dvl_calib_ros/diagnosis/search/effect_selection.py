@@ -89,6 +89,14 @@ class EffectSelection:
         return replace(self, selected=(), fit=self.base, opened=None, moved={})
 
 
+class TooFewBinsError(Exception):
+    """Streams that are known together for too short a time; says how many samples that is."""
+
+    def __init__(self, samples: int) -> None:
+        super().__init__(samples)
+        self.samples = samples
+
+
 def started(
     recordings: Sequence[RecordedStreams],
     rotation_dvl_from_body: Array,
@@ -99,6 +107,7 @@ def started(
     with what of each is shown."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
+    _check_size(problem)
     every, effects = effects, observable_parts({name: effect.once for name, effect in effects.items()}, problem)
     problem = replace(problem, unshown=unobservable_parts(every, effects))
     found: dict[str, tuple[Values, ...]] = {
@@ -118,7 +127,7 @@ def select(
     lever_arm: Array,
     effects: Mapping[str, Effect],
 ) -> EffectSelection:
-    """Select among testable effects."""
+    """Select among testable effects. Raises TooFewBinsError."""
     heading = effects.get(HEADING)
     effects = every = {name: effect.usual for name, effect in effects.items()}  # what is not shown is no noise either
     problem, start, guesses, effects = started(recordings, rotation_dvl_from_body, lever_arm, effects)
@@ -178,8 +187,14 @@ def _beside_moving_clocks(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess
     return tuple(found)
 
 
+def _check_size(problem: Problem) -> None:
+    if len(problem.time) < SETTINGS.min_bins:
+        raise TooFewBinsError(len(problem.bin_of))
+
+
 def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
     """Robust fit of the first hypothesis, with white noise as large as the best fit so far leaves."""
+    _check_size(problem)
     fitter = Fitter(problem)
     _, residual = fitter.evaluated(start)
     fit = fitter.fit(start, white_noise(residual, problem.segments, None, problem.interval))
