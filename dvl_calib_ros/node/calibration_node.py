@@ -560,7 +560,8 @@ class CalibrationNode(AnsweringNode):
             say(f"calibration_node: {error}")
         except InputError as error:
             result = result_text(self._result_document())
-            say(f"calibration_node: {error}. The result follows.\n{result}")
+            for line in (f"calibration_node: {error}. The result follows.", *result.splitlines()):
+                say(line)
             return False
         return True
 

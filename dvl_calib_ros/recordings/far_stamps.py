@@ -22,6 +22,8 @@ from .columns import TopicColumns
 FURTHEST_NS = 365 * 86_400 * SECOND_NS
 # A segment with a smaller share of a topic's messages is no second dive in the same recording.
 SMALL_SHARE = 0.1
+# Fewer messages of a topic, all of them far away, are strays and no clock.
+FEWEST_OF_A_CLOCK = 10
 Span = tuple[int, int]
 
 
@@ -85,6 +87,9 @@ def without_far(
     joined = np.concatenate([np.zeros(0, dtype=np.int64), *log_ns])
     [by_log] = far([joined])
     of_log = np.split(by_log, np.cumsum([len(own) for own in log_ns])[:-1]) if names else []
+    # a topic that is far as a whole has another clock, which is found and said later
+    of_log = [np.zeros_like(own) if len(own) >= FEWEST_OF_A_CLOCK and own.all() else own for own in of_log]
+    by_log = np.concatenate([by_log[:0], *of_log])
     stamps_ns = [part.stamps_ns for part in columns.values()]
     # what was recorded far away may be stamped by the same clock: it has no say
     of_stamps = far([own[~aside] for own, aside in zip(stamps_ns, of_log, strict=True)])
