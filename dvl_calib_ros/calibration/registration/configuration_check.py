@@ -95,7 +95,7 @@ def fitting_configuration(
     best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
     if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
-    if given is not None and (axis := _mirrored(motion, curves, nominal, lever_arm, given, found[best].level)):
+    if given is not None and (axis := _mirrored(motion, curves, nominal, lever_arm, given, found[best])):
         return finding("DVL_LEFT_HANDED", axis=axis)
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
 
@@ -147,7 +147,7 @@ def _other_signs(
 ) -> Reason | None:
     """Return the finding of the signs of the DVL's axes that explain most, where others than those given do."""
     turned = _turned_round(motion, curves, nominal, lever_arm, registered)
-    axis = _mirrored(motion, curves, nominal, lever_arm, registered, math.inf if turned is None else turned.level)
+    axis = _mirrored(motion, curves, nominal, lever_arm, registered, turned)
     if axis:
         return finding("DVL_LEFT_HANDED", axis=axis)
     return None if turned is None else finding("DVL_AXES_FRD")
@@ -183,12 +183,17 @@ def _turned_round(
 
 
 def _mirrored(
-    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration, most: float
+    motion: MotionStreams,
+    curves: Curves,
+    nominal: Array,
+    lever_arm: Array,
+    registered: Registration,
+    rival: Fitted | None,
 ) -> str:
     """Return the axis of a left-handed DVL, of which the other sign explains more, with any lever arm; '' for none.
 
     The sign of y is that of the sway of turns, which at one speed is a lever arm of the other sign; the sign of z is
-    that of the heave. most: level, m/s, that another explanation leaves.
+    that of the heave. rival: another explanation, a rotation, of which it has to explain more as well.
     """
     held = (REFERENCE,)
     given: Fitted | None = None
@@ -201,11 +206,11 @@ def _mirrored(
             continue
         turned = MotionFit(other, lever_arm, of_other, MOST_ROWS)(0.0, near.dvl_late, nominal, held)
         given = given or MotionFit(motion, lever_arm, curves, MOST_ROWS)(0.0, registered.dvl.late, nominal, held)
-        if turned is None or given is None or turned.level > most:
+        if turned is None or given is None:
             continue
+        gain = min(_gain(each, turned) for each in (given, rival) if each is not None)
         # noise that lasts is that of fewer samples (survey 34211)
-        gain = _gain(given, turned) / max(given.inflation, turned.inflation) ** 2
-        if gain > CLEARLY + math.sqrt(6.0 * turned.rows):
+        if gain > max(given.inflation, turned.inflation) ** 2 * (CLEARLY + math.sqrt(6.0 * turned.rows)):
             levels[axis] = turned.level
     return min(levels, key=levels.__getitem__, default="")
 
