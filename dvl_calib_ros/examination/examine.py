@@ -106,9 +106,9 @@ class Examination(Answering):
         if self.cannot or self.verdict == "no":
             why = self.cannot or self.against[0].says
             return f"{why[:1].upper()}{why[1:]}."
-        *others, last = ["", *(each.name for each in self.shown if each.needs)]
-        missing = " and ".join(filter(None, (", ".join(others[1:]), last)))
-        return f"Not shown yet: {missing}." if missing else ""
+        missing = [each.name for each in self.shown if each.needs]
+        listed = " and ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:])))
+        return f"Not shown yet: {listed}." if listed else ""
 
     def document(self) -> dict[str, Any]:
         """Plain data, for JSON."""
@@ -153,7 +153,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
     replayed, cannot = _replayed(recording, discovery)
-    verification = None if replayed is None else replayed.result.verifications.get(replayed.result.selected)
+    verification = None if replayed is None else replayed.result.verifications[replayed.result.selected]
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
     judged = Severity.REJECT if verification is None else verification.verdict
