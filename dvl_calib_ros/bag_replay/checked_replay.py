@@ -83,12 +83,14 @@ def checked_replay(
     merge: bool = False,
     with_history: bool = False,
     mounting_is_guessed: bool = False,
+    objections: Sequence[Reason] = (),
 ) -> Replayed:
     """`replay`, after several recordings, or an initial calibration, have been held against each other.
 
     merge: take several recordings together even if the mounting moved between them; that stays a note, not the verdict.
     What `initial_calibration` says is left out, and said to be, if the data contradict it. mounting_is_guessed: nobody
-    told mounting_rpy; of a mounting far from it none is misaligned: it is taken, and all is done once more.
+    told mounting_rpy; of a mounting far from it none is misaligned: it is taken, and all is done once more. objections:
+    what the discovery has against its result.
     Raises InputError.
     """
     topics = topics or Topics()
@@ -106,7 +108,13 @@ def checked_replay(
     replayed = _with_fitting_start(recording, parameters, topics, progress_of, parts, with_history)
     if mounting_is_guessed and (rpy := _mounting_found(replayed.result)) is not None:
         better = parameters.replace(mounting_rpy=rpy)
-        return checked_replay(recording, better, topics, on_progress, merge=merge, with_history=with_history)
+        return checked_replay(
+            recording, better, topics, on_progress, merge=merge, with_history=with_history, objections=objections
+        )
+    if objections:
+        result = replayed.result
+        judged = {name: each.with_objections(objections) for name, each in result.verifications.items()}
+        replayed = replace(replayed, result=replace(result, verifications=judged))
     return replayed if recordings is None else _judged(replayed, recordings, merge)
 
 

@@ -189,8 +189,8 @@ def in_time(recording: Recording, topics: Topics, found: Registration) -> Survey
 
 def _thinned(look: Look) -> Look:
     step = -(-len(look.stamps_s) // COMPARED)
-    rates = None if look.rates is None else look.rates[::step]
-    return replace(look, stamps_s=look.stamps_s[::step], values=look.values[::step], rates=rates)
+    rates, pose = (None if each is None else each[::step] for each in (look.rates, look.pose))
+    return replace(look, stamps_s=look.stamps_s[::step], values=look.values[::step], rates=rates, pose=pose)
 
 
 def difference_of(dvl: Look, reference: Look) -> float | None:
@@ -198,7 +198,7 @@ def difference_of(dvl: Look, reference: Look) -> float | None:
     motion = compared_motion(dvl, reference, None)
     if motion is None:
         return None
-    found = Readings(motion, np.zeros(3)).agreements([Reading(VelocityFrame.BODY, None, False)], None)
+    found = Readings(motion, np.zeros(3)).agreements([Reading(VelocityFrame.BODY.value, None, False)], None)
     return found[0].best_left if found else None
 
 

@@ -21,32 +21,30 @@ from ..calibration.registration.frame_hypotheses import (
     FITS,
     Agreement,
     ImuFrame,
-    Reading,
     Readings,
     best_rotation,
     nominal_rpy,
-    turns_right,
 )
 from ..calibration.registration.gauss_newton import white_noise
 from ..errors import InputError
-from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named
+from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named, turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topic_preview import Look, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
-from .clock_offsets import compared_motion, difference_of, imu_columns_of, in_time
+from .clock_offsets import compared_motion, difference_of, in_time
 from .discovery import (
     Discovery,
     Given,
-    as_option,
     clocks_of_recording,
     in_degrees,
     in_metres,
     in_time_of,
     mounting_guessed,
 )
+from .frame_choice import FrameChoice, FrameChooser
 from .gravity import Gravity, believed_heading
 from .transforms import FrameTree, Placed
 
@@ -64,8 +62,6 @@ QUIETEST, CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE, WHITE_FROM_HZ = 0.01, 3.0, 2.0, 3.
 CLAIMS_FAR_TOO_MUCH, NOISIER = 4.0, 1.5
 # Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
 BETTER = 0.8
-# Reference frames, in the order in which they are taken for one that the data cannot tell.
-USUAL = (VelocityFrame.ENU, VelocityFrame.BODY, VelocityFrame.NED)
 
 
 def discover(recording: Recording | Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
@@ -180,7 +176,7 @@ class _Search:
             frame = ""
             if role == "reference" and look is not None:
                 chosen = self._values.get("gnss_frame") or self._parameters.gnss_frame
-                declared = self._declared_reference(look)
+                declared = self._declared.declared_reference(look)
                 shown = chosen if chosen != FROM_FRAME_ID else "" if declared is None else declared.name
                 frame = f", {shown}" if shown else ""
             parts.append(f"{role} {name} ({kind.split('/')[-1]}{frame}{rate})")
@@ -196,23 +192,34 @@ class _Search:
         known = self._parameters.rotation_dvl_from_body.T if self._gives("mounting_rpy") else None
         if known is None and placed is not None:
             known = placed.rotation
-        turned = self._declared_turned(dvl, placed)
-        imu_frames = self._imu_frames(imu)
+        imu_placed = None if imu is None else self._tree.placed(imu.frame_id, self._parameters.base_frame)
+        base = self._values.get("base_frame", self._parameters.base_frame)
+        frames = self._declared = FrameChooser(
+            self._parameters, self._given.parameters, base, dvl, placed, imu, imu_placed
+        )
         chosen = None
         if reference is not None:
-            chosen = self._chosen = self._fit(dvl, reference, imu, known, turned, imu_frames, placed)
-        elif known is None:
-            self._mounting_from_motion(dvl, turned)
+            chosen = self._fit(dvl, reference, imu, known, placed)
+        taken = frames.imu if chosen is None else chosen.imu
+        self._take_base_axes(taken is not None and taken.z_down)
+        turned = frames.dvl_is_turned(self._is_z_down)
         if chosen is not None and reference is not None:
-            turned = chosen.reading.turned
-            self._take(chosen, known, imu_frames, reference, imu)
-            self._measure_noise(chosen, known, dvl, reference)
-        elif imu_frames and imu is not None:
-            self._take_imu(imu_frames[0], imu)
-        if self._parameters.dvl_axes == FROM_MESSAGE and turned != self._turned_by_message(dvl):
-            self._values["dvl_axes"] = FRD if turned else FLU
-            which = "forward-right-down" if turned else "as they come"
-            self._found.append(f"the DVL's data are taken {which} (dvl_axes {self._values['dvl_axes']})")
+            agreement = self._chosen = chosen.agreement
+            turned = agreement.reading.turned
+            self._contradictions += chosen.says
+            self._take(agreement, known, reference, imu)
+            self._measure_noise(agreement, known, dvl, reference)
+        elif reference is None and known is None:
+            self._mounting_from_motion(dvl, turned)
+        if taken is not None:
+            self._take_imu(taken.frame)
+        parameters = self._parameters.replace(base_axes=FRD if self._is_z_down else FLU)
+        if parameters.dvl_axes == FROM_MESSAGE and turned != turns_dvl(
+            VELOCITY_TYPES[dvl.msgtype], dvl.frame_id, parameters
+        ):
+            axes = self._values["dvl_axes"] = FRD if turned != self._is_z_down else FLU
+            which = "forward-right-down" if axes == FRD else "forward-left-up"
+            self._found.append(f"the DVL's data are taken {which} (dvl_axes {axes})")
         if known is not None and not self._gives("mounting_rpy"):
             self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
         if placed is not None and placed.source:
@@ -227,11 +234,27 @@ class _Search:
             self._know_heading(imu)
             self._look_at_gravity(imu)
 
+    @property
+    def _is_z_down(self) -> bool:
+        return str(self._values.get("base_axes", self._parameters.base_axes)) == FRD
+
+    def _take_base_axes(self, z_down: bool) -> None:
+        """Say it where base_frame is forward-right-down, and nobody set that."""
+        if z_down and not self._parameters.is_z_down:
+            self._values["base_axes"] = FRD
+            base = self._values.get("base_frame", self._parameters.base_frame)
+            self._found.append(
+                f"{base} is taken forward-right-down, as the IMU's attitude and its transform have it: mounting and "
+                "lever arm are in these axes (base_axes frd)"
+            )
+
     def _look_at_gravity(self, imu: Look) -> None:
         """Say where acceleration and orientation contradict what the IMU's data are taken for."""
         gravity, taken = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
         if gravity is not None and (
-            found := gravity.contradiction(imu.topic, rotation_from_rpy(taken.imu_rpy), taken.imu_frame)
+            found := gravity.contradiction(
+                imu.topic, rotation_from_rpy(taken.imu_rpy), taken.imu_frame, taken.is_z_down
+            )
         ):
             self._contradictions.append(found)
 
@@ -292,47 +315,12 @@ class _Search:
         name = frame_id.strip("/")
         return name == self._parameters.base_frame.strip("/") or name.lower() in EARTH_FRAMES
 
-    def _turned_by_message(self, dvl: Look) -> bool:
-        """Whether the calibration turns the DVL's data if nobody tells it: by the frame's name, else by the type."""
-        return VELOCITY_TYPES[dvl.msgtype].is_turned(dvl.frame_id)
-
-    def _declared_turned(self, dvl: Look, placed: Placed | None) -> bool:
-        """Whether the DVL's data are forward-right-down, by parameter, frame, transform and type."""
-        if self._parameters.dvl_axes != FROM_MESSAGE:
-            return self._parameters.dvl_axes == FRD
-        if dvl.frame_id.lower().endswith(("_frd", "_flu")):
-            return self._turned_by_message(dvl)
-        # a frame whose z points down, as the sensor's own does, is that of the driver's axes and not REP-103's
-        driver_axes = placed is not None and placed.rotation[2, 2] < 0.0 and not self._gives("mounting_rpy")
-        return self._turned_by_message(dvl) and not driver_axes
-
-    def _declared_reference(self, reference: Look) -> DeclaredFrame | None:
-        if self._parameters.gnss_frame != FROM_FRAME_ID:
-            return DECLARED_FRAMES[self._parameters.gnss_frame]
-        of_type = VELOCITY_TYPES[reference.msgtype].reference_frame
-        if of_type is not None:
-            return DeclaredFrame(of_type)
-        base = self._parameters.base_frame
-        return frame_named(reference.frame_id, (base, self._values.get("base_frame", base)))
-
-    def _points_down(self, reference: Look, imu: Look | None, imu_frame: ImuFrame | None) -> bool:
-        """Whether a reference in the body is forward-right-down: as declared, else by how it says that it turns."""
-        declared = self._declared_reference(reference)
-        if declared is not None and declared.frame is VelocityFrame.BODY:
-            return declared.points_down
-        if imu is not None and imu_frame is not None and reference.rates is not None:
-            turns = turns_right(reference.stamps_s, reference.rates, imu_columns_of(imu), imu_frame)
-            if turns is not None:
-                return turns
-        world = frame_named(reference.world, ())  # of the pose: a body in NED is forward-right-down by custom
-        return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
-
     def _reference_frame(self, reference: Look | None) -> VelocityFrame | None:
         """The frame that the reference is taken in; None without one, or if nothing tells."""
         if reference is None:
             return None
         taken = self._values.get("gnss_frame")
-        said = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
+        said = self._declared.declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
         return None if said is None else said.frame
 
     def _knows_imu(self, imu: Look | None) -> bool:
@@ -343,111 +331,31 @@ class _Search:
         if placed is not None and placed.source:
             return True
         fit = self._chosen  # a reference in the body agrees whatever the IMU says
-        return fit is not None and fit.reading.reference is not VelocityFrame.BODY and fit.best_left < FITS
-
-    def _imu_frames(self, imu: Look | None) -> list[ImuFrame]:
-        """How the IMU's data may be meant, the likeliest first."""
-        if imu is None:
-            return []
-        if self._gives("imu_rpy") or self._gives("imu_frame"):
-            rotation = rotation_from_rpy(self._parameters.imu_rpy)
-            return [ImuFrame(rotation, self._parameters.imu_frame, "as given")]
-        placed = self._tree.placed(imu.frame_id, self._parameters.base_frame)
-        at = np.eye(3) if placed is None else placed.rotation
-        says = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
-        upright = ImuFrame(at, "enu", says)
-        marine = ImuFrame(at @ FLU_FROM_FRD, "ned", f"forward-right-down in NED, {says}")
-        frames = [upright, marine, ImuFrame(at, "ned", f"in NED, {says}")]
-        if placed is not None and not np.allclose(at, np.eye(3)):
-            frames.append(ImuFrame(np.eye(3), "enu", "as the body, whatever its transform says"))
-        gravity = Gravity.of(imu.values[:, :4], imu.values[:, 7:])
-        if gravity is None:
-            return frames
-        frames.append(ImuFrame(at @ FLU_FROM_FRD, "enu", f"turned over, {says}"))
-        wrong = [gravity.contradicts(each.rotation_body_from_imu, each.world) for each in frames]
-        # the first stays among them, for a driver may have the acceleration's sign wrong
-        kept = [at for at in range(len(frames)) if at == 0 or wrong[at] == 0]
-        return [frames[at] for at in sorted(kept, key=lambda at: wrong[at])]
+        return fit is not None and not fit.reading.in_body and fit.best_left < FITS
 
     def _fit(
-        self,
-        dvl: Look,
-        reference: Look,
-        imu: Look | None,
-        known: Array | None,
-        turned: bool,
-        imu_frames: Sequence[ImuFrame],
-        placed: Placed | None,
-    ) -> Agreement | None:
+        self, dvl: Look, reference: Look, imu: Look | None, known: Array | None, placed: Placed | None
+    ) -> FrameChoice | None:
         position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
         motion = compared_motion(dvl, reference, imu)
         if motion is None:
             return None
         self._readings = Readings(motion, position)
-        declared = self._declared_reference(reference)
-        fixed = self._parameters.gnss_frame != FROM_FRAME_ID
-        references = [declared.frame] if fixed and declared is not None else list(USUAL)
-        said = self._parameters.dvl_axes != FROM_MESSAGE or dvl.frame_id.lower().endswith(("_frd", "_flu"))
-        turns = [turned] if said else [turned, not turned]
-        imus: list[ImuFrame | None] = [*imu_frames] or [None]
-        down = {each: self._points_down(reference, imu, each) for each in imus}
-        in_body = VelocityFrame.BODY
-        tried = [
-            Reading(frame, each, turn, frame is in_body and down[each])
-            for frame in references
-            for each in imus
-            for turn in turns
-        ]
-        mounting = None if known is None else known.T
-        found = self._readings.agreements(tried, mounting)
-        if not found:
-            return None
-        first = imus[0]
-        named = USUAL[0] if declared is None else declared.frame
-        wanted = Reading(named, first, turned, named is in_body and down[first])
-        decided = _decided(found, wanted, declared is not None)
-        own = next((each for each in found if each.reading == wanted), None)
-        if decided is None:
-            return None
-        if own is None or replace(own.reading, turned=decided.reading.turned) == decided.reading:
-            as_declared = own or decided
-            return as_declared if said else self._upright(as_declared, mounting)
-        to_body = decided.reading.reference is in_body
-        if to_body and declared is not None and declared.frame is not in_body and not self._is_in_body(decided):
-            return own
-        best, given = (self._readings.registered(each.reading, mounting)[0] for each in (decided, own))
-        return decided if best < CLEARLY * given else own
-
-    def _upright(self, decided: Agreement, mounting: Array | None) -> Agreement:
-        """That with the DVL's axes the other way up if only that leaves little with any lever arm.
-
-        A vehicle that goes ahead hardly shows which way is up; its turns do, by the lever arm that they ask for.
-        """
-        other = replace(decided.reading, turned=not decided.reading.turned)
-        as_it_is = np.eye(3) if mounting is None else mounting
-        if self._readings.agreements([decided.reading, other], as_it_is)[0].reading != other:
-            return decided
-        best, given = (self._readings.registered(each, as_it_is)[0] for each in (other, decided.reading))
-        return self._readings.agreements([other], mounting)[0] if best < BETTER * given else decided
-
-    def _is_in_body(self, found: Agreement) -> bool:
-        if self._readings.is_in_body(found):
-            return True
-        self._contradictions.append(finding("BODY_OR_EARTH"))
-        return False
+        return self._declared.choose(self._readings, reference, None if known is None else known.T)
 
     def _take(
         self,
         chosen: Agreement,
         known: Array | None,
-        imu_frames: Sequence[ImuFrame],
         reference: Look,
         imu: Look | None,
     ) -> None:
         """Write what a reading says into the parameters."""
         reading, parameters = chosen.reading, self._parameters
-        declared = self._declared_reference(reference)
-        taken = DeclaredFrame(reading.reference, reading.reference_turned)
+        declared = self._declared.declared_reference(reference)
+        if declared is not None and self._is_z_down and declared.points_down:
+            declared = DeclaredFrame(VelocityFrame.BODY)
+        taken = DECLARED_FRAMES[reading.reference]
         if imu is None and declared is None and chosen.best_left >= FITS:  # no frame could be tried but the body's
             self._notes.append(finding("REFERENCE_FRAME_NOT_TOLD", topic=reference.topic))
         elif taken != declared:
@@ -462,26 +370,17 @@ class _Search:
                 self._contradictions.append(finding("REFERENCE_FRAME_OTHER", topic=reference.topic, **frame))
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
-        if reading.imu is not None and imu_frames:
-            self._take_imu(reading.imu, None if reading.imu is imu_frames[0] else reference)
-        found = chosen.rotation_dvl_from_body.T
-        if known is None:
-            if chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
-                left, _ = self._readings.registered(reading, np.eye(3))
-                turned_left, rotation = self._readings.registered(reading, None)
-                if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(left):
-                    agree = "where DVL and reference agree best"
-                    rotation = self._readings.without_roll(chosen, rotation)
-                    rpy = nominal_rpy(rotation.T)
-                    # a roll that a level vehicle hardly shows is none, unless the data need it
-                    level = (0.0, *rpy[1:])
-                    level_left, _ = self._readings.registered(reading, rotation_from_rpy(level).T)
-                    self._mounting_found(level if BETTER * level_left <= turned_left else rpy, agree)
-        elif chosen.left > FITS and chosen.best_left < CLEARLY * chosen.left:
-            given, fits = in_degrees(rpy_from_rotation(known)), nominal_rpy(found)
-            self._contradictions.append(
-                finding("MOUNTING_CONTRADICTED", given=given, found=in_degrees(fits), option=as_option(fits))
-            )
+        if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
+            left, _ = self._readings.registered(reading, np.eye(3))
+            turned_left, rotation = self._readings.registered(reading, None)
+            if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(left):
+                agree = "where DVL and reference agree best"
+                rotation = self._readings.without_roll(chosen, rotation)
+                rpy = nominal_rpy(rotation.T)
+                # a roll that a level vehicle hardly shows is none, unless the data need it
+                level = (0.0, *rpy[1:])
+                level_left, _ = self._readings.registered(reading, rotation_from_rpy(level).T)
+                self._mounting_found(level if BETTER * level_left <= turned_left else rpy, agree)
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
         """The noise of a reference that claims none, or far too little, or one that its velocities do not have."""
@@ -517,7 +416,7 @@ class _Search:
             f"(-p gnss_aided_std:={shown:.2g})"
         )
 
-    def _take_imu(self, frame: ImuFrame, seen: Look | None) -> None:
+    def _take_imu(self, frame: ImuFrame) -> None:
         if self._gives("imu_rpy") or self._gives("imu_frame"):
             return
         rpy = tuple((rpy_from_rotation(frame.rotation_body_from_imu) + 0.0).tolist())
@@ -564,22 +463,3 @@ class _Search:
                 said.append(f"lever arm {in_metres(position)} m")
         if said:
             self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
-
-
-def _decided(found: Sequence[Agreement], wanted: Reading, declared: bool) -> Agreement | None:
-    """That of what is declared, unless another reading of the data found clearly better.
-
-    None if what is declared cannot be tried, for want of an attitude: then it stands.
-
-    declared: the recording says the reference's frame; else the usual order decides between frames that fit alike.
-    """
-    best = found[0]
-    own = [each for each in found if each.reading == wanted]
-    if declared and not own:
-        return None
-    if own and not (best.left < CLEARLY * own[0].left and best.left < FITS):
-        return own[0]
-    if declared or best.left >= FITS:
-        return best
-    alike = [each for each in found if CLEARLY * each.left <= best.left]
-    return min(alike, key=lambda each: (USUAL.index(each.reading.reference), found.index(each)))

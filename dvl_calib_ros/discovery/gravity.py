@@ -50,13 +50,18 @@ class Gravity(NamedTuple):
         across = [math.sqrt(float((each[:, :2] ** 2).sum(axis=1).mean())) for each in (world, inverted)]
         return Gravity(size, a.mean(axis=0), world.mean(axis=0), *across)
 
-    def contradicts(self, rotation_body_from_imu: Array, world: str) -> int:
-        """How many of the two, the body's up and the world's, are down if an IMU's data are meant so."""
-        return int(float(rotation_body_from_imu[2] @ self.body) < -CLEARLY) + int(self._up(world) < -CLEARLY)
+    def contradicts(self, rotation_body_from_imu: Array, world: str, z_down: bool) -> int:
+        """How many of the two, the body's up and the world's, are down if an IMU's data are meant so.
 
-    def contradiction(self, topic: str, rotation_body_from_imu: Array, world: str) -> Reason | None:
+        z_down: whether the body is forward-right-down.
+        """
+        return int(self._up_in_body(rotation_body_from_imu, z_down) < -CLEARLY) + int(self._up(world) < -CLEARLY)
+
+    def contradiction(
+        self, topic: str, rotation_body_from_imu: Array, world: str, z_down: bool = False
+    ) -> Reason | None:
         """What is wrong with how the data of an IMU's topic are taken."""
-        body_up, up = float(rotation_body_from_imu[2] @ self.body), self._up(world)
+        body_up, up = self._up_in_body(rotation_body_from_imu, z_down), self._up(world)
         if body_up < -CLEARLY and up < -CLEARLY:
             return finding("GRAVITY_SIGN", topic=topic)
         if body_up < -CLEARLY or up < -CLEARLY:
@@ -72,6 +77,9 @@ class Gravity(NamedTuple):
         if abs(self.size / STANDARD - 1.0) > NEAR:
             return finding("GRAVITY_SIZE", topic=topic, size=self.size)
         return None
+
+    def _up_in_body(self, rotation_body_from_imu: Array, z_down: bool) -> float:
+        return float(rotation_body_from_imu[2] @ self.body) * (-1.0 if z_down else 1.0)
 
     def _up(self, world: str) -> float:
         return float(self.world[2]) * (-1.0 if world == "ned" else 1.0)

@@ -13,7 +13,7 @@ import numpy as np
 from ..bag_replay.checked_replay import checked_replay
 from ..bag_replay.replay import Replayed
 from ..calibration.models import MODELS
-from ..calibration.models.parameters import FRD, FROM_MESSAGE, Parameters
+from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.samples import Stream, VelocityFrame
 from ..calibration.registration.frame_hypotheses import FITS
@@ -23,6 +23,7 @@ from ..calibration.streams.position_velocities import NOISY_MPS
 from ..discovery.discover import discover
 from ..discovery.discovery import Discovery, Given
 from ..errors import InputError
+from ..messages.decode import turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
 from ..messages.positions import SELDOM_S
 from ..recordings.recording import Recording, open_recording
@@ -181,7 +182,13 @@ def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | No
     """Return the replay that `dvl-calib replay` makes, whose verdict is the doctor's; or why there can be none."""
     guessed = bool(discovery.mounting_because)
     try:
-        replayed = checked_replay(recording, discovery.parameters, discovery.topics, mounting_is_guessed=guessed)
+        replayed = checked_replay(
+            recording,
+            discovery.parameters,
+            discovery.topics,
+            mounting_is_guessed=guessed,
+            objections=discovery.objections,
+        )
     except InputError as error:
         return None, str(error).rstrip(".")
     return replayed, ""
@@ -213,10 +220,9 @@ def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> 
     """The DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
     values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
     values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]
-    by_message = VELOCITY_TYPES[dvl.msgtype].is_turned("" if look is None else look.frame_id)
-    turned = by_message if parameters.dvl_axes == FROM_MESSAGE else parameters.dvl_axes == FRD
-    flu = values @ FLU_FROM_FRD if turned else values
-    return flu @ rotation_from_rpy(parameters.mounting_rpy).T
+    turned = turns_dvl(VELOCITY_TYPES[dvl.msgtype], "" if look is None else look.frame_id, parameters)
+    own = values @ FLU_FROM_FRD if turned else values
+    return own @ rotation_from_rpy(parameters.mounting_rpy).T
 
 
 def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Reason]:

@@ -99,7 +99,11 @@ def _calibrated(task: Task, path: Any) -> Entry:
     recording = open_recording([path], None, task.parameters)
     found = discover(recording, task.parameters, task.given)
     replayed = checked_replay(
-        recording, found.parameters, found.topics, mounting_is_guessed=bool(found.mounting_because)
+        recording,
+        found.parameters,
+        found.topics,
+        mounting_is_guessed=bool(found.mounting_because),
+        objections=found.objections,
     )
     return entry_of_replay(replayed, task.recording.name)
 

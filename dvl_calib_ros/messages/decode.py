@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.models.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE, Parameters
-from ..calibration.numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, Vector
+from ..calibration.models.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE, NWU, Parameters
+from ..calibration.numerics.frames import ENU_FROM_NED, Array, Vector
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from ..calibration.streams.imu_frame import ImuAlignment
 from ..verdict.reasons import Reason, finding
@@ -40,24 +40,59 @@ EARTH_FRAMES = {
 }
 
 
+class Axes(NamedTuple):
+    """A signed permutation of axes: component i is sign[i] times component order[i] of the message."""
+
+    order: tuple[int, int, int]
+    sign: tuple[float, float, float]
+
+    def velocity(self, values: Array) -> Array:
+        """Return velocities (..., 3) in the other axes."""
+        return np.asarray(values[..., self.order] * self.sign)
+
+    def covariance(self, values: Array) -> Array:
+        """Return covariances (..., 3, 3) in the other axes."""
+        turned = values[..., self.order, :][..., self.order]
+        return np.asarray(turned * np.outer(self.sign, self.sign))
+
+
+AS_SENT = Axes((0, 1, 2), (1.0, 1.0, 1.0))
+# Forward-right-down to forward-left-up, or the other way; north-west-up to east-north-up.
+HALF_TURN, QUARTER_TURN = Axes((0, 1, 2), (1.0, -1.0, -1.0)), Axes((1, 0, 2), (-1.0, 1.0, 1.0))
+
+
 class DeclaredFrame(NamedTuple):
-    """What is said of a reference's frame. points_down: of the body, forward-right-down."""
+    """A frame of reference velocities: as the core reads it, and the axes that its messages are turned by before."""
 
     frame: VelocityFrame
-    points_down: bool = False
+    axes: Axes = AS_SENT
+
+    @property
+    def points_down(self) -> bool:
+        """Whether it is of the body, forward-right-down."""
+        return self.axes is HALF_TURN
 
     @property
     def name(self) -> str:
         """As parameter gnss_frame has it."""
-        return FRD if self.points_down else self.frame.value
+        return {HALF_TURN: FRD, QUARTER_TURN: NWU}.get(self.axes, self.frame.value)
+
+    def in_base(self, parameters: Parameters) -> DeclaredFrame:
+        """Return the frame as it is to be read: of a z-down base_frame, its own axes need no turn."""
+        return DeclaredFrame(self.frame) if parameters.is_z_down and self.points_down else self
 
 
 # by value of parameter gnss_frame
 DECLARED_FRAMES = {
-    each.name: each for each in (*map(DeclaredFrame, VelocityFrame), DeclaredFrame(VelocityFrame.BODY, True))
+    each.name: each
+    for each in (
+        *map(DeclaredFrame, VelocityFrame),
+        DeclaredFrame(VelocityFrame.BODY, HALF_TURN),
+        DeclaredFrame(VelocityFrame.ENU, QUARTER_TURN),
+    )
 }
 # by the end of a frame's name
-_SUFFIXES = {"enu": "enu", "ned": "ned", "flu": "body", "frd": FRD}
+_SUFFIXES = {"enu": "enu", "ned": "ned", "nwu": NWU, "flu": "body", "frd": FRD}
 
 
 def frame_name(frame_id: str) -> str:
@@ -98,13 +133,13 @@ class LinearCovariance:
     """Takes the (3, 3) of the linear velocity out of covariances of messages: of it alone, or of a twist.
 
     Most drivers send the same covariance with every message; it stays the same object then, and what is made of it
-    need not be made again. turned: from forward-right-down to forward-left-up, or the other way.
+    need not be made again. axes: that they are turned by.
     """
 
-    def __init__(self, turned: bool = False) -> None:
+    def __init__(self, axes: Axes = AS_SENT) -> None:
         self._bytes = b""
         self._linear: Array = np.zeros((3, 3))
-        self._turned = turned
+        self._axes = axes
 
     def __call__(self, covariance: Any) -> Array | None:
         """(9,) or (36,) -> (3, 3); None -> None. Raises ValueError for any other size."""
@@ -114,32 +149,44 @@ class LinearCovariance:
         content = array.tobytes()
         if content != self._bytes:
             linear = array.reshape(3, 3) if array.size == 9 else array.reshape(6, 6)[:3, :3]
-            self._linear = linear * TURNED_COVARIANCE if self._turned else linear.copy()
+            self._linear = self._axes.covariance(linear)
             self._bytes = content
         return self._linear
 
 
-# F C F of a covariance C and the diagonal F = FLU_FROM_FRD, element by element
-TURNED_COVARIANCE = np.outer(FLU_FROM_FRD.diagonal(), FLU_FROM_FRD.diagonal())
 OnFix = Callable[[int, Array, Array], None]
 # what a message of another layout than its type's makes the readers raise
 UNREADABLE = (AttributeError, TypeError, ValueError, IndexError, OverflowError)
 
 
 class _VelocityReader:
-    """Reads the velocity and its covariance from messages of one type. turned: as in `LinearCovariance`."""
+    """Reads the velocity and its covariance from messages of one type. axes: as in `LinearCovariance`."""
 
-    def __init__(self, kind: VelocityType, turned: bool = False) -> None:
+    def __init__(self, kind: VelocityType, axes: Axes) -> None:
         self._velocity, self._given, self._lacks = kind.velocity, kind.covariance, kind.lacks_covariance
-        self._covariance = LinearCovariance(turned)
-        self._turned = turned
+        self._covariance = LinearCovariance(axes)
+        self._axes = axes
 
     def __call__(self, message: Any) -> tuple[Vector, Array | None]:
         velocity = self._velocity(message)
         covariance = None if self._lacks(message) else self._covariance(self._given(message))
-        if self._turned:
-            return (velocity.x, -velocity.y, -velocity.z), covariance
-        return (velocity.x, velocity.y, velocity.z), covariance
+        if self._axes is AS_SENT:
+            return (velocity.x, velocity.y, velocity.z), covariance
+        sent = velocity.x, velocity.y, velocity.z
+        x, y, z = (sign * sent[place] for place, sign in zip(*self._axes, strict=True))
+        return (x, y, z), covariance
+
+
+def turns_dvl(kind: VelocityType, frame_id: str, parameters: Parameters) -> bool:
+    """Return whether velocities of a DVL are turned about x by 180°, from their own axes to those of base_frame.
+
+    A z-down vehicle's DVL is z down as well, unless its frame_id says otherwise.
+    """
+    if parameters.dvl_axes != FROM_MESSAGE:
+        return parameters.dvl_axes != parameters.base_axes
+    if parameters.is_z_down:
+        return frame_id.lower().endswith("_flu")
+    return kind.is_turned(frame_id)
 
 
 class MessageDecoder:
@@ -156,7 +203,7 @@ class MessageDecoder:
         self.dvl_type = velocity_type("dvl_type", parameters.dvl_type)
         self.reference_type = velocity_type("gnss_type", parameters.gnss_type)
         self.imu_alignment = ImuAlignment(parameters)
-        self._reference_readers = [_VelocityReader(self.reference_type, turned) for turned in (False, True)]
+        self._reference_readers: dict[Axes, _VelocityReader] = {}
         self._on_problem = on_problem
         self.on_fix: OnFix = lambda *_: None
         self.forget()
@@ -185,7 +232,7 @@ class MessageDecoder:
             if broken is not None:
                 return Refusal(broken.counter)
             if self._dvl_reader is None:
-                self._dvl_reader = _VelocityReader(kind, self.turns_dvl)
+                self._dvl_reader = _VelocityReader(kind, HALF_TURN if self.turns_dvl else AS_SENT)
                 self.note_axes()
             velocity, covariance = self._dvl_reader(message)
             stamp = self._stamp_ns(Stream.DVL, message.header, received_ns)
@@ -203,7 +250,9 @@ class MessageDecoder:
             stamp = self._stamp_ns(Stream.REFERENCE, message.header, received_ns)
             if kind.position is not None:
                 return self._difference(kind.position, message, stamp, frame.frame)
-            velocity, covariance = self._reference_readers[frame.points_down](message)
+            if frame.axes not in self._reference_readers:
+                self._reference_readers[frame.axes] = _VelocityReader(kind, frame.axes)
+            velocity, covariance = self._reference_readers[frame.axes](message)
         except UNREADABLE as error:
             return self.undecodable(Stream.REFERENCE, f"{kind.name}, {type(error).__name__}: {error}")
         return ReferenceSample(stamp, velocity, covariance, frame.frame)
@@ -277,11 +326,8 @@ class MessageDecoder:
 
     @property
     def turns_dvl(self) -> bool:
-        """Whether the DVL's data are turned from forward-right-down to forward-left-up."""
-        axes = self.parameters.dvl_axes
-        if axes != FROM_MESSAGE:
-            return axes == FRD
-        return self.dvl_type.is_turned(self.dvl_frame or "")
+        """Whether the DVL's data are turned about x by 180°, to the axes of base_frame."""
+        return turns_dvl(self.dvl_type, self.dvl_frame or "", self.parameters)
 
     def note_axes(self) -> None:
         """Ask about a DVL whose data are turned upside down, and its mounting as well; its frame is known by now."""
@@ -310,14 +356,15 @@ class MessageDecoder:
     def _frame_named(self, frame_id: str) -> DeclaredFrame | None:
         p = self.parameters
         if p.gnss_frame != FROM_FRAME_ID:
-            return DECLARED_FRAMES[p.gnss_frame]
+            return DECLARED_FRAMES[p.gnss_frame].in_base(p)
         if self.reference_type.reference_frame is not None:
             return DeclaredFrame(self.reference_type.reference_frame)
         frame = frame_named(frame_id, (p.base_frame,))
         if frame is None:
             known = {"base": p.base_frame, "earth": ", ".join(EARTH_FRAMES)}
             self._problem("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, **known))
-        return frame
+            return None
+        return frame.in_base(p)
 
     def note_imu_frame(self, frame_id: str) -> None:
         """Take note of the frame of IMU messages."""

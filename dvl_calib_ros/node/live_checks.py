@@ -39,7 +39,11 @@ class GravitySeen:
         rows = np.array(self._rows, dtype=float).reshape(-1, 7)
         gravity = Gravity.of(rows[:, :4], rows[:, 4:])
         body_from_imu = rotation_from_rpy(parameters.imu_rpy)
-        found = None if gravity is None else gravity.contradiction(topic, body_from_imu, parameters.imu_frame)
+        found = (
+            None
+            if gravity is None
+            else gravity.contradiction(topic, body_from_imu, parameters.imu_frame, parameters.is_z_down)
+        )
         return [] if found is None else [found]
 
 

@@ -59,9 +59,6 @@ FAMILIES = ((True, "Models with GNSS"), (False, "Models without GNSS"))
 # Which way is plus, for who mounts it
 _AXES = {
     "scale": "scale of motion ahead",
-    "lever arm x": "lever arm, ahead",
-    "lever arm y": "lever arm, to port",
-    "lever arm z": "lever arm, up",
 }
 
 
@@ -247,9 +244,11 @@ def _headline(run: Replayed, rejected: bool) -> str:
 
 def _mounting(run: Replayed) -> Iterator[Item]:
     """What was found, what the angles are measured against, whose own error stays in them, and what is not shown."""
+    body_axes = Parameters.from_mapping(run.result.parameters).body_axes
+    names = _AXES | {f"lever arm {axis}": f"lever arm, {where}" for axis, where in zip("xyz", body_axes, strict=True)}
     numbers = [
         Number(
-            _AXES.get(each.name, each.name),
+            names.get(each.name, each.name),
             each.in_unit(each.value, signed=True),
             each.in_unit(each.std),
             each.in_unit(each.nominal),

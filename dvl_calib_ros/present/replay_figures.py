@@ -209,8 +209,8 @@ def held_out_errors(labels: Sequence[str], uncorrected: Array, corrected: Array,
 _SEEN, _MOST_TIMES = math.radians(12.0), 20
 # Length of a vehicle whose DVL is in its middle, and of the axes drawn, m and a share of it; its height by its length
 _LENGTH, _AXIS, _SLENDER = 2.0, 0.25, 0.3
-# Two axes of the body, what the second is called, and who looks along the third
-_VIEWS = ((0, 1, "to port", "from above"), (0, 2, "up", "from starboard"))
+# Two axes of the body, and who looks along the third
+_VIEWS = ((0, 1, "from above"), (0, 2, "from starboard"))
 
 
 def mounting_pictures(result: Result) -> list[Picture]:
@@ -228,14 +228,14 @@ def mounting_pictures(result: Result) -> list[Picture]:
     return [
         picture(
             f"DVL on the vehicle, {where}", f"Axes of the DVL as configured and as found, {where}. {how}",
-            _view, (across, up, name), nominal, rotation_of(times * turn) @ nominal, place or (0.0, 0.0, 0.0),
-            caption=how,
+            _view, (across, up, parameters.body_axes[up]), nominal, rotation_of(times * turn) @ nominal,
+            place or (0.0, 0.0, 0.0), parameters.is_z_down, caption=how,
         )
-        for across, up, name, where in _VIEWS
+        for across, up, where in _VIEWS
     ]  # fmt: skip
 
 
-def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float]) -> Figure:
+def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float], down: bool) -> Figure:
     across, up, name = axes_of
     figure, axes = new_figure(height=2.6)
     length = max(_LENGTH, 2.4 * float(np.abs(place).max()))
@@ -250,6 +250,8 @@ def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Se
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("ahead, m")
     axes.set_ylabel(f"{name}, m")
+    if down:  # port stays on the left, the surface above
+        axes.invert_yaxis()
     legend_above(axes)
     return figure
 

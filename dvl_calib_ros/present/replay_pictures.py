@@ -14,7 +14,6 @@ from .error_terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
 from .figure_data import TimeAxis
 from .figure_style import Picture, picture
 
-BODY_AXES = ("ahead", "to port", "up")
 # What becomes of DVL samples, by model
 FATES: Mapping[str, Callable[[Result, str], int]] = {
     "used": lambda result, name: result.estimates[name].used,
@@ -67,7 +66,8 @@ def _line(name: str, history: ModelHistory, term: Term) -> figures.ModelLine:
 def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
     """Velocity and, with a reference, residual, per body axis."""
     time = TimeAxis(history.stamps_ns)
-    t = Parameters.from_mapping(replayed.result.parameters).rotation_dvl_from_body
+    parameters = Parameters.from_mapping(replayed.result.parameters)
+    t = parameters.rotation_dvl_from_body
     correction = replayed.result.estimate
     before, after = history.dvl_velocity @ t, correction.corrected_velocity(history.dvl_velocity, t)
     pictures = [
@@ -76,7 +76,7 @@ def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
             figures.velocity_over_time, time, history.dvl_ns, before[:, axis], after[:, axis], history.paired_ns,
             history.reference_velocity[:, axis], f"velocity {where}, m/s",
         )
-        for axis, where in enumerate(BODY_AXES)
+        for axis, where in enumerate(parameters.body_axes)
     ]  # fmt: skip
     navigation = replayed.navigation
     if navigation is not None:
@@ -86,7 +86,7 @@ def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
                 figures.residual_over_time, time, navigation.stamps_ns, -navigation.error_before[:, axis],
                 -navigation.error_after[:, axis], f"DVL − GNSS {where}, m/s",
             )
-            for axis, where in enumerate(BODY_AXES)
+            for axis, where in enumerate(parameters.body_axes)
         ]  # fmt: skip
     return pictures
 

@@ -22,6 +22,8 @@ from ..calibration.numerics.samples import Codes, Covariances, Index, Mask, Stam
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance, stamp_ns
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES, VelocityType
 
+ODOMETRY = "nav_msgs/msg/Odometry"
+
 
 @dataclass(frozen=True)
 class Laid:
@@ -31,7 +33,7 @@ class Laid:
     values: (N, 3) velocity, m/s, in the message's axes; of an IMU (N, 7) its quaternion (x, y, z, w) and angular
     velocity, rad/s, nan where not given. frame: (N,) places in frames, of frame_ids. covariance: (N,) places in
     distinct (C, 3, 3), (m/s)², -1 where not given. broken: (N,) 1 + the first of its type's rules that a message
-    breaks, 0 if none. beside: (N, 3) acceleration, m/s², of an IMU, angular velocity, rad/s, of a twist; else nan.
+    breaks, 0 if none. beside: (N, 3) acceleration, m/s², of an IMU; else as `beside_velocity`.
     world: frame_id of the first message's header, which of an odometry is that of its pose. heading_variance: that of
     an IMU's orientation about z, rad², of the first message; nan where none is given.
     """
@@ -219,7 +221,7 @@ class Collector:
 
     def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
         self._topic, self._msgtype, self._parameters, self._decoder = topic, msgtype, parameters, decoder
-        shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "beside": (3,)}
+        shapes = {"values": (7 if msgtype == IMU_TYPE else 3,), "beside": (beside_width(msgtype),)}
         self._laid = {name: GrowingRows(dtype, shapes.get(name, ()), expected) for name, dtype in _DTYPES.items()}
         self._world = ""
         self._heading_variance = math.nan
@@ -257,7 +259,8 @@ class Collector:
                 self._heading_variance = heading_variance(columns.orientation_covariance[0])
         else:
             velocity = kind.velocity(columns)
-            values, beside = _columns_of(velocity), np.broadcast_to(turning(columns), (n, 3))
+            values, beside = _columns_of(velocity), beside_velocity(columns, self._msgtype)
+            beside = np.broadcast_to(beside, (n, beside.shape[1]))
             covariances = _covariances(kind, columns)
             broken = _broken(kind, columns, self._parameters)
         self._world = self._world or frame_name(columns.header.frame_id[0].tobytes().decode("ascii"))
@@ -313,12 +316,29 @@ def _columns_of(vector: Any) -> Array:
     return np.column_stack([vector.x, vector.y, vector.z]).astype(float, copy=False)
 
 
-def turning(message: Any) -> Array:
-    """Angular velocity of a twist, rad/s, of columns (N, 3) or of a message (1, 3); nan of other types."""
+def beside_width(msgtype: str) -> int:
+    """Return how many numbers are kept beside a velocity or an IMU's data."""
+    return 10 if msgtype == ODOMETRY else 3
+
+
+def beside_velocity(message: Any, msgtype: str) -> Array:
+    """Return the angular velocity of a twist (rad/s), and of an odometry its pose.
+
+    Returns
+    -------
+    (N, 3) of columns or (1, 3) of a message; of an odometry (N, 10) with its position (m) and its quaternion (x, y, z,
+    w). nan where a type has none.
+
+    """
     twist = getattr(message, "twist", None)
     if twist is None:
-        return np.full((1, 3), np.nan)
-    return _columns_of(getattr(twist, "twist", twist).angular)
+        return np.full((1, beside_width(msgtype)), np.nan)
+    rates = _columns_of(getattr(twist, "twist", twist).angular)
+    if msgtype != ODOMETRY:
+        return rates
+    q = message.pose.pose.orientation
+    quaternion = np.column_stack([q.x, q.y, q.z, q.w]).astype(float, copy=False)
+    return np.hstack([rates, _columns_of(message.pose.pose.position), quaternion])
 
 
 def _imu(columns: MessageColumns) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.numerics.frames import FLU_FROM_FRD, Array
+from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import (
     FRAME_CODES,
     Covariances,
@@ -24,7 +24,7 @@ from ..calibration.numerics.samples import (
     no_samples,
     sample_block,
 )
-from ..messages.decode import TURNED_COVARIANCE, WRONG_FRAME, MessageDecoder, Refusal
+from ..messages.decode import AS_SENT, HALF_TURN, WRONG_FRAME, Axes, MessageDecoder, Refusal
 from .columns import Laid, TopicColumns
 
 # Messages of a stretch: enough for columns to pay, few enough for what is made of them to stay in the caches.
@@ -152,15 +152,16 @@ def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBloc
         broken = [(rule.counter, laid.broken == code) for code, rule in enumerate(decoder.dvl_type.rules, start=1)]
     else:
         codes = np.zeros(len(laid.frames), dtype=np.uint8)
-        down = np.zeros(len(laid.frames), dtype=bool)
+        axes: dict[Axes, Mask] = {}
         for place, name in names.items():
             said = decoder.reference_frame(name)
             is_other[place] = said is None
             codes[place] = 0 if said is None else FRAME_CODES[said.frame]
-            down[place] = said is not None and said.points_down
+            if said is not None and said.axes is not AS_SENT:
+                axes.setdefault(said.axes, np.zeros(len(laid.frames), dtype=bool))[place] = True
         frames = codes[laid.frame]
-        if down.any():
-            values, covariances = _turned(values, covariances, down[laid.frame])
+        for own, of_frame in axes.items():
+            values, covariances = _turned(own, values, covariances, of_frame[laid.frame])
     for reason, is_broken in [(WRONG_FRAME, is_other[laid.frame]), *broken]:
         new = is_broken & (refused == 0)
         if new.any():
@@ -168,23 +169,22 @@ def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBloc
     if stream is Stream.DVL and not refused.all():
         decoder.note_axes()
         if decoder.turns_dvl:
-            values, covariances = _turned(values, covariances, np.ones(len(laid), dtype=bool))
+            values, covariances = _turned(HALF_TURN, values, covariances, np.ones(len(laid), dtype=bool))
     return sample_block(
         stream, _stamped(stream, laid, decoder, refused), values, covariance=covariances, frames=frames,
         arrival=laid.arrival, refused=refused, reasons=reasons,
     )  # fmt: skip
 
 
-def _turned(values: Array, covariances: Covariances, which: Mask) -> tuple[Array, Covariances]:
-    """Those of N velocities that are forward-right-down (N,) as forward-left-up, with their covariances."""
+def _turned(axes: Axes, values: Array, covariances: Covariances, which: Mask) -> tuple[Array, Covariances]:
+    """Turn those of N velocities that are sent in other axes (N,), with their covariances."""
+    turned = axes.covariance(covariances.distinct)
     if which.all():
-        return values * FLU_FROM_FRD.diagonal(), Covariances(
-            covariances.distinct * TURNED_COVARIANCE, covariances.index
-        )
+        return axes.velocity(values), Covariances(turned, covariances.index)
     n = len(covariances.distinct)
-    both = np.concatenate([covariances.distinct, covariances.distinct * TURNED_COVARIANCE])
+    both = np.concatenate([covariances.distinct, turned])
     index = np.where(which & (covariances.index >= 0), covariances.index + n, covariances.index)
-    return np.where(which[:, None], values * FLU_FROM_FRD.diagonal(), values), Covariances(both, index.astype(np.intp))
+    return np.where(which[:, None], axes.velocity(values), values), Covariances(both, index.astype(np.intp))
 
 
 def _imu(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:

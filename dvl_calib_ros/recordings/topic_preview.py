@@ -23,7 +23,7 @@ from ..calibration.numerics.samples import Index, Stamps
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.positions import SELDOM_S, FixDifference, PositionType
-from .columns import TopicColumns, stamped, turning
+from .columns import ODOMETRY, TopicColumns, beside_velocity, stamped
 
 # Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
 # straights, and stamps that are late by seconds; 10 Hz is what a DVL gives at most.
@@ -44,7 +44,8 @@ class Look:
     in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan where not
     given. rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero where it has none. world:
     frame_id of the header, which of an odometry is that of its pose. claimed_std: noise per axis that the messages
-    claim, m/s, of an IMU that of its heading, rad, in the median; nan where they claim none.
+    claim, m/s, of an IMU that of its heading, rad, in the median; nan where they claim none. pose: (N, 7) position, m,
+    and quaternion x y z w of an odometry.
     """
 
     topic: str
@@ -58,6 +59,7 @@ class Look:
     rates: Array | None = None
     world: str = ""
     claimed_std: float = math.nan
+    pose: Array | None = None
 
     @property
     def speed(self) -> float:
@@ -124,13 +126,13 @@ def look_of(
     ahead_s = 1e-9 * float(median(np.asarray(stamps_ns - log_ns, dtype=float)))
     stamps_s = 1e-9 * (stamps_ns[kept] - start_ns)
     rate_hz = count / seconds if seconds else 0.0
-    rates = beside[kept]
+    rates, pose = beside[kept, :3], beside[kept, 3:] if msgtype == ODOMETRY else None
     if msgtype == IMU_TYPE:
         values, rates = np.hstack([values, beside]), np.full((0, 3), np.nan)
     turns = None if np.isnan(rates).all() else rates
     frame_id, claimed = numbers.frame_id, numbers.claimed_std
     return Look(
-        topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], turns, numbers.world, claimed
+        topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], turns, numbers.world, claimed, pose
     )
 
 
@@ -232,7 +234,7 @@ class _Numbers:
         """A velocity, or quaternion and angular velocity of an IMU; and what is kept beside."""
         if self._kind is not None:
             v = message.velocity if self._kind.position else self._kind.velocity(message)
-            return [v.x, v.y, v.z], turning(message)
+            return [v.x, v.y, v.z], beside_velocity(message, self._msgtype)
         q, w, a = message.orientation, message.angular_velocity, message.linear_acceleration
         given = (
             ((q.x, q.y, q.z, q.w), message.orientation_covariance),
@@ -262,7 +264,7 @@ class _Numbers:
         if self._msgtype != IMU_TYPE:
             values[(values == 0.0).all(axis=1)] = np.nan  # what drivers send for want of a measurement
             whole = (np.abs(values) < FASTEST).all(axis=1)
-        for each in (values, beside):
+        for each in (values, beside[:, :3]):
             each[~(np.abs(each) < FASTEST)] = np.nan  # so that their squares are numbers
         order = np.lexsort((arrival, stamps_ns))
         return stamps_ns, log_ns, values, beside, order[whole[order]]

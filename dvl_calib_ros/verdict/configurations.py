@@ -254,6 +254,14 @@ CONFIGURATIONS = (
         "A transform or parameter says another mounting than the data.",
         "try -p mounting_rpy:={option}",
     ),
+    _Said(
+        "FRAMES_AMBIGUOUS",
+        "the data fit {taken} and, as well, {other}; the first is taken",
+        "Both explain the data, and give another mounting. Which side is port on the DVL, and in which axes is the "
+        "reference?",
+        "set the one that is right",
+        severity=Severity.MARGINAL,
+    ),
     _Said("TWO_CONTRADICTIONS", "{one}; {other}", "Two of this list at once.", ""),
 )
 

@@ -113,9 +113,12 @@ def finding(code: str, **numbers: object) -> Reason:
     return found
 
 
+_CAUSES = ("FRAMES_AMBIGUOUS", "CONFIGURATION_WRONG")
+
+
 def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
-    """The worst first, else in the order that they came in."""
-    return sorted(reasons, key=lambda each: _WORST_FIRST.index(each.severity))
+    """The worst first; of one severity frames and clocks first, as causes of the others, else as they came in."""
+    return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), each.code not in _CAUSES))
 
 
 def table(kinds: Iterable[Kind]) -> str:

@@ -16,7 +16,7 @@ from ...verdict.reasons import Reason, finding
 from ..models import MODELS, Model
 from ..models.base import Assumptions, Observations
 from ..models.parameters import Parameters
-from ..numerics.frames import Array, rotation_from_quaternion, skew
+from ..numerics.frames import FLU_FROM_FRD, Array, rotation_from_quaternion, skew
 from ..numerics.samples import FRAME_CODES, VelocityFrame
 from ..results.results import Estimate
 from ..streams.aligner import Aligner
@@ -186,6 +186,8 @@ def _information(
     rotation = np.array([[ca * cb, -sa, ca * sb], [sa * cb, ca, sa * sb], [-sb, zero, cb]]).transpose(2, 0, 1)
     turning, pitching = np.gradient(yaw, STEP_S), np.gradient(pitch, STEP_S)
     rates = np.column_stack([-turning * np.sin(pitch), pitching, turning * np.cos(pitch)])
+    if parameters.is_z_down:
+        rotation, rates = rotation @ FLU_FROM_FRD, rates @ FLU_FROM_FRD
     seen = Observations(
         ahead @ t.T,
         ahead,

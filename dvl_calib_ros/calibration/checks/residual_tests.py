@@ -144,7 +144,8 @@ def residual_trend(
     """
     if len(time) < 3 or time[-1] - time[0] < ENOUGH * STRETCH_S:
         return None
-    roll = np.arctan2(rotation_enu_from_body[:, 2, 1], rotation_enu_from_body[:, 2, 2])
+    up = np.sign(rotation_enu_from_body[:, 2, 2].mean())  # of a body that is z down -1
+    roll = np.arctan2(up * rotation_enu_from_body[:, 2, 1], up * rotation_enu_from_body[:, 2, 2])
     pitch = -np.arcsin(np.clip(rotation_enu_from_body[:, 2, 0], -1.0, 1.0))
     changing = [_mean(time, tilt, TILT_S[0]) - _mean(time, tilt, TILT_S[1]) for tilt in (roll, pitch)]
     body_from_enu = rotation_enu_from_body.swapaxes(1, 2)

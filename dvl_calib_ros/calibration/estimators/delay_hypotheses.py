@@ -100,7 +100,8 @@ class DelayBank:
         self._nis_sum = 0.0
         self.blocks = TimeBlocks()
         self._turns = turns_of(parameters.rotation_dvl_from_body, N_STATE)
-        self._up = self._turns[:, 2]
+        self._z = self._turns[:, 2]
+        self._up = parameters.up * self._z
         self._std_beside = prior_std(parameters.heading_deviation_std, parameters.dvl_bias_std)
         self._epoch_ns: int | None = None  # of the first row
         self._folds = FoldInformation(self._start) if verified else None
@@ -427,7 +428,7 @@ class DelayBank:
         """What rows of heave tell of some hypotheses (M,), as of `HeaveSums.with_terms`. heave: as in `known`."""
         sums = heave or self._heave.sums()
         some = sums._replace(told=sums.told[numbers], mean=sums.mean[numbers])
-        return some.with_terms(self._sums.heave_variance, self._up[:3])
+        return some.with_terms(self._sums.heave_variance, self._z[:3])
 
     def found(self, known: Sequence[Known]) -> list[Likely | None]:
         """What was known at times of this day, with what that makes of the heading; None where numbers ran away."""
@@ -477,7 +478,7 @@ class DelayBank:
 
     def _posterior(self, found: Likely, errors: GaussianState) -> Posterior:
         state = merged_mixture(errors, self.delays_s[found.kept], found.share)
-        raised = state.raised(found.inflation).turned(self._up, found.drifted)
+        raised = state.raised(found.inflation).turned(self._z, found.drifted)
         p = state.p
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, :3])  # (lever arm, misalignment)
         by_lever_arm = (p[:3, LEVER_ARM] * turns.T).sum(axis=1)

@@ -110,7 +110,7 @@ class Group:
         # the paper's models are as they are published
         self._deviates = self.needs is Needs.REFERENCE and models[0].in_correction_parameters
         self._turns = turns_of(parameters.rotation_dvl_from_body, models[0].n_state)
-        self._up = self._turns[:, 2]
+        self._z = self._turns[:, 2]
         self._n_errors = models[0].n_errors
         self._scatter = self._new_scatter() if still else None
         self._heave = HeaveRows(len(models), models[0].n_state, parameters) if models[0].heave is not None else None
@@ -130,7 +130,7 @@ class Group:
         """Blocks of time from now on."""
         terms = BlockTerms(self._turns, self._n_errors) if self._deviates else None
         std = prior_std(self._parameters.heading_deviation_std, self._parameters.dvl_bias_std)
-        return BlockScatter(self._x, self._p, BLOCK_S, terms, std)
+        return BlockScatter(self._x, self._p, BLOCK_S, terms, std, self._parameters.up * self._z)
 
     def update(
         self, stamps_ns: Stamps, seen: Observations, weight: Array, prior_known: Mask, ends: Ends | None = None
@@ -163,7 +163,7 @@ class Group:
             beside = None
             if of_heave:
                 sums, variance = of_heave[last]
-                beside = sums.with_terms(variance, self._up[:3])
+                beside = sums.with_terms(variance, self._z[:3])
             self._scatter.add(cuts, after.at.x[at], after.at.p[at], at_last, beside)
         self._states.clear()
         self._of_recording.clear()
@@ -306,7 +306,7 @@ class Group:
             return self._now(), None
         sums = self._heave.sums()
         state, variance = _joined(GaussianState(self._x, self._p), sums, self._parameters.motion_std)
-        return state, sums.with_terms(variance, self._up[:3])
+        return state, sums.with_terms(variance, self._z[:3])
 
     def _process_noise(self, stamps_ns: Stamps) -> Array | None:
         rate = self._assembler.process_rate
@@ -329,7 +329,7 @@ class Group:
         if name not in self._of_recording:
             found = self._scatter.found(self.index[name])
             state = self._sound_state(name, found.shift[0], found.more[0]) if found.more.any() else self.state(name)
-            raised = state.raised(found.inflation).turned(self._up, found.drifted)
+            raised = state.raised(found.inflation).turned(self._z, found.drifted)
             self._of_recording[name] = found.of_bias.at(0).added_to(raised)
         return self._of_recording[name]
 
@@ -452,16 +452,15 @@ class BlockScatter:
     last block, so it depends on stamps alone.
     """
 
-    def __init__(self, x: Array, p: Array, seconds: float, terms: BlockTerms | None, std: Array) -> None:
+    def __init__(self, x: Array, p: Array, seconds: float, terms: BlockTerms | None, std: Array, up: Array) -> None:
         """Start from states x (K, n), P (K, n, n).
 
         seconds: length of a block. terms: None for filters that heading and bias are not looked for by. std: (9,) of
-        `heading_states.prior_std`.
+        `heading_states.prior_std`. up: (n,) as of `heading_states`.
         """
         self._blocks = TimeBlocks()
         self._length_ns = round(seconds * 1e9)
-        self._terms, self._std = terms, std
-        self._up = np.zeros(x.shape[-1]) if terms is None else terms.up
+        self._terms, self._std, self._up = terms, std, up
         self._beside: tuple[Array, Array] | None = None
         self._last: int | None = None
         self._state = GaussianState(x, p)

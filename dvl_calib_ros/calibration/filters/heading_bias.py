@@ -303,7 +303,7 @@ def prior_std(heading: float, bias: float) -> Array:
 def heading_states(seen: Sequence[HeadingEvidence], std: Array, up: Array) -> list[HeadingStates]:
     """The deviation each time; none where blocks are without terms, which say no more than `inflation`.
 
-    std: (9,) of `prior_std`. up: (n,) states that turn about the body's vertical, as of `TermsOfBlock`.
+    std: (9,) of `prior_std`. up: (n,) states that turn about the vertical, upwards.
     """
     found: dict[int, HeadingStates] = {}
     with_them = [number for number, each in enumerate(seen) if each.has_terms]

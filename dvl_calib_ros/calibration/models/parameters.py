@@ -25,6 +25,8 @@ IAC = "iac"
 FROM_FRAME_ID = "from_frame_id"
 UNKNOWN, TOLD, FROM_REFERENCE = "unknown", "told", "from_reference"
 FROM_MESSAGE, FLU, FRD = "from_message", "flu", "frd"
+# Axes of a world: north-west-up beside VelocityFrame's
+NWU = "nwu"
 IMU_ENU, IMU_NED = "enu", "ned"
 XYZ, XY = "xyz", "xy"
 
@@ -75,10 +77,11 @@ class Parameters:
     )
     gnss_frame: str = _parameter(
         FROM_FRAME_ID,
-        "Frame of the reference velocity; frd: of the body, forward-right-down. from_frame_id: base_frame is body; "
-        "enu, map, odom, world are ENU; ned is NED; a name that ends in _enu, _ned, _flu or _frd says so; anything "
-        "else is refused.",
-        choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame), FRD),
+        "Frame of the reference velocity; body: of the body, in base_axes; frd: of the body, forward-right-down. "
+        "from_frame_id: base_frame is body; "
+        "enu, map, odom, world are ENU; ned is NED; nwu: north-west-up; a name that ends in _enu, _ned, _nwu, _flu "
+        "or _frd says so; anything else is refused.",
+        choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame), FRD, NWU),
     )
     gnss_axes: str = _parameter(
         AUTO,
@@ -88,7 +91,13 @@ class Parameters:
     )
     base_frame: str = _parameter(
         "base_link",
-        "Name of the body frame (forward-left-up): of calibrated_twist, and of a body-frame reference.",
+        "Name of the body frame: of calibrated_twist, and of a body-frame reference.",
+    )
+    base_axes: str = _parameter(
+        FLU,
+        "Axes of base_frame: flu (forward-left-up, as REP-103 has it) or frd (forward-right-down, z down). Mounting, "
+        "lever arm and every result are in these axes.",
+        choices=(FLU, FRD),
     )
     use_transforms: bool = _parameter(
         True,
@@ -106,8 +115,8 @@ class Parameters:
     )
     dvl_axes: str = _parameter(
         FROM_MESSAGE,
-        "Axes of the DVL's data: flu (forward-left-up), taken as they are, or frd (forward-right-down), turned to "
-        "flu. from_message: a frame_id that ends in _frd or _flu says so, else the message type does.",
+        "Axes of the DVL's data: flu (forward-left-up) or frd (forward-right-down). Where base_axes are the other, "
+        "they are turned. from_message: a frame_id that ends in _frd or _flu says so, else the message type does.",
         choices=(FROM_MESSAGE, FLU, FRD),
     )
     dvl_type: str = _parameter(
@@ -165,8 +174,9 @@ class Parameters:
     )
     imu_frame: str = _parameter(
         IMU_ENU,
-        "What the IMU's orientation is relative to: enu (yaw 0 is east, REP-103) or ned (yaw 0 is north, clockwise).",
-        choices=(IMU_ENU, IMU_NED),
+        "What the IMU's orientation is relative to: enu (yaw 0 is east, REP-103), ned (yaw 0 is north, clockwise) or "
+        "nwu (yaw 0 is north, counter-clockwise).",
+        choices=(IMU_ENU, IMU_NED, NWU),
     )
     dvl_time_offset: float = _parameter(
         0.0,
@@ -542,6 +552,21 @@ class Parameters:
     def as_dict(self) -> dict[str, Any]:
         """Name -> value with arrays as lists, for YAML and JSON."""
         return {name: list(value) if isinstance(value := getattr(self, name), tuple) else value for name in SCHEMA}
+
+    @property
+    def is_z_down(self) -> bool:
+        """Whether base_frame is forward-right-down."""
+        return self.base_axes == FRD
+
+    @property
+    def body_axes(self) -> tuple[str, str, str]:
+        """Which way x, y and z of base_frame point, in words."""
+        return ("ahead", "to starboard", "down") if self.is_z_down else ("ahead", "to port", "up")
+
+    @property
+    def up(self) -> float:
+        """The vertical, upwards, along z of base_frame: 1 or, z down, -1."""
+        return -1.0 if self.is_z_down else 1.0
 
     @cached_property
     def rotation_dvl_from_body(self) -> Array:

@@ -18,6 +18,8 @@ Quaternion = tuple[float, float, float, float]
 
 # forward-right-down <-> forward-left-up, and its own inverse
 FLU_FROM_FRD: Array = np.diag([1.0, -1.0, -1.0])
+# north-west-up -> east-north-up
+ENU_FROM_NWU: Array = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 # north-east-down -> east-north-up, and its own inverse
 ENU_FROM_NED: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 

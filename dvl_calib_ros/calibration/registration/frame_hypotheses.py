@@ -1,21 +1,22 @@
-"""In which frames velocities and attitudes may be: the reading of the data under which DVL and reference agree.
+"""Frame hypotheses: in which axes velocities and attitudes are, by how well DVL and reference agree.
 
-Under every reading (reference in the body, ENU or NED; IMU as its transform says or as marine instruments give it; DVL
-forward-left-up or forward-right-down) velocities of one time are compared: where the mounting is known, by what is left
-of the difference; where it is not, by what is left after the best rotation. A DVL that sits ahead, or is stamped late,
-can look as if it were turned; so before anything else than what is declared is taken, readings are registered.
+Under each reading of the data (frame of the reference, axes and world of the IMU, axes of the DVL) velocities of one
+time are compared: with the mounting, where it is known, else after the best rotation. A DVL that sits ahead, or is
+stamped late, can look as if it were turned; so the readings that compare well are registered, with lever arm and delay.
+The posterior of a reading is its prior, which the caller states, times a tempered likelihood of the residual.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..numerics.frames import (
     ENU_FROM_NED,
+    ENU_FROM_NWU,
     FLU_FROM_FRD,
     Array,
     cross,
@@ -27,7 +28,7 @@ from ..numerics.frames import (
     whole_degrees,
 )
 from ..numerics.samples import VelocityFrame
-from ..streams.imu_frame import quaternion_product
+from ..streams.imu_frame import ENU_FROM, quaternion_product
 from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from .configuration_check import DRAWN, angle_between, misfit, nearest
 from .earth_frame_velocity import Directions
@@ -48,15 +49,27 @@ CLEARLY = 0.5
 FITS = 0.3
 # Data need a turn about the direction of travel if it leaves less than this share.
 ROLLED = 0.8
+# Independent samples of three axes that a comparison counts for, and rows of a registration for each more of them; a
+# residual below this share of the speed is none.
+INDEPENDENT, ROWS_A_SAMPLE, LEAST_LEFT = 4.0, 50.0, 0.005
+# A mean velocity to the side below this share of the speed is none that a vehicle travels by.
+SIDEWAYS = 0.5
 # Turn rates below this (rad/s) do not say which way a body's axes point.
 TURNS = 0.01
 # A mounting nearer than this (rad) to one that is drawn is that one.
 MEANT_WITHIN = math.radians(8.0)
 
 
+# Frames of a reference: in the body, and by which matrix it is read.
+IN_BODY = (VelocityFrame.BODY.value, "frd")
+READ_BY: Mapping[str, Array] = {
+    "body": np.eye(3), "frd": FLU_FROM_FRD, "enu": np.eye(3), "ned": ENU_FROM_NED, "nwu": ENU_FROM_NWU,
+}  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class ImuFrame:
-    """How an IMU's data may be meant. rotation_body_from_imu (3, 3); world: "enu" or "ned"."""
+    """How an IMU's data may be meant. rotation_body_from_imu (3, 3); world: as parameter imu_frame."""
 
     rotation_body_from_imu: Array
     world: str
@@ -67,19 +80,26 @@ class ImuFrame:
         quaternions = quaternion_product(
             imu.orientation, np.array(quaternion_from_rotation(self.rotation_body_from_imu.T))
         )
-        if self.world == "ned":
-            quaternions = quaternion_product(np.array(quaternion_from_rotation(ENU_FROM_NED)), quaternions)
+        quaternions = quaternion_product(np.array(quaternion_from_rotation(ENU_FROM[self.world])), quaternions)
         return ImuColumns(imu.times, quaternions, imu.angular_velocity @ self.rotation_body_from_imu.T)
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One reading of the data. turned: the DVL's data are forward-right-down; reference_turned: the reference's."""
+    """One reading of the data.
 
-    reference: VelocityFrame
+    reference: frame of the reference, as parameter gnss_frame. turned: whether the DVL's data are turned about x by
+    180°, to the axes of the body.
+    """
+
+    reference: str
     imu: ImuFrame | None
     turned: bool
-    reference_turned: bool = False
+
+    @property
+    def in_body(self) -> bool:
+        """Whether the reference is in the body."""
+        return self.reference in IN_BODY
 
 
 @dataclass(frozen=True)
@@ -88,13 +108,14 @@ class Agreement:
 
     left: root mean square of what is left of the difference of DVL and reference, as a share of the speed, at the
     mounting that is given or, without one, at the best. rotation_dvl_from_body: (3, 3) the best; best_left: what that
-    leaves.
+    leaves. is_ahead: whether the vehicle mostly goes ahead or astern under this reading, rather than sideways.
     """
 
     reading: Reading
     left: float
     rotation_dvl_from_body: Array
     best_left: float
+    is_ahead: bool
 
     @property
     def angle(self) -> float:
@@ -129,6 +150,15 @@ class Readings:
         square = float(squared(self._dvl).mean())
         return math.sqrt(max(left**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
 
+    def log_likelihood(self, left: float, registered: bool = False) -> float:
+        """Return the tempered log likelihood of a residual, as a share of the speed.
+
+        What a fit misses of arms, delays and waves is alike from sample to sample, so few of them count; more once
+        lever arm and delay are registered.
+        """
+        n = INDEPENDENT + (min(len(self), FEW_ROWS) / ROWS_A_SAMPLE if registered else 0.0)
+        return -3.0 * n * math.log(max(self.beside_noise(left), LEAST_LEFT))
+
     def agreements(self, readings: Sequence[Reading], rotation_dvl_from_body: Array | None) -> list[Agreement]:
         """All readings that can be tried, the best first, with clocks in time and no other lever arm.
 
@@ -159,7 +189,9 @@ class Readings:
             best = best_rotation(dvl[kept], body[kept], likely)
             best_left = _rms(dvl - body @ best.T) / speed
             left = best_left if known is None else _rms(dvl - body @ known.T) / speed
-            found.append(Agreement(reading, left, best, best_left))
+            travel = np.abs(body.mean(axis=0) if known is None else (dvl @ known).mean(axis=0))
+            is_ahead = bool(travel[1] < max(travel[0], SIDEWAYS * speed))
+            found.append(Agreement(reading, left, best, best_left, is_ahead))
         # of two that fit alike the one that asks for the smaller turn; rounding decides nothing: worlds that are both
         # turned over fit the same
         return sorted(found, key=lambda each: round(each.left + (0.02 * each.angle if known is None else 0.0), 9))
@@ -205,7 +237,7 @@ class Readings:
 
     def is_in_body(self, found: Agreement) -> bool:
         """Whether DVL and reference that agree as in the body are not both in the earth's frame."""
-        motion = self._read(replace(found.reading, reference=VelocityFrame.ENU))
+        motion = self._read(replace(found.reading, reference=VelocityFrame.ENU.value))
         if motion is None:
             return True
         directions = Directions()
@@ -219,14 +251,10 @@ class Readings:
         if key not in self._motions:
             m = self._motion
             imu = m.imu if reading.imu is None else reading.imu.read(m.imu)
-            reference = m.reference
-            in_earth = reading.reference is not VelocityFrame.BODY
+            in_earth = not reading.in_body
             if in_earth and (reading.imu is None or not m.has_attitude):
                 return None
-            if reading.reference is VelocityFrame.NED:
-                reference = reference @ ENU_FROM_NED.T
-            elif not in_earth and reading.reference_turned:
-                reference = reference @ FLU_FROM_FRD
+            reference = m.reference @ READ_BY[reading.reference].T
             turned = replace(m, reference=reference, in_earth=in_earth, imu=imu, turns=TurnRates.of(imu))
             self._motions[key] = turned
         return self._motions[key]

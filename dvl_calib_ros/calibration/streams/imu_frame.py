@@ -6,14 +6,25 @@ With W the turn from the IMU's world to ENU and M the IMU's mounting ``rotation_
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from ..models.parameters import IMU_NED, Parameters
-from ..numerics.frames import ENU_FROM_NED, Array, Quaternion, Vector, quaternion_from_rotation, rotation_from_rpy
+from ..models.parameters import IMU_ENU, IMU_NED, NWU, Parameters
+from ..numerics.frames import (
+    ENU_FROM_NED,
+    ENU_FROM_NWU,
+    Array,
+    Quaternion,
+    Vector,
+    quaternion_from_rotation,
+    rotation_from_rpy,
+)
 from ..numerics.samples import ImuSample, SampleBlock
 
+# By the parameter imu_frame
+ENU_FROM: Mapping[str, Array] = {IMU_ENU: np.eye(3), IMU_NED: ENU_FROM_NED, NWU: ENU_FROM_NWU}
 # What is not finite stays so, and is counted further on.
 _QUIET = np.errstate(invalid="ignore", over="ignore")
 
@@ -25,12 +36,11 @@ class ImuAlignment:
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        self.is_identity = not any(parameters.imu_rpy) and parameters.imu_frame != IMU_NED
+        self.is_identity = not any(parameters.imu_rpy) and parameters.imu_frame == IMU_ENU
         rotation_body_from_imu = rotation_from_rpy(parameters.imu_rpy)
         self._rotation_body_from_imu: Array = rotation_body_from_imu
         self._imu_from_body = quaternion_from_rotation(rotation_body_from_imu.T)
-        world = ENU_FROM_NED if parameters.imu_frame == IMU_NED else np.eye(3)
-        self._enu_from_world = quaternion_from_rotation(world)
+        self._enu_from_world = quaternion_from_rotation(ENU_FROM[parameters.imu_frame])
 
     def sample(self, sample: ImuSample) -> ImuSample:
         """One sample, live. What the IMU does not give stays None; what is not finite stays so."""

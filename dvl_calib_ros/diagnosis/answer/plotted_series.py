@@ -212,7 +212,9 @@ def _of_motion(motion: EffectInput, about: str) -> dict[str, Array]:
         return {"yaw, ° from east to north": np.degrees(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))}
     if rotation is not None and about == "tilt":
         pitch = np.degrees(-np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0)))
-        return {"pitch, ° (bow down)": pitch, "roll, °": np.degrees(np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]))}
+        up = np.sign(rotation[:, 2, 2].mean())  # of a body that is z down -1
+        roll = np.degrees(np.arctan2(up * rotation[:, 2, 1], up * rotation[:, 2, 2]))
+        return {"pitch, ° (bow down)": pitch, "roll, °": roll}
     if rotation is not None and about == "depth":
         steps = np.clip(np.diff(motion.time, prepend=motion.time[0]), 0.0, 10.0)
         return {"height against the start, m": np.cumsum(np.einsum("ni,ni->n", rotation[:, 2], velocity) * steps)}

@@ -1,0 +1,380 @@
+"""The frames that a recording's data are in: prior odds by what it declares, likelihood by what its data fit.
+
+A hypothesis is a `Reading`: axes of base_frame, of the IMU and its world, of the reference, of the DVL. Its prior is
+the product of the odds of each contradiction of what names, transforms, message types, gravity and an odometry's own
+pose say. Its likelihood is that of the residual of DVL and reference, see `frame_hypotheses`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, IMU_ENU, IMU_NED, NWU, Parameters
+from ..calibration.numerics.frames import (
+    ENU_FROM_NED,
+    FLU_FROM_FRD,
+    Array,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    rpy_from_rotation,
+)
+from ..calibration.numerics.samples import VelocityFrame
+from ..calibration.registration.configuration_check import angle_between
+from ..calibration.registration.frame_hypotheses import (
+    CLEARLY,
+    FITS,
+    Agreement,
+    ImuFrame,
+    Reading,
+    Readings,
+    nominal_rpy,
+    turns_right,
+)
+from ..calibration.streams.imu_frame import ENU_FROM
+from ..calibration.streams.screening import unit_quaternions
+from ..messages.decode import DECLARED_FRAMES, DeclaredFrame, frame_named
+from ..messages.drivers import VELOCITY_TYPES
+from ..recordings.topic_preview import Look
+from ..verdict.reasons import Reason, finding
+from .clock_offsets import imu_columns_of
+from .discovery import as_option, in_degrees
+from .gravity import Gravity
+from .transforms import Placed
+
+# Prior odds of what contradicts a declaration, as their logarithm. A transform of the IMU that its driver does not
+# keep to is the commonest of these errors, a whole vehicle that is z down without saying so the rarest.
+IMU_IN_NED, IMU_IN_OTHER_WORLD, IMU_OTHERWISE = math.log(1 / 10), math.log(1 / 20), math.log(1 / 50)
+DVL_AXES_OTHER = math.log(1 / 20)
+# Where no transform says anything, marine axes are nearly as common as REP-103's.
+UNPLACED_IN_NED = UNPLACED_DVL_AXES_OTHER = math.log(1 / 3)
+# A transform or parameter of the mounting that is wrong; a mounting nobody says that is not as the body; one upside
+# down, which is the same as other axes.
+MOUNTING_OTHER, MOUNTING_TURNED, UPSIDE_DOWN = math.log(1 / 50), math.log(1 / 3), math.log(1 / 100)
+BASE_Z_DOWN = math.log(1 / 50)
+REFERENCE_FRAME_OTHER = math.log(1 / 200)
+REFERENCE_AXES_OTHER = math.log(1 / 50)
+# Of a reference that declares no frame: ENU, the body, NED; other worlds.
+UNDECLARED = {"enu": 0.0, "body": math.log(1 / 2), FRD: math.log(1 / 2), "ned": math.log(1 / 3)}
+OTHER_WORLD = math.log(1 / 50)
+# Axes of a twist that its own turn rates or its pose's world contradict; its own pose, which shows them.
+TWIST_RATES_OTHER, TWIST_POSE_OTHER = math.log(1 / 20), math.log(1 / 1000)
+# A vehicle travels ahead or astern, seldom sideways.
+SIDEWAYS = math.log(1 / 50)
+# An accelerometer of which the sign is wrong; gravity that points down in the body or in the world alone.
+GRAVITY_INVERTED, GRAVITY_CONTRADICTS = math.log(1 / 100), math.log(1 / 1000)
+# Readings whose odds at a first look are this much worse (log) than the best are not registered; at most so many are.
+FAR_WORSE, MOST_REGISTERED = 8.0, 6
+# Two readings within these odds fit as well, rad and log.
+AS_LIKELY, SAME_ANSWER = math.log(3.0), math.radians(1.0)
+# A mounting is not as the body from here on, rad.
+TURNED_FROM = math.radians(12.0)
+# Over this time (s) a twist is held against the way of its own pose.
+POSE_STEP_S, POSE_LONGEST_S = 0.5, 1.5
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """The reading that is taken.
+
+    agreement: how well it fits. imu: its hypothesis of the IMU. says: what is doubtful of it, as another reading that
+    fits as well and gives another mounting.
+    """
+
+    agreement: Agreement
+    imu: ImuHypothesis | None
+    says: tuple[Reason, ...]
+
+
+class ImuHypothesis(NamedTuple):
+    """A hypothesis of the IMU. z_down: of the body under it; prior: log odds."""
+
+    frame: ImuFrame
+    z_down: bool
+    prior: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Tried:
+    """A reading with a mounting: rotation_dvl_from_body (3, 3), None for the one that fits. prior: log odds."""
+
+    agreement: Agreement
+    mounting: Array | None
+    prior: float
+
+    @property
+    def reading(self) -> Reading:
+        """Its reading."""
+        return self.agreement.reading
+
+    def odds(self, found: Array) -> float:
+        """Return the prior with that of the mounting (3, 3) that fits, where none is known, and of the travel."""
+        prior = self.prior + (0.0 if self.agreement.is_ahead else SIDEWAYS)
+        if self.mounting is None and angle_between(found, np.eye(3)) > TURNED_FROM:
+            prior += UPSIDE_DOWN if found[2, 2] < 0.0 else MOUNTING_TURNED
+        return prior
+
+
+class FrameChooser:
+    """Frames of one recording's streams."""
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        given: frozenset[str],
+        base_frame: str,
+        dvl: Look,
+        dvl_placed: Placed | None,
+        imu: Look | None,
+        imu_placed: Placed | None,
+    ) -> None:
+        """given: names of parameters that the user set."""
+        self._parameters, self._given, self._base_frame = parameters, given, base_frame
+        self._dvl, self._dvl_placed = dvl, dvl_placed
+        self._imu, self._imu_placed = imu, imu_placed
+        self._gravity = None if imu is None else Gravity.of(imu.values[:, :4], imu.values[:, 7:])
+        self.imus = self._imu_hypotheses()
+
+    @property
+    def imu(self) -> ImuHypothesis | None:
+        """The likeliest hypothesis of the IMU by its own data alone."""
+        return max(self.imus, key=lambda each: each.prior, default=None)
+
+    # ------------------------------------------------------------------ priors
+
+    @property
+    def _says_z_down(self) -> bool:
+        return self._parameters.is_z_down or self._base_frame.lower().endswith(("_frd", "_ned"))
+
+    def _imu_hypotheses(self) -> list[ImuHypothesis]:
+        imu, placed = self._imu, self._imu_placed
+        if imu is None:
+            return []
+        if self._given & {"imu_rpy", "imu_frame"}:
+            rotation = rotation_from_rpy(self._parameters.imu_rpy)
+            frame = ImuFrame(rotation, self._parameters.imu_frame, "as given")
+            return [ImuHypothesis(frame, self._parameters.is_z_down, 0.0)]
+        at = np.eye(3) if placed is None else placed.rotation
+        says = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
+        frames = [
+            (ImuFrame(at, IMU_ENU, says), 0.0),
+            (
+                ImuFrame(at @ FLU_FROM_FRD, IMU_NED, f"forward-right-down in NED, {says}"),
+                UNPLACED_IN_NED if placed is None else IMU_IN_NED,
+            ),
+            (ImuFrame(at, IMU_NED, f"in NED, {says}"), IMU_IN_OTHER_WORLD),
+            (ImuFrame(at, NWU, f"with a heading that counts from north, {says}"), IMU_OTHERWISE),
+        ]
+        if not np.allclose(at, np.eye(3)):
+            said = "as the body, whatever its transform says"
+            frames.append((ImuFrame(np.eye(3), IMU_ENU, said), IMU_IN_OTHER_WORLD))
+        if self._gravity is not None:
+            frames.append((ImuFrame(at @ FLU_FROM_FRD, IMU_ENU, f"turned over, {says}"), IMU_OTHERWISE))
+        found = []
+        for frame, prior in frames:
+            z_down = self._body_is_z_down(frame)
+            if "base_axes" in self._given and z_down != self._parameters.is_z_down:
+                continue
+            if z_down and frame.world == IMU_NED and frame.rotation_body_from_imu is at:
+                prior = 0.0  # the world of a vehicle that is z down
+            elif z_down:
+                prior += IMU_IN_OTHER_WORLD
+            prior += BASE_Z_DOWN if z_down != self._says_z_down else 0.0
+            if self._gravity is not None:
+                wrong = self._gravity.contradicts(frame.rotation_body_from_imu, frame.world, z_down)
+                prior += (0.0, GRAVITY_CONTRADICTS, GRAVITY_INVERTED)[wrong]
+            found.append(ImuHypothesis(frame, z_down, prior))
+        return found
+
+    def _body_is_z_down(self, frame: ImuFrame) -> bool:
+        """Whether z of the body points down under a hypothesis of the IMU, by its attitude."""
+        assert self._imu is not None
+        quaternion = unit_quaternions(self._imu.values[:, :4])
+        known = np.isfinite(quaternion).all(axis=1)
+        if not known.any():
+            return self._says_z_down
+        up = ENU_FROM[frame.world][2] @ rotation_from_quaternion(quaternion[known]).mean(axis=0)
+        return bool(up @ frame.rotation_body_from_imu.T[:, 2] < 0.0)
+
+    def dvl_is_turned(self, z_down: bool) -> bool:
+        """Whether the DVL's data are to be turned to the axes of base_frame, as frame, transform and type declare."""
+        p, frame_id = self._parameters, self._dvl.frame_id.lower()
+        if p.dvl_axes != FROM_MESSAGE:
+            return (p.dvl_axes == FRD) != z_down
+        if frame_id.endswith(("_frd", "_flu")):
+            return frame_id.endswith("_frd") != z_down
+        # a frame whose z points down, as the sensor's own does, is that of the driver's axes and not REP-103's
+        placed = self._dvl_placed
+        driver_axes = placed is not None and placed.rotation[2, 2] < 0.0 and "mounting_rpy" not in self._given
+        return VELOCITY_TYPES[self._dvl.msgtype].is_turned(self._dvl.frame_id) and not driver_axes and not z_down
+
+    @property
+    def _dvl_axes_are_said(self) -> bool:
+        return self._parameters.dvl_axes != FROM_MESSAGE or self._dvl.frame_id.lower().endswith(("_frd", "_flu"))
+
+    def declared_reference(self, reference: Look) -> DeclaredFrame | None:
+        """The frame that a reference declares; None if it says nothing."""
+        if self._parameters.gnss_frame != FROM_FRAME_ID:
+            return DECLARED_FRAMES[self._parameters.gnss_frame]
+        of_type = VELOCITY_TYPES[reference.msgtype].reference_frame
+        if of_type is not None:
+            return DeclaredFrame(of_type)
+        return frame_named(reference.frame_id, (self._parameters.base_frame, self._base_frame))
+
+    def _reference_priors(self, reference: Look, imu: ImuHypothesis | None) -> dict[str, float]:
+        """Log odds of the frames that a reference may be in, by name."""
+        z_down = self._says_z_down if imu is None else imu.z_down
+        declared = self.declared_reference(reference)
+        if self._parameters.gnss_frame != FROM_FRAME_ID and declared is not None:
+            return {declared.in_base(self._parameters.replace(base_axes=FRD)).name if z_down else declared.name: 0.0}
+        names = ["enu", "body", *([] if z_down else [FRD]), "ned", NWU]
+        if declared is None:
+            priors = {name: UNDECLARED.get(name, OTHER_WORLD) for name in names}
+        else:
+            of_body = declared.frame is VelocityFrame.BODY
+            other = {"body": REFERENCE_AXES_OTHER, FRD: REFERENCE_AXES_OTHER} if of_body else {}
+            priors = {name: other.get(name, REFERENCE_FRAME_OTHER) for name in names}
+            priors["body" if z_down and declared.points_down else declared.name] = 0.0
+        shown = twist_axes(reference)
+        if shown is not None:
+            agreeing = {"body" if z_down else FRD} if shown == FRD else {"body"} if shown == "body" else {shown}
+            agreeing = set() if shown == "body" and z_down else agreeing
+            return {name: prior if name in agreeing else prior + TWIST_POSE_OTHER for name, prior in priors.items()} | {
+                name: 0.0 for name in agreeing
+            }
+        if not z_down and (declared is None or declared.frame is not VelocityFrame.BODY):
+            right = self._points_down(reference, imu)
+            priors["body" if right else FRD] += TWIST_RATES_OTHER
+        return priors
+
+    def _points_down(self, reference: Look, imu: ImuHypothesis | None) -> bool:
+        """Whether a twist is forward-right-down, by how it says that it turns, else by its pose's world."""
+        if self._imu is not None and imu is not None and reference.rates is not None:
+            turns = turns_right(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
+            if turns is not None:
+                return turns
+        world = frame_named(reference.world, ())  # of the pose: a body in NED is forward-right-down by custom
+        return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
+
+    # ------------------------------------------------------------------ posterior
+
+    def choose(self, readings: Readings, reference: Look, mounting: Array | None) -> FrameChoice | None:
+        """Return the likeliest reading; None if none can be tried. mounting: rotation_dvl_from_body (3, 3) if known."""
+        priors: dict[Reading, float] = {}
+        as_declared: dict[Reading, bool] = {}
+        imus: dict[Reading, ImuHypothesis | None] = {}
+        for imu in (*self.imus,) or (None,):
+            z_down = self._says_z_down if imu is None else imu.z_down
+            declared = self.dvl_is_turned(z_down)
+            for name, prior in self._reference_priors(reference, imu).items():
+                for turned in {declared} if self._dvl_axes_are_said else {declared, not declared}:
+                    reading = Reading(name, None if imu is None else imu.frame, turned)
+                    imus[reading] = imu
+                    priors[reading] = prior + (0.0 if imu is None else imu.prior)
+                    as_declared[reading] = declared
+                    if turned != declared:
+                        is_placed = self._dvl_placed is not None
+                        priors[reading] += DVL_AXES_OTHER if is_placed else UNPLACED_DVL_AXES_OTHER
+        found = readings.agreements(list(priors), mounting)
+        declared_frame = self.declared_reference(reference)
+        in_earth = declared_frame is not None and declared_frame.frame is not VelocityFrame.BODY
+        if not found or (in_earth and all(each.reading.in_body for each in found)):
+            return None  # what is declared cannot be tried without an attitude, and stands
+        tried = [_Tried(each, mounting, priors[each.reading]) for each in found]
+        if mounting is not None:  # or it is wrong, and the DVL's axes are as declared
+            free = readings.agreements([each for each in priors if each.turned == as_declared[each]], None)
+            tried += [_Tried(each, None, priors[each.reading] + MOUNTING_OTHER) for each in free]
+        first = {
+            each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.agreement.left)
+            for each in tried
+        }
+        ranked = sorted(tried, key=lambda each: -first[each])
+        says: tuple[Reason, ...] = ()
+        if in_earth:
+            first_best = ranked[0].agreement
+            if first_best.reading.in_body and not readings.is_in_body(first_best):
+                says = (finding("BODY_OR_EARTH"),)
+                ranked = [each for each in ranked if not each.reading.in_body] or ranked
+        likely = [each for each in ranked if first[each] > first[ranked[0]] - FAR_WORSE][:MOST_REGISTERED]
+        expected = max(ranked, key=lambda each: each.prior)
+        if expected not in likely:
+            likely.append(expected)
+        if likely == [expected] and expected.mounting is mounting:
+            return FrameChoice(expected.agreement, imus[expected.reading], says)
+        fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
+        odds = {
+            each: each.odds(rotation) + readings.log_likelihood(left, registered=True)
+            for each, (left, rotation) in fits.items()
+        }
+        best, *others = sorted(likely, key=lambda each: -odds[each])
+        alike = [each for each in others if odds[each] > odds[best] - AS_LIKELY]
+        for rival in alike:
+            one, other = (self._options(each.reading, imus[each.reading]) for each in (best, rival))
+            other_axes = any(one[name] != other[name] for name in ("dvl_axes", "base_axes"))
+            if other_axes or angle_between(fits[best][1], fits[rival][1]) > SAME_ANSWER:
+                taken, instead = (
+                    " and ".join(f"{name} {this[name]}" for name in this if one[name] != other[name]) or "the mounting"
+                    for this in (one, other)
+                )
+                says += (finding("FRAMES_AMBIGUOUS", taken=taken, other=instead),)
+                break
+        if mounting is not None and best.mounting is None:
+            given, fitting = in_degrees(rpy_from_rotation(mounting.T)), nominal_rpy(fits[best][1].T)
+            said = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting)}
+            says += (finding("MOUNTING_CONTRADICTED", **said),)
+        return FrameChoice(best.agreement, imus[best.reading], says)
+
+    def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
+        """A reading as values of parameters."""
+        z_down = self._says_z_down if imu is None else imu.z_down
+        return {
+            "base_axes": FRD if z_down else FLU,
+            "gnss_frame": reading.reference,
+            "dvl_axes": FRD if reading.turned != z_down else FLU,
+            "imu_frame": IMU_ENU if imu is None else imu.frame.world,
+        }
+
+
+def twist_axes(look: Look) -> str | None:
+    """Return the frame of an odometry's twist by the way of its own pose, as gnss_frame; None if that does not show.
+
+    Its pose p, R moves by the twist v: dp = R v dt if v is in the axes of the pose's body.
+    """
+    if look.pose is None or not len(look.pose):
+        return None
+    quaternion = unit_quaternions(look.pose[:, 3:])
+    use = np.isfinite(quaternion).all(axis=1) & np.isfinite(look.values).all(axis=1)
+    times, place, velocity = look.stamps_s[use], look.pose[use, :3], look.values[use]
+    if len(times) < 2:
+        return None
+    rotation = rotation_from_quaternion(quaternion[use])
+    after = np.searchsorted(times, times + POSE_STEP_S)
+    before = np.flatnonzero((after < len(times)) & (times[np.minimum(after, len(times) - 1)] - times < POSE_LONGEST_S))
+    after = after[before]
+    if not len(before):
+        return None
+    seconds = (times[after] - times[before])[:, None]
+    moved = (place[after] - place[before]) / seconds
+    steps = np.diff(times, prepend=times[0])[:, None]
+
+    def left(seen: Array) -> float:
+        way = np.cumsum(0.5 * steps * (seen + np.roll(seen, 1, axis=0)), axis=0)
+        return float(np.sqrt((((way[after] - way[before]) / seconds - moved) ** 2).sum(axis=1).mean()))
+
+    turned = {each: np.einsum("nij,nj->ni", rotation, velocity @ axes) for each, axes in _BODY_AXES.items()}
+    tried = {name: left(seen) for name, seen in {**turned, "enu": velocity, "ned": velocity @ ENU_FROM_NED}.items()}
+    best, second = sorted(tried, key=tried.__getitem__)[:2]
+    if tried[best] > FITS * look.speed or tried[best] > CLEARLY * tried[second]:
+        return None
+    world = frame_named(look.world, ())
+    in_ned = world is not None and world.frame is VelocityFrame.NED
+    if best in _BODY_AXES:
+        body_down = (float(rotation[:, 2, 2].mean()) < 0.0) != in_ned
+        return FRD if body_down != (best == FRD) else "body"
+    return best if not in_ned else {"enu": "ned", "ned": "enu"}[best]
+
+
+_BODY_AXES = {"body": np.eye(3), FRD: FLU_FROM_FRD}
