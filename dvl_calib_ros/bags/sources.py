@@ -190,48 +190,59 @@ def _until_damage(batches: Batches, path: Path, salvage: Salvage, counts: Mappin
     """Messages as an index leads to them, after damage those that salvaging finds. counts: what the index announces."""
 
     def all_batches(topics: Collection[str]) -> Iterator[Batch]:
-        newest_ns, read = -1, 0
-        newest: list[BagMessage] = []
+        read = 0
         try:
             for batch in batches(topics):
-                if batch.log_ns[0] != newest_ns:
-                    newest = []
-                if batch.log_ns[-1] != newest_ns:
-                    newest_ns, newest = int(batch.log_ns[-1]), []
-                newest += batch.part(batch.log_ns == newest_ns).messages()
                 read += batch.size
                 yield batch
             if read < (announced := sum(count for channel, count in counts.items() if channel.topic in topics)):
                 raise DamagedError(f"it announces {announced} messages, its index leads to {read}")
         except DAMAGE as error:
-            damage = yield from _rest(salvage(path), topics, newest_ns, newest)
+            damage = yield from _rest(salvage(path), topics, _Given(batches(topics), read))
             raise DamagedError(damage or said(error)) from error
 
     return all_batches
 
 
-def _rest(
-    salvaged: Iterator[Salvaged], topics: Collection[str], newest_ns: int, newest: Sequence[BagMessage]
-) -> Generator[Batch, None, str]:
-    """What of a damaged recording comes after the messages that its index led to (at newest_ns: `newest`).
+class _Given:
+    """The first so many messages of batches, which a reader has; each is known once for each time that it was given.
 
-    Returns what is damaged.
+    They are known by themselves: of a damaged recording no time, and no place, says which came before.
     """
-    damage = ""
-    known = {(channel.topic, data) for _, channel, data in newest}
 
-    def later() -> Iterator[BagMessage]:
+    def __init__(self, batches: Iterator[Batch], count: int) -> None:
+        messages = (message for batch in batches for message in batch.messages())
+        keys = np.fromiter((self._key(message) for message in islice(messages, count)), np.int64)
+        self._keys, self._left = np.unique(keys, return_counts=True)
+
+    def __contains__(self, message: BagMessage) -> bool:
+        key = self._key(message)
+        at = int(np.searchsorted(self._keys, key))
+        if at == len(self._keys) or self._keys[at] != key or not self._left[at]:
+            return False
+        self._left[at] -= 1
+        return True
+
+    @staticmethod
+    def _key(message: BagMessage) -> int:
+        log_ns, channel, data = message
+        return hash((log_ns, channel.topic, data))
+
+
+def _rest(salvaged: Iterator[Salvaged], topics: Collection[str], given: _Given) -> Generator[Batch, None, str]:
+    """The messages of a damaged recording that were not given before. Returns what is damaged."""
+    damage = ""
+
+    def others() -> Iterator[BagMessage]:
         nonlocal damage
         try:
             for message in _with_channels(salvaged):
-                log_ns, channel, data = message
-                is_later = log_ns > newest_ns or (log_ns == newest_ns and (channel.topic, data) not in known)
-                if is_later and channel.topic in topics:
+                if message[1].topic in topics and message not in given:
                     yield message
         except DAMAGE as error:
             damage = said(error)
 
-    yield from batched(by_log_time(later()))
+    yield from batched(by_log_time(others()))
     return damage
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
+from flips import flip_seeds, run_flips
 from io_fixtures import mcap_bytes, raw, run, write_bag
 from log_fixtures import dataflash, pd0, rmc, telemetry
 from mcap.writer import CompressionType, IndexType, Writer
@@ -386,6 +387,7 @@ _SMALLEST_BAG = _small_mcap()
 _MESSAGE_ENDS = [_small_run()[number][2] for number in (0, 0, 1)]
 TARGETS = {
     "mcap": Target(run_mcap, _mcap_seeds),
+    "flips": Target(partial(run_flips, path=FOLDER / "flipped.mcap"), flip_seeds),
     "sqlite": Target(run_sqlite, _sqlite_seeds),
     "mcap_records": Target(run_mcap_records, _mcap_seeds),
     "sqlite_pages": Target(run_sqlite_pages, _sqlite_seeds),

@@ -27,13 +27,15 @@ class DamagedError(Exception):
 class Damage:
     """Takes note of damaged places on the way, so that reading goes on after each.
 
-    skipped: bytes that are not used because of them; of what is compressed within a chunk, unpacked bytes.
+    skipped: bytes that are not used because of them; of what is compressed within a chunk, unpacked bytes. lost: how
+    many messages fewer were found than the recording counts.
     """
 
     def __init__(self) -> None:
         self._first = ""
         self._places = 0
         self.skipped = 0
+        self.lost = 0
 
     def note(self, what: str, skipped: int) -> None:
         """One more damaged place, and how many bytes are not used because of it."""
@@ -42,10 +44,12 @@ class Damage:
         self.skipped += skipped
 
     def __bool__(self) -> bool:
-        return self._places > 0
+        return self._places > 0 or self.lost > 0
 
     def raise_if_any(self) -> None:
         """Raise DamagedError with all of it in one sentence."""
-        if self._places:
+        if self:
             more = f" (the first of {self._places} damaged places)" if self._places > 1 else ""
-            raise DamagedError(f"{self._first}{more}, {self.skipped} bytes skipped")
+            what = f"{self._first}{more}, {self.skipped} bytes skipped" if self._places else "it counts more messages"
+            lost = f", {self.lost} message{'s' if self.lost > 1 else ''} lost" if self.lost else ""
+            raise DamagedError(what + lost)

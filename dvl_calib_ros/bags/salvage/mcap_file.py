@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import os
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import accumulate, chain
 from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO
+from zlib import crc32
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -31,32 +33,43 @@ from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 from .mcap_records import (
     CHANNEL,
     MESSAGE,
+    MESSAGE_START,
     PARSING,
     RECORD_HEAD,
     SCHEMA,
     Found,
+    Resumed,
     Tables,
     is_chunk,
+    likeness,
+    message_head,
     messages_of,
     open_chunk,
     places_by_index,
     places_of,
     record_head,
+    resumed,
     search,
-    search_records,
     sound_end,
 )
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 FIRST_PRIVATE = 0x80
+# What ends the data, and its length: its end, or, where that is damaged, the footer behind all that follows
+_ENDS = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
+# Of a message's head length, channel and log time
+ALL_BUT_OPCODE = 3
+_MESSAGE_OPCODE = bytes([MESSAGE])
 _CHUNK_BEGIN_SIZE = 64
 # Before a summary the data end: opcode and length
 _DATA_END = RECORD_HEAD.pack(Opcode.DATA_END, 4)
 _LARGEST_SUMMARY = 16 << 20
 # Of an index of messages: opcode, length, channel, bytes of its pairs of log time and place
 _INDEX_HEAD = struct.Struct("<BQHI")
+_INDEX_OWN = _INDEX_HEAD.size - RECORD_HEAD.size
 # At the very end: where the summary begins, where its offsets do, CRC, magic
 _FOOTER = struct.Struct("<QQI8s")
+_CHECKSUM_TO_END = 12
 
 
 def read_summary(path: Path) -> Summary | None:
@@ -78,6 +91,7 @@ def _summary(file: BinaryIO) -> Summary | None:
     if magic != MCAP_MAGIC:
         raise DamagedError("it does not end as a finished recording does")
     _check_no_chunk(file, start, size)
+    _check_sum(file, start, size)
     # The library looks for the magic bytes wherever the file stands; those at the beginning may be unreadable.
     file.seek(size - len(MCAP_MAGIC))
     try:
@@ -102,6 +116,18 @@ def _check_no_chunk(file: BinaryIO, start: int, size: int) -> None:
                 raise DamagedError("its index is of another part of it: recordings joined in one file")
             return
         at += RECORD_HEAD.size + length
+
+
+def _check_sum(file: BinaryIO, start: int, size: int) -> None:
+    """Raise DamagedError if the index that begins at `start` has a checksum that does not match."""
+    end = size - _CHECKSUM_TO_END
+    if not 0 < start < end or end - start > LARGEST_RECORD:
+        return
+    file.seek(start)
+    content = file.read(end + 4 - start)
+    (checksum,) = struct.unpack_from("<I", content, end - start)
+    if checksum and crc32(memoryview(content)[:-4]) != checksum:
+        raise DamagedError("the checksum of its index does not match")
 
 
 def bytes_at_once(summary: Summary, channels: Collection[int]) -> int:
@@ -215,7 +241,8 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     damage, summary = Damage(), None
     with suppress(DamagedError):  # schemas and channels once more: the chunk that introduces them may be damaged
         summary = _summary(file)
-    repeated = Tables(summary) if summary else _repeated(file, size)
+    repeated = Tables(summary) if summary else _repeated(file, size).unmet()
+    announced = Counter(summary.statistics.channel_message_counts if summary and summary.statistics else {})
     file.seek(0)
     is_cut = file.read(len(MCAP_MAGIC)) != MCAP_MAGIC and not holes_in(file, 0, len(MCAP_MAGIC))
     if is_cut:
@@ -227,10 +254,14 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
         at = begins
         while at < size and not walk.has_ended:
             found, at = walk.step(at)
+            announced.subtract(number for _, number, _ in found)
             yield from map(tables.salvaged, found)
+        announced.subtract(number for _, number, _ in walk.held)
+        yield from map(tables.salvaged, walk.held)
         if not walk.has_ended and not damage:
             damage.note(f"it stops at byte {size} without the end of the data", 0)
         begins = _joined(file, at, size)
+    damage.lost = (+announced).total()
     damage.raise_if_any()
 
 
@@ -273,33 +304,68 @@ class _FileWalk:
         self._indexes = {index.chunk_start_offset: index for index in indexes}
         self._may_hold_chunks = True
         self._holds_chunks = False
+        self._before: int | None = None
+        self.held: list[Found] = []
         self.has_ended = False
 
     def step(self, at: int) -> tuple[list[Found], int]:
-        """Messages of the record at `at`, and where to go on; `has_ended` behind the last of the data."""
+        """Messages of the record before that at `at`, and where to go on; `has_ended` behind the last of the data.
+
+        held: what the record at `at` itself holds, of which nothing is said before it is known that it led on.
+        """
+        found, self.held, here = self.held, [], None
         try:
-            if index := self._index_instead_of_head(at):
-                return self._chunk(at, 0, index)
-            opcode, length = record_head(self._file, at)
-            if holes_in(self._file, at, at + RECORD_HEAD.size):
-                raise DamagedError(f"the record at byte {at} cannot be read from the disk")
-            if opcode == Opcode.CHUNK or (not SCHEMA <= opcode <= MESSAGE and is_chunk(self._file, at, length)):
-                return self._chunk(at, length)
-            end = at + RECORD_HEAD.size + length
-            if opcode == 0 or Opcode.DATA_END < opcode < FIRST_PRIVATE:
-                raise DamagedError(f"no record at byte {at}")
-            if end > self._size or (SCHEMA <= opcode <= MESSAGE and length > LARGEST_RECORD):
-                raise DamagedError(f"the record at byte {at} is cut off or damaged")
-            self.has_ended = opcode == Opcode.DATA_END
-            found: list[Found] = []
-            if SCHEMA <= opcode <= MESSAGE:
-                self._file.seek(at)
-                content = self._file.read(end - at)
-                holes = [(first - at, last - at) for first, last in holes_in(self._file, at, end)]
-                found = messages_of(at, content, self._tables, self._damage, holes=holes)
-            return found, end
+            self.held, end, here = self._record(at)
         except DamagedError as error:
-            return [], self._go_on(at, str(error))
+            place, is_before_damaged = self._resumed(at)
+            if is_before_damaged and self._before is not None:
+                found, at = [], self._before
+            self._damage.note(str(error), place - at)
+            end = place
+        self._before = here
+        return found, end
+
+    def _record(self, at: int) -> tuple[list[Found], int, int | None]:
+        """Messages of the record at `at`, its end, and where it begins if the end is only what itself says."""
+        if index := self._index_instead_of_head(at):
+            return *self._chunk(at, 0, index), None
+        opcode, length = record_head(self._file, at)
+        if holes_in(self._file, at, at + RECORD_HEAD.size):
+            raise DamagedError(f"the record at byte {at} cannot be read from the disk")
+        if opcode == Opcode.CHUNK or (opcode != MESSAGE and is_chunk(self._file, at, length)):
+            return *self._chunk(at, length), None
+        end = at + RECORD_HEAD.size + length
+        is_end = opcode in _ENDS
+        if opcode == 0 or Opcode.DATA_END < opcode < FIRST_PRIVATE or (is_end and length != _ENDS[opcode]):
+            raise DamagedError(f"no record at byte {at}")
+        is_read = SCHEMA <= opcode <= MESSAGE
+        if end > self._size or (is_read and length > LARGEST_RECORD):
+            raise DamagedError(f"the record at byte {at} is cut off or damaged")
+        head = self._head_at(at)
+        is_message = likeness(head, self._size - at, self._tables) >= ALL_BUT_OPCODE and bool(self._tables.eras)
+        # an index behind a chunk begins as a message does, but for its opcode
+        is_index = self._holds_chunks and is_message and _INDEX_HEAD.unpack_from(head)[-1] == length - _INDEX_OWN
+        if is_message and (opcode == MESSAGE) == is_index:
+            raise DamagedError(f"the record at byte {at} is damaged")
+        self.has_ended = is_end
+        if is_end and opcode == Opcode.FOOTER:  # the end of the data itself is damaged
+            return [], at, None
+        if not is_read:
+            return [], end, at
+        self._file.seek(at)
+        content = self._file.read(end - at)
+        if holes_in(self._file, at, end):
+            self._damage.note(f"at byte {at}: a record cannot be read from the disk", end - at)
+        elif opcode == MESSAGE:
+            channel, log_ns = message_head(head, at, at, self._size, self._tables, self._head_at)
+            return [(log_ns, channel, content[MESSAGE_START:])], end, at
+        else:
+            self._tables.note(at, opcode, content[RECORD_HEAD.size :])
+        return [], end, at
+
+    def _head_at(self, at: int) -> bytes:
+        self._file.seek(at)
+        return self._file.read(MESSAGE_START)
 
     def _index_instead_of_head(self, at: int) -> ChunkIndex | None:
         """What the index says of the chunk at `at`, if the disk cannot read how the chunk begins."""
@@ -310,7 +376,7 @@ class _FileWalk:
         return index if holes_in(self._file, at, at + len(self._file.read(_CHUNK_BEGIN_SIZE))) else None
 
     def _chunk(self, at: int, length: int, index: ChunkIndex | None = None) -> tuple[list[Found], int]:
-        self._holds_chunks = True
+        self._holds_chunks, self._before = True, None
         chunk = open_chunk(self._file, at, length, self._size, index)
         # of what is not believed only the channels, which later chunks need
         within = Damage() if chunk.damage else self._damage
@@ -318,34 +384,35 @@ class _FileWalk:
         if not chunk.damage:
             return found, chunk.end
         if not chunk.is_believed:
-            return [], self._go_on(at, chunk.damage)
+            raise DamagedError(chunk.damage)
         self._damage.note(chunk.damage, within.skipped)
         return found, chunk.end if index else self._next_place(at)
 
-    def _go_on(self, at: int, what: str) -> int:
-        """Where to go on after damage in the record at `at`, of which nothing is used."""
-        place = self._next_place(at)
-        self._damage.note(what, place - at)
-        return place
-
     def _next_place(self, at: int) -> int:
-        """Where to go on after the damaged record at `at`: at its end, if records follow there; else search."""
+        """Where to go on after the damaged chunk at `at`: at its end, if records follow there; else search."""
         end = sound_end(self._file, at, self._size, self._tables)
-        if end is not None:
-            return end
-        place = self._searched(at)
-        headless = (start for start in self._indexes if at < start < place and self._index_instead_of_head(start))
-        return min(headless, default=place)
+        return self._resumed(at).place if end is None else end
 
-    def _searched(self, at: int) -> int:
+    def _resumed(self, at: int) -> Resumed:
+        """Where to go on after the damaged record at `at`."""
+        if self._before is None and not self._head_at(at).startswith(_MESSAGE_OPCODE):
+            end = sound_end(self._file, at, self._size, self._tables)
+            if end is not None:
+                return Resumed(end, False)
+        found = self._searched(at)
+        headless = (start for start in self._indexes if at < start < found.place and self._index_instead_of_head(start))
+        return found._replace(place=min(headless, default=found.place))
+
+    def _searched(self, at: int) -> Resumed:
         if self._may_hold_chunks:
-            place = search(self._file, at + 1, self._size, (Opcode.CHUNK, Opcode.CHUNK), self._is_chunk_at)
+            start = at if self._before is None else self._before
+            place = search(self._file, start + 1, self._size, (Opcode.CHUNK, Opcode.CHUNK), self._is_chunk_at)
             if place is not None:
-                return place
+                return Resumed(place, place < at)
             self._may_hold_chunks = False
         if self._holds_chunks:  # outside of chunks, with their checksums, what looks like messages is not believed
-            return self._size
-        return search_records(self._file, at, self._size, self._tables)
+            return Resumed(self._size, False)
+        return resumed(self._file, self._before, at, self._size, self._tables)
 
     def _is_chunk_at(self, at: int) -> bool:
         return is_chunk(self._file, at, record_head(self._file, at)[1])

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from io import BytesIO
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
@@ -28,9 +28,15 @@ from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 # plain numbers: they are compared for every message
 SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+MESSAGE_START = 31  # of a message's content, from where its record begins
+# Of the four parts of a head so many are sound where two bits are flipped; elsewhere no two are by chance
+ALIKE, ENOUGH_ALIKE = 4, 2
 _WINDOW = 1 << 20
 # Damaged offsets lead beyond what can be sought in a file
 _LARGEST_FILE = 1 << 62
+# Log times with the same upper bits are within 2^48 ns, three days: a flipped bit above is told from a log time
+ERA_BITS = 48
+_SAID_OF_SCHEMA, _SAID_OF_CHANNEL = attrgetter("name", "encoding", "data"), attrgetter("topic", "schema_id")
 # What damaged bytes make the mcap library raise when it parses records
 PARSING = (McapError, struct.error, ValueError, LookupError, OverflowError, EOFError, MemoryError)
 
@@ -58,31 +64,63 @@ class Places(NamedTuple):
 
 
 class Tables:
-    """The schemas and channels that are known; at the beginning, those of the summary."""
+    """The schemas and channels that are known, and what is known of messages; at the beginning, by the summary.
+
+    eras: stretches of three days (`ERA_BITS`) that log times were met in. lengths: channel -> of its last message.
+    """
 
     def __init__(self, summary: Summary | None) -> None:
         self.schemas: dict[int, Schema] = dict(summary.schemas) if summary else {}
         self.channels: dict[int, Channel] = dict(summary.channels) if summary else {}
+        self.eras: set[int] = set()
+        self.lengths: dict[int, int] = {}
+        self._met = {
+            *(("schema", number) for number in self.schemas),
+            *(("channel", number) for number in self.channels),
+        }
         self._made: dict[int, tuple[str, str, str, str]] = {}
+        if summary and summary.statistics and summary.statistics.message_count:
+            self.meet(summary.statistics.message_start_time)
+            self.meet(summary.statistics.message_end_time)
 
     def copy(self) -> Tables:
         """The same, to go on from."""
         copied = Tables(None)
         copied.schemas, copied.channels = dict(self.schemas), dict(self.channels)
+        copied.eras, copied._met = set(self.eras), set(self._met)
         return copied
 
+    def unmet(self) -> Tables:
+        """The same of a summary that may be another recording's: what the messages' own records say replaces it."""
+        self._met.clear()
+        return self
+
+    def meet(self, log_ns: int) -> None:
+        """Take note of when messages are."""
+        era = log_ns >> ERA_BITS
+        if era not in self.eras:
+            self.eras.update((era - 1, era, era + 1))
+
     def note(self, at: int, opcode: int, content: bytes) -> None:
-        """Take note of a schema or channel; DamagedError if it is none."""
+        """Take note of a schema or channel; DamagedError if it is none, or not as it was known."""
         try:
             if opcode == SCHEMA:
                 schema = Schema.read(ReadDataStream(BytesIO(content)))
+                self._check(at, "schema", schema.id, _SAID_OF_SCHEMA(schema), self.schemas.get(schema.id))
                 self.schemas[schema.id] = schema
             else:
                 channel = Channel.read(ReadDataStream(BytesIO(content)))
+                self._check(at, "channel", channel.id, _SAID_OF_CHANNEL(channel), self.channels.get(channel.id))
                 self.channels[channel.id] = channel
         except PARSING as error:
             raise DamagedError(f"the record at byte {at} is damaged") from error
         self._made.clear()
+
+    def _check(self, at: int, kind: str, number: int, says: Any, known: Any) -> None:
+        said = _SAID_OF_SCHEMA if kind == "schema" else _SAID_OF_CHANNEL
+        if (kind, number) in self._met and known is not None and said(known) != says:
+            raise DamagedError(f"the record at byte {at} says otherwise of {kind} {number} than others")
+        self._met.add((kind, number))
 
     def salvaged(self, message: Found) -> Salvaged:
         """A message with what is known of its channel."""
@@ -131,44 +169,125 @@ def search(
 
 
 def sound_end(file: BinaryIO, at: int, size: int, tables: Tables) -> int | None:
-    """Where the record at `at` says that it ends, if records follow there."""
+    """Where the record at `at` says that it ends, if a record follows there."""
     with suppress(DamagedError):
         end = at + RECORD_HEAD.size + record_head(file, at)[1]
-        if end <= size and _records_follow(file, end, size, tables):
+        if end <= size and _record_follows(file, end, size, tables):
             return end
     return None
 
 
-def _next_record(file: BinaryIO, at: int, size: int, tables: Tables) -> int:
-    """Where schemas, channels or messages go on after damage in the record at `at`; `size` if nowhere."""
-    end = sound_end(file, at, size, tables)
-    return search_records(file, at, size, tables) if end is None else end
+class Resumed(NamedTuple):
+    """Where reading goes on; is_before_damaged: the record before is the one that is damaged, or is as well."""
+
+    place: int
+    is_before_damaged: bool
 
 
-def search_records(file: BinaryIO, at: int, size: int, tables: Tables) -> int:
-    """As `_next_record`, of a record whose own end is known to lead nowhere."""
-    place = search(file, at + 1, size, (SCHEMA, MESSAGE), lambda place: _records_follow(file, place, size, tables))
-    return size if place is None else place
+def resumed(file: BinaryIO, before: int | None, at: int, size: int, tables: Tables) -> Resumed:
+    """Where schemas, channels or messages go on after damage at `at`; `size` if nowhere.
+
+    before: where the record begins whose length led to `at`. That may be what is damaged, and have led past others.
+    """
+    start = at if before is None else before
+    place = search(
+        file, start + 1, size, (SCHEMA, Opcode.DATA_END), lambda each: each != at and _begins(file, each, size, tables)
+    )
+    place = size if place is None else place
+    return Resumed(place, before is not None and (place < at or not _may_be_head(file, at, size, tables)))
 
 
-def _records_follow(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
-    """Whether this is where records go on: three in a row make sense, or all up to the end of the file."""
-    with suppress(DamagedError, struct.error):
-        for number in range(3):
-            if at >= size:
-                return at == size or number > 1
-            opcode, length = record_head(file, at)
-            if not 0 < opcode <= Opcode.DATA_END or length > LARGEST_RECORD:
-                return False
-            if opcode == MESSAGE:
-                channel, *_ = _MESSAGE_HEAD.unpack(file.read(_MESSAGE_HEAD.size))
-                if length < _MESSAGE_HEAD.size or channel not in tables.channels:
-                    return False
-            if opcode == Opcode.FOOTER:
-                return True
-            at += RECORD_HEAD.size + length
+def likeness(head: bytes, room: int, tables: Tables) -> int:
+    """Return how many of the four parts of a message's head are sound: opcode, length, channel and log time.
+
+    head: from its opcode on. room: bytes there are from there on.
+    """
+    if len(head) < MESSAGE_START:
+        return 0
+    opcode, length = RECORD_HEAD.unpack_from(head)
+    channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(head, RECORD_HEAD.size)
+    is_length = _MESSAGE_HEAD.size <= length <= room - RECORD_HEAD.size
+    is_time = not tables.eras or log_ns >> ERA_BITS in tables.eras
+    return (opcode == MESSAGE) + is_length + (channel in tables.channels) + is_time
+
+
+def _head_at(file: BinaryIO, at: int) -> bytes:
+    file.seek(at)
+    return file.read(MESSAGE_START)
+
+
+def _may_be_head(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
+    """Whether a record may begin here, some of whose head is damaged."""
+    head = _head_at(file, at)
+    if len(head) < MESSAGE_START:
         return True
+    opcode, length = RECORD_HEAD.unpack_from(head)
+    return opcode <= Opcode.DATA_END or length < size or likeness(head, size - at, tables) >= ENOUGH_ALIKE
+
+
+def _begins(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
+    """Whether a sound message, schema, channel or end of the data begins here, and a record follows."""
+    head = _head_at(file, at)
+    opcode, length = RECORD_HEAD.unpack_from(head)
+    end = at + RECORD_HEAD.size + length
+    if end > size:
+        return False
+    if opcode == MESSAGE:
+        return likeness(head, size - at, tables) == ALIKE and _record_follows(file, end, size, tables)
+    if opcode in (SCHEMA, CHANNEL):
+        return _is_definition(file, at, opcode, length) and _record_follows(file, end, size, tables)
+    return opcode == Opcode.DATA_END and length == 4
+
+
+def _is_definition(file: BinaryIO, at: int, opcode: int, length: int) -> bool:
+    if length > LARGEST_RECORD:
+        return False
+    file.seek(at + RECORD_HEAD.size)
+    content = BytesIO(file.read(length))
+    with suppress(*PARSING):
+        (Schema if opcode == SCHEMA else Channel).read(ReadDataStream(content))
+        return content.tell() == length
     return False
+
+
+def _record_follows(file: BinaryIO, at: int, size: int, tables: Tables, deep: int = 3) -> bool:
+    """Whether a record begins at `at`: a message, of whose head parts may be damaged, or `deep` others in a row."""
+    if at == size or not deep:
+        return True
+    head = _head_at(file, at)
+    if likeness(head, size - at, tables) >= ENOUGH_ALIKE:
+        return True
+    if len(head) < RECORD_HEAD.size:
+        return False
+    opcode, length = RECORD_HEAD.unpack_from(head)
+    if opcode == MESSAGE or not 0 < opcode <= Opcode.DATA_END or length > LARGEST_RECORD:
+        return False
+    if opcode == Opcode.FOOTER:
+        return True
+    end: int = at + RECORD_HEAD.size + length
+    return end <= size and _record_follows(file, end, size, tables, deep - 1)
+
+
+def message_head(
+    head: bytes, at: int, here: int, n: int, tables: Tables, holds: Callable[[int], bytes]
+) -> tuple[int, int]:
+    """Channel and log time of a message whose record begins at `here` of `n`; DamagedError if it is none.
+
+    at: place of all that in the file. holds: what is at a place.
+    """
+    _, length = RECORD_HEAD.unpack_from(head)
+    channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(head, RECORD_HEAD.size)
+    if length < _MESSAGE_HEAD.size or channel not in tables.channels:
+        raise DamagedError(f"at byte {at}: a message is of no known channel")
+    usual = tables.lengths.get(channel, length)
+    if usual != length and tables.eras:  # a length may be damaged, and lead into the message or past others
+        ends = [here + RECORD_HEAD.size + each for each in (usual, length)]
+        by_usual, by_own = (likeness(holds(end), n - end, tables) for end in ends)
+        if by_usual == ALIKE and (usual < length or by_own < ENOUGH_ALIKE):
+            raise DamagedError(f"at byte {at}: the length of a message is damaged")
+    tables.lengths[channel] = length
+    tables.meet(log_ns)
+    return channel, log_ns
 
 
 def places_of(records: bytes, tables: Tables) -> Places | None:
@@ -208,9 +327,9 @@ def places_of(records: bytes, tables: Tables) -> Places | None:
 def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) -> Places | None:
     """`places_of`, by an index of where messages begin; None where that is not exactly what the records hold."""
     n = len(records)
-    start = np.sort(starts).astype(np.intp)
-    if not len(start) or start[0] < 0 or start[-1] > n - _HEAD_AT.itemsize:
+    if not len(starts) or int(starts.max()) > n - _HEAD_AT.itemsize:
         return None
+    start = np.sort(starts).astype(np.intp)
     heads = np.ndarray((n - _HEAD_AT.itemsize + 1,), _HEAD_AT, records, strides=(1,))[start]
     length = heads["length"]
     if not ((heads["opcode"] == MESSAGE) & (length >= _MESSAGE_HEAD.size) & (length <= n)).all():
@@ -259,31 +378,36 @@ def messages_of(
     of the records could not be read.
     """
     found: list[Found] = []
-    channels, n = tables.channels, len(records)
-    head, message_head = RECORD_HEAD.unpack_from, _MESSAGE_HEAD.unpack_from
-    here = 0
+    n = len(records)
+    here, before, kept = 0, None, 0
     while here < n:
         try:
             if holes and any(first < here + 9 and here < last for first, last in holes):
                 raise DamagedError(f"at byte {at}: a record cannot be read from the disk")
-            opcode, length = head(records, here)
+            opcode, length = RECORD_HEAD.unpack_from(records, here)
             end = here + 9 + length
             if end > n or not SCHEMA <= opcode <= MESSAGE:
                 raise DamagedError(f"in the chunk at byte {at}: a record is cut off or damaged")
+            head = records[here : here + MESSAGE_START]
+            count = len(found)
             if holes and any(first < end and here < last for first, last in holes):
                 damage.note(f"at byte {at}: a record cannot be read from the disk", end - here)
             elif opcode == MESSAGE:
-                channel_id, _, log_ns, _ = message_head(records, here + 9)
-                if length < 22 or channel_id not in channels:
-                    raise DamagedError(f"in the chunk at byte {at}: a message is of no known channel")
-                if wanted is None or channel_id in wanted:
-                    found.append((log_ns, channel_id, records[here + 31 : end]))
+                channel, log_ns = message_head(
+                    head, at, here, n, tables, lambda place: records[place : place + MESSAGE_START]
+                )
+                if wanted is None or channel in wanted:
+                    found.append((log_ns, channel, records[here + MESSAGE_START : end]))
             else:
                 tables.note(at, opcode, records[here + 9 : end])
-            here = end
+            here, before, kept = end, here, count
         except (struct.error, DamagedError) as error:
-            start, here = here, _next_record(BytesIO(records), here, n, tables)
-            damage.note(str(error), here - start)
+            place, is_before_damaged = resumed(BytesIO(records), before, here, n, tables)
+            if is_before_damaged and before is not None:
+                del found[kept:]
+                here = before
+            damage.note(str(error), place - here)
+            here, before = place, None
     found.sort(key=itemgetter(0))
     return found
 
@@ -369,6 +493,8 @@ def open_chunk(file: BinaryIO, at: int, length: int, size: int, index: ChunkInde
     if not lengths or head.unpacked_size > LARGEST_RECORD:
         raise DamagedError(f"the chunk at byte {at} claims more than {LARGEST_RECORD} bytes")
     start = at + RECORD_HEAD.size + head.size
+    if lengths[1:] and lengths[1] != lengths[0]:
+        lengths.sort(key=lambda each: not _record_follows(file, start + each, size, Tables(None)))
     chunk = _unpack_chunk(file, at, start, head, lengths[0], size)
     if chunk.damage and lengths[1:] and lengths[1] != lengths[0]:
         other = _unpack_chunk(file, at, start, head, lengths[1], size)

@@ -162,6 +162,46 @@ def test_a_damaged_length_in_a_chunk_without_checksum_costs_only_its_message(tmp
     assert len(notes) == 1
 
 
+@pytest.mark.parametrize("options", [{}, {"use_chunking": False}, {"use_chunking": False, "enable_crcs": True}])
+def test_a_wild_log_time_and_a_damaged_length_behind_it_cost_one_message_and_it_is_counted(tmp_path, options):
+    """A bit of each: what came before the damage was judged by the newest log time, and all of it was left out."""
+    whole = bytearray(mcap_bytes(messages(), **{"enable_crcs": False, "chunk_size": 8000, **options}))
+    wild, long = (bytes(whole).index(messages()[number][2]) for number in (20, 90))
+    whole[wild - 16 + 7] ^= 0x40
+    whole[long - 22 - 8 + 1] ^= 0x01
+    found, notes = read(tmp_path, bytes(whole))
+    assert [data for *_, data in messages()[:90] + messages()[91:]] == sorted(
+        (data for *_, data in found), key=[data for *_, data in messages()].index
+    )
+    (note,) = notes
+    assert "1 message lost" in note and f"{len(found)} whole messages" in note
+
+
+@pytest.mark.parametrize("swallowed", [1, 4])
+def test_a_length_that_leads_to_where_a_later_message_begins_costs_no_other(tmp_path, swallowed):
+    alike = [("dvl/twist", 10**18 + i, bytes([i]) * 33) for i in range(100)]  # records of 64 bytes
+    whole = bytearray(mcap_bytes(alike, enable_crcs=False, use_chunking=False))
+    whole[bytes(whole).index(alike[50][2]) - 22 - 8] += 64 if swallowed == 1 else 0
+    whole[bytes(whole).index(alike[50][2]) - 22 - 7] += 1 if swallowed == 4 else 0
+    found, notes = read(tmp_path, bytes(whole))
+    assert found == alike[:50] + alike[51:]
+    assert "1 message lost" in notes[0]
+
+
+@pytest.mark.parametrize("options", [{"use_chunking": False}, {"chunk_size": 3000, "enable_crcs": False}])
+@pytest.mark.parametrize("bit", range(8))
+def test_a_bit_of_the_record_behind_the_messages_costs_none(tmp_path, bit, options):
+    """Of the end of the data, or of an index of messages, which one bit makes the end of the data."""
+    whole = bytearray(mcap_bytes(messages(), **options))
+    last = bytes(whole).rindex(messages()[-1][2]) + len(messages()[-1][2])
+    end_of_data = bytes(whole).rindex(b"\x0f\x04" + bytes(7))
+    for at in {last, end_of_data}:
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << bit
+        assert tuple(read(tmp_path, bytes(damaged))[0]) == messages()
+        assert sorted(read(tmp_path, bytes(damaged[:-9]))[0]) == sorted(messages())  # without the index at the end
+
+
 def test_mcap_1474_a_file_cut_in_its_index_gives_a_new_one_that_every_reader_reads(tmp_path, capsys):
     """`mcap recover` ended well, and wrote statistics that nobody could read."""
     case = next(case for case in damage.cases() if "the middle of the index" in case.name)
