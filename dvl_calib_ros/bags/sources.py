@@ -59,10 +59,13 @@ class Source:
         self.span_ns = span_ns
         self.batches = batches
         self.damage_noted = damage_noted
+        self._by_topic: dict[str, list[Channel]] = {}
+        for channel in counts:
+            self._by_topic.setdefault(channel.topic, []).append(channel)
 
     def channels(self, topic: str) -> list[Channel]:
         """The channels of a topic."""
-        return [channel for channel in self.counts if channel.topic == topic]
+        return self._by_topic.get(topic, [])
 
 
 def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path | None = None) -> Source:
@@ -112,14 +115,14 @@ def _mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
     if summary is None or summary.statistics is None:
         return None
     statistics, schemas = summary.statistics, summary.schemas
-    channels = {}
-    for number, channel in summary.channels.items():
-        schema = schemas.get(channel.schema_id)
-        if schema is None:
-            channels[number] = Channel(channel.topic, "")
-        else:
-            definition = definition_of(schema.encoding, schema.data.decode("utf-8", "replace"))
-            channels[number] = Channel(channel.topic, schema.name, definition)
+    types = {
+        number: (schema.name, definition_of(schema.encoding, schema.data.decode("utf-8", "replace")))
+        for number, schema in schemas.items()
+    }
+    channels = {
+        number: Channel(channel.topic, *types.get(channel.schema_id, ("",)))
+        for number, channel in summary.channels.items()
+    }
     counts = dict.fromkeys(channels.values(), 0)
     for number, count in statistics.channel_message_counts.items():
         if number not in channels:
