@@ -181,7 +181,8 @@ def choose_imu(survey: Survey, default: str) -> str | None:
 
 
 def _listing(survey: Survey) -> str:
-    held = ", ".join(f"{name} ({kind})" for name, kind in sorted(survey.topics.items()))
+    unread = {name: f", which cannot be decoded: {why}" for name, why in survey.unread.items()}
+    held = ", ".join(f"{name} ({kind}{unread.get(name, '')})" for name, kind in sorted(survey.topics.items()))
     return f"The bag has: {held}" if held else "The bag is empty"
 
 

@@ -247,7 +247,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         ):
             rate_hz = 1.0 / topic_checks.interval_s(reference)
             found.append(finding("DOCTOR_SLOW_REFERENCE", topic=reference.topic, rate_hz=rate_hz))
-    if imu is not None and discovery.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
+    if imu is not None and len(imu) and discovery.reference_frame in (VelocityFrame.ENU, VelocityFrame.NED):
         found += topic_checks.orientation_findings(imu)
     if imu is None:
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
@@ -265,6 +265,8 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     units = [] if reference is None or over_legs else _units(dvl, reference)
     if units:
         found += units
+    elif not len(dvl):
+        pass  # it has been said why
     elif not len(speed) or (speed > parameters.min_speed).mean() < MOVES_SHARE:
         found.append(finding("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
     elif reference is not None and not over_legs:

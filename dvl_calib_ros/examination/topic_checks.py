@@ -14,6 +14,7 @@ from ..calibration.registration.clock_domains import arrival_offset
 from ..calibration.streams.stream_order import strays
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Recorded
+from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 
 SECOND_NS = 1_000_000_000
@@ -47,10 +48,14 @@ def interval_s(topic: Recorded) -> float:
 
 
 def stamp_findings(topic: Recorded, stream: Stream, parameters: Parameters) -> list[Reason]:
-    """Too few messages, zero stamps, stamps of reception, stamps that stray, go back, jump or repeat."""
-    if len(topic) < ENOUGH:
-        return [finding("DOCTOR_TOO_FEW", topic=topic.topic, count=len(topic))]
+    """Messages that cannot be decoded, too few, zero stamps, of reception, that stray, go back, jump or repeat."""
     found = []
+    if topic.unreadable:
+        of_all = {"count": topic.unreadable, "total": topic.unreadable + len(topic)}
+        unread = finding("DOCTOR_UNDECODABLE", topic=topic.topic, **of_all, reason=topic.unreadable_because)
+        found.append(unread.weighed(Severity.WARNING if len(topic) >= ENOUGH else Severity.ERROR))
+    if len(topic) < ENOUGH:
+        return found or [finding("DOCTOR_TOO_FEW", topic=topic.topic, count=len(topic))]
     zero = topic.stamps_ns == 0
     if zero.any():
         found.append(finding("DOCTOR_STAMP_ZERO", topic=topic.topic, share=zero.mean()))

@@ -141,7 +141,12 @@ class Recording:
             for topic, parts in columns.items()
         }  # fmt: skip
         seen = {topic: look for topic, look in looks.items() if look is not None}
-        return Survey(self.types, self.counts, seen, self.transforms, self.descriptions)
+        unread = {
+            topic: why
+            for topic, parts in columns.items() if topic not in seen
+            for *_, why in islice((row for part in parts for row in part.singles.messages(slice(1))), 1) if why
+        }  # fmt: skip
+        return Survey(self.types, self.counts, seen, self.transforms, self.descriptions, unread)
 
     def water(self, topics: Topics) -> Water | None:
         """What it says of its water, and the speed of sound that the DVL used; None if nothing."""

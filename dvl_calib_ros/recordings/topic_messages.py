@@ -30,8 +30,8 @@ class Recorded:
     stamps_ns: (N,) of the header, 0 where it has none. log_ns: (N,). values: (N, 3) m/s; of an IMU (N, 4) its
     quaternion. variances: (N, 3) (m/s)², nan where not given; (0, 3) of an IMU. unmeasured: (N,) axes that a
     message says not to measure, as of `screening.Screened`; (0,) of an IMU. refused: by counter of the driver's
-    rules, of how many. unreadable: messages that could not be read. window_s: over which positions became these
-    velocities, 0 of what is measured as a velocity.
+    rules, of how many. unreadable: messages that could not be read, and why the first could not. window_s: over which
+    positions became these velocities, 0 of what is measured as a velocity.
     """
 
     topic: str
@@ -44,6 +44,7 @@ class Recorded:
     refused: Mapping[str, int]
     unreadable: int
     window_s: float = 0.0
+    unreadable_because: str = ""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -61,7 +62,7 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     """All messages of a topic, of which each recording has a part."""
     topic, msgtype = parts[0].topic, parts[0].msgtype
     refused: Counter[str] = Counter()
-    unreadable = 0
+    unread: list[str] = []
     rules = VELOCITY_TYPES[msgtype].rules if msgtype in VELOCITY_TYPES else ()
     for part in parts:
         for code in np.flatnonzero(np.bincount(part.laid.broken)).tolist():
@@ -73,12 +74,13 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
     window_s = 0.0 if position is None else _window_s(singly, parameters)
     if position is not None:
         rows = _differences(singly, position, window_s)
+        unread = [why for _, _, message, why in singly if message is None]
     else:
-        for arrival, log_ns, message, _ in singly:
+        for arrival, log_ns, message, why in singly:
             try:
                 row, broken = _row(arrival, log_ns, message, msgtype, parameters)
-            except UNREADABLE:
-                unreadable += 1
+            except UNREADABLE as error:
+                unread.append(why or f"{msgtype}, {type(error).__name__}: {error}")
                 continue
             rows.append(row)
             refused.update(broken)
@@ -92,7 +94,10 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
         columns.append(_of_rows(rows, width, is_imu))
     _, log_ns, stamps_ns, values, variances, unmeasured = columns[0] if len(columns) == 1 else _in_order(columns)
     values, variances = _plausible(values, FASTEST), _plausible(variances, FASTEST**2)
-    return Recorded(topic, msgtype, stamps_ns, log_ns, values, variances, unmeasured, refused, unreadable, window_s)
+    because = unread[0] if unread else ""
+    return Recorded(
+        topic, msgtype, stamps_ns, log_ns, values, variances, unmeasured, refused, len(unread), window_s, because
+    )
 
 
 def _claimed(laid: Laid) -> tuple[Array, Codes]:

@@ -10,7 +10,7 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import accumulate
 from types import SimpleNamespace
 from typing import Any
@@ -79,13 +79,17 @@ class Look:
 
 @dataclass(frozen=True)
 class Survey:
-    """What was seen. looks: by topic. transforms: messages of tf_static; descriptions: of robot_description."""
+    """What was seen. looks: by topic. transforms: messages of tf_static; descriptions: of robot_description.
+
+    unread: topic -> why none of its messages can be decoded.
+    """
 
     topics: Mapping[str, str]
     counts: Mapping[str, int]
     looks: Mapping[str, Look]
     transforms: tuple[Any, ...]
     descriptions: tuple[str, ...]
+    unread: Mapping[str, str] = field(default_factory=dict)
 
 
 def look_of(

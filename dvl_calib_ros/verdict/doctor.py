@@ -67,6 +67,12 @@ _KINDS = (
         Severity.ERROR,
     ),
     Kind(
+        "DOCTOR_UNDECODABLE",
+        "{topic}: {count} of {total} messages cannot be decoded: {reason}",
+        "They are of another version than the recording says, damaged, or written by a tool that does it otherwise.",
+        "rebuild the driver's messages, or record with ros2 bag record",
+    ),
+    Kind(
         "DOCTOR_GAPS",
         "{topic}: silent for {seconds:.1f} s in all (gaps: {count}), the longest at {at_s:.0f} s",
         "The sensor, its cable, its fix or its driver dropped out.",

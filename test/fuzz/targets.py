@@ -308,6 +308,8 @@ def _definition_seeds() -> Iterator[bytes]:
     for msgtype in (TWIST_TYPE, IMU_TYPE, "diagnostic_msgs/msg/DiagnosticArray"):
         yield b"\0" + JAZZY.generate_msgdef(msgtype, ros_version=2)[0].encode()
     yield b"\0int32 X=3\nfloat64[<=4] values\nstring<=5 name 'a'\nfloat64[9] covariance\n"
+    yield b"\0a/B self\n"
+    yield b"\0a/B2[] x\n" + b"=" * 80 + b"\nMSG: a/B2\na/B y\n"
     yield b"\xff" + (
         b"================================================================================\nIDL: a/msg/B\n"
         b"module a { module msg { typedef double double__9[9]; struct B { long x; double__9 covariance; "

@@ -6,6 +6,7 @@ import io
 import os
 import shutil
 import sqlite3
+import time
 from contextlib import closing
 from pathlib import Path
 
@@ -295,6 +296,90 @@ def test_salvage_of_a_bag_without_definitions_writes_none(tmp_path):
     with BagReader([tmp_path / "new"]) as reader:
         assert all(is_empty(channel.definition) for topic in TOPICS for channel in reader.channels(topic))
     assert raw(tmp_path / "new") == raw(bag)
+
+
+# ---------------------------------------------------------------------- definitions and encodings
+
+
+@pytest.mark.parametrize(
+    ("text", "which"),
+    [
+        ("geometry_msgs/TwistWithCovarianceStamped again\n", "geometry_msgs/msg/TwistWithCovarianceStamped"),
+        ("geometry_msgs/TwistWithCovarianceStamped[] again\n", "geometry_msgs/msg/TwistWithCovarianceStamped"),
+        (f"a/B2 x\n{'=' * 80}\nMSG: a/B2\na/B3[2] y\n{'=' * 80}\nMSG: a/B3\na/B2 z\n", "a/msg/B2"),
+    ],
+)
+def test_a_definition_that_contains_itself_is_told_of_its_topic(tmp_path, capsys, text, which):
+    samples = raw(write_bag(tmp_path / "bag", run(6.0)))
+    (tmp_path / "round.mcap").write_bytes(mcap_bytes(samples, {"dvl/twist": (TWIST_TYPE, text)}))
+    assert main(["doctor", str(tmp_path / "round.mcap")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"dvl/twist: 30 of 30 messages cannot be decoded: the definition of {which} contains itself" in said
+
+
+def big_endian(topic: str, data: bytes) -> bytes:
+    kind = TOPICS[topic]
+    return bytes(JAZZY.serialize_cdr(JAZZY.deserialize_cdr(data, kind), kind, little_endian=False))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [big_endian, lambda _, data: data + bytes(4), lambda _, data: data + bytes(8)],
+    ids=["big-endian", "4 bytes of padding", "8 bytes of padding"],
+)
+def test_messages_in_big_endian_or_with_padding_are_read_as_they_are(tmp_path, change):
+    samples = raw(write_bag(tmp_path / "bag", run(20.0)))
+    changed = [(topic, log_ns, change(topic, data)) for topic, log_ns, data in samples]
+    (tmp_path / "changed.mcap").write_bytes(mcap_bytes(changed))
+    assert estimates(tmp_path / "changed.mcap") == estimates(tmp_path / "bag")
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda data: data + b"\xff" * 4, "bytes follow the end of a sensor_msgs/msg/Imu"),
+        (lambda data: data + b"\xff" * 100, "bytes follow the end of a sensor_msgs/msg/Imu"),
+        (lambda data: b"\0\7" + data[2:], "it is encoded as CDR2_LE, only plain CDR is read"),
+        (lambda data: b"abcd" + data[4:], "no CDR: it begins with 61 62 63 64"),
+        (lambda data: data[:60], "Could not deserialize"),
+    ],
+)
+def test_why_messages_of_a_topic_cannot_be_decoded_is_said_of_the_topic(tmp_path, capsys, change, reason):
+    samples = raw(write_bag(tmp_path / "bag", run(6.0)))
+    changed = [(topic, at, change(data) if topic == "imu/data" else data) for topic, at, data in samples]
+    (tmp_path / "changed.mcap").write_bytes(mcap_bytes(changed))
+    assert main(["doctor", str(tmp_path / "changed.mcap")]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert f"imu/data: 120 of 120 messages cannot be decoded: {reason}" in said
+    assert "dvl/twist: 30 of" not in said and "DOCTOR_NO_ORIENTATION" not in said
+
+
+def test_why_a_dvl_cannot_be_decoded_is_said_where_none_is_found(tmp_path, capsys):
+    samples = raw(write_bag(tmp_path / "bag", run(6.0)))
+    changed = [(topic.replace("dvl/twist", "a50/velocity"), at, b"\0\7" + data[2:]) for topic, at, data in samples]
+    twist = (TWIST_TYPE, JAZZY.generate_msgdef(TWIST_TYPE, ros_version=2)[0])
+    (tmp_path / "changed.mcap").write_bytes(mcap_bytes(changed, {"a50/velocity": twist}))
+    assert main(["doctor", str(tmp_path / "changed.mcap")]) == 2
+    error = capsys.readouterr().err
+    assert f"a50/velocity ({TWIST_TYPE}, which cannot be decoded: it is encoded as CDR2_LE" in error
+
+
+def test_thousands_of_channels_are_opened_in_a_time_that_goes_with_their_number(tmp_path):
+    output = io.BytesIO()
+    writer = McapWriter(output)
+    writer.start("ros2")
+    schema = writer.register_schema(TWIST_TYPE, "ros2msg", STANDARD.encode())
+    channels_ = [writer.register_channel(f"t{number}", "cdr", schema) for number in range(16_000)]
+    for _, log_ns, data in raw_twists():
+        writer.add_message(channels_[7], log_ns, data, log_ns)
+    writer.finish()
+    (tmp_path / "many.mcap").write_bytes(output.getvalue())
+    began = time.process_time()
+    with BagReader([tmp_path / "many.mcap"]) as bag:
+        assert len(bag.topics) == 16_000
+        assert all(len(bag.types_of(topic)) == 1 and not bag.lacks_definition(topic) for topic in bag.topics)
+        assert len(list(bag.messages(bag.topics))) == 4
+    assert time.process_time() - began < 6.0  # it was 20 s; 1 s is usual
 
 
 # ---------------------------------------------------------------------- what is no damage
