@@ -16,7 +16,8 @@ from .channels import Channel
 
 # What single messages are gathered to, and their bytes.
 MOST_MESSAGES, MOST_BYTES = 4096, 4 << 20
-_LATEST_NS = 2**63 - 1
+# No later log time fits int64, in which columns and SQLite have them
+LATEST_NS = 2**63 - 1
 
 Times = NDArray[Any]
 """(N,) ns, int64; Python's integers where damage made some that int64 does not hold."""
@@ -104,7 +105,7 @@ def times(log_ns: Any) -> Times:
     """Log times (N,), of damaged recordings among them."""
     array = np.asarray(log_ns)
     if array.dtype.kind == "u":
-        return array.astype(np.int64 if not len(array) or array.max() <= _LATEST_NS else object)
+        return array.astype(np.int64 if not len(array) or array.max() <= LATEST_NS else object)
     try:
         return np.array(log_ns, dtype=np.int64)
     except OverflowError:

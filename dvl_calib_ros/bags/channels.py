@@ -11,6 +11,7 @@ import struct
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from graphlib import CycleError, TopologicalSorter
 from typing import Any, NamedTuple
 
 from rosbags.interfaces import MessageDefinitionFormat, Nodetype
@@ -104,13 +105,9 @@ class Decoder:
 
 
 def _decoded(store: Typestore, data: bytes, msgtype: str) -> Any:
-    """A message; zeros behind its end are padding, as some recorders fill up to 4 or 8 bytes."""
-    if len(data) < 4 or data[:2] not in _PLAIN_CDR:
-        kind = _OTHER_CDR.get(data[1]) if len(data) >= 4 and not data[0] else None
-        raise SerdeError(
-            f"it is encoded as {kind}, only plain CDR is read" if kind else
-            f"no CDR: it begins with {data[:4].hex(' ') or 'nothing'}"
-        )  # fmt: skip
+    """Decode a message; some recorders pad it with zeros to a multiple of 4 or 8 bytes, which rosbags refuses."""
+    if data[:2] not in PLAIN_CDR:
+        raise SerdeError(f"it begins with {data[:2].hex(' ') or 'nothing'}, plain CDR with 00 00 or 00 01")
     try:
         return store.deserialize_cdr(data, msgtype)
     except KeyError as error:
@@ -118,32 +115,21 @@ def _decoded(store: Typestore, data: bytes, msgtype: str) -> Any:
     except SerdeError as error:
         if _TOO_LONG not in str(error):
             raise
-        for surplus in _SURPLUS:
-            if not any(data[-surplus:]):
+        for padding in (4, 8):
+            if not any(data[-padding:]):
                 with suppress(SerdeError):
-                    return store.deserialize_cdr(data[:-surplus], msgtype)
-        raise DefinitionError(
-            f"bytes follow the end of a {msgtype}; its definition may be of another version"
-        ) from error
+                    return store.deserialize_cdr(data[:-padding], msgtype)
+        raise DefinitionError(f"it is longer than a {msgtype}; its definition may be of another version") from error
 
 
-# What rosbags says of a message with more behind its end than the three bytes of padding that it takes
+# What rosbags says of a message with more bytes behind its end than the three of padding that it takes
 _TOO_LONG = "size mismatch"
 # Big-endian and little-endian
-_PLAIN_CDR = (b"\0\0", b"\0\1")
-# https://www.omg.org/spec/DDS-XTYPES, 7.6.3.1.2, and those of DDS-RTPS before
-_OTHER_CDR = {
-    2: "PL_CDR_BE", 3: "PL_CDR_LE", 6: "CDR2_BE", 7: "CDR2_LE", 8: "D_CDR2_BE", 9: "D_CDR2_LE", 10: "PL_CDR2_BE",
-    11: "PL_CDR2_LE",
-}  # fmt: skip
-# What padding is tried, bytes
-_SURPLUS = (4, 8)
+PLAIN_CDR = (b"\0\0", b"\0\1")
 
 # Of the definitions that ROS ships the longest has 9 kB, with all that is nested in it, and the largest array 48.
 LONGEST_DEFINITION = 1 << 18
 LARGEST_ARRAYS = 1 << 16
-# Types in types: of those that ROS ships none has more than 6 levels.
-DEEPEST = 30
 # Types made of definitions that are kept: making them takes longer than reading a minute, and recordings are alike.
 KEPT = 32
 _FIELD = re.compile(r"[A-Za-z]\w*", re.ASCII)
@@ -237,20 +223,16 @@ def _harmless(types: dict[str, Any]) -> dict[str, Any]:
 
 
 def _check_finite(types: dict[str, Any]) -> None:
-    """Raise DefinitionError for a type that contains itself, or in more levels than any driver has."""
-    inner = {
-        name: {_named(description) for _, description in fields} & types.keys() for name, (_, fields) in types.items()
-    }
-    left = dict(inner)
-    for _ in range(DEEPEST + 1):
-        left = {name: held & left.keys() for name, held in left.items() if held & left.keys()}
-        if not left:
-            return
-    raise DefinitionError(f"the definition of {min(left)} contains itself")
+    """Raise DefinitionError for a type that contains itself."""
+    inner = {name: {_named(description) for _, description in fields} for name, (_, fields) in types.items()}
+    try:
+        TopologicalSorter(inner).prepare()
+    except CycleError as error:
+        raise DefinitionError(f"the definition of {min(error.args[1])} contains itself") from error
 
 
 def _named(description: Any) -> str:
-    """The type that a field holds, or holds many of."""
+    """Return the type that a field holds, or holds many of; '' for numbers and strings."""
     kind, what = description
     while kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         kind, what = what[0]

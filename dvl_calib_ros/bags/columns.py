@@ -20,8 +20,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys.store import Typestore
 
-from .batches import Batch, Index
-from .channels import Channel, Decoder, DecodingError
+from .batches import LATEST_NS, Batch, Index
+from .channels import PLAIN_CDR, Channel, Decoder, DecodingError
 from .reader import BagReader
 
 # Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
@@ -30,7 +30,6 @@ ENOUGH_MESSAGES = 1024
 # A recorder has one layout or a few; garbage could have ever new ones.
 _MOST_LAYOUTS = 8
 Stamps = NDArray[np.int64]
-_LATEST_NS = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
     arrived = 0
     for batches in _windows(bag.batches(topics)):
         places = np.cumsum([0, *(batch.size for batch in batches)])
-        log_ns = np.concatenate([np.minimum(batch.log_ns, _LATEST_NS).astype(np.int64) for batch in batches])
+        log_ns = np.concatenate([np.minimum(batch.log_ns, LATEST_NS).astype(np.int64) for batch in batches])
         by_kind: dict[tuple[int, int], list[tuple[Batch, Index, Index]]] = {}
         for batch, first in zip(batches, places.tolist(), strict=False):
             for number, length, at in _kinds(batch):
@@ -168,7 +167,7 @@ class _Layouts:
             return False
         try:
             known.append(layout_of(store, channel.msgtype, data))
-        except (NoLayoutError, LookupError):
+        except (NoLayoutError, LookupError, RecursionError):
             return False
         return True
 
@@ -259,7 +258,7 @@ class MessageColumns:
 
 def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
     """The layout of a message. Raises NoLayoutError, also where rosbags makes something else of the message."""
-    if len(data) < ENCAPSULATION or data[:2] not in (b"\0\0", b"\0\1"):
+    if len(data) < ENCAPSULATION or data[:2] not in PLAIN_CDR:
         raise NoLayoutError("no CDR")
     walk = _LayoutWalk(store, data)
     walk.message("", msgtype)

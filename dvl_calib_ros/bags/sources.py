@@ -20,7 +20,7 @@ from urllib.parse import quote
 import numpy as np
 
 from ..errors import InputError
-from .batches import MOST_BYTES, MOST_MESSAGES, BagMessage, Batch, batched, by_log_time, times
+from .batches import LATEST_NS, MOST_BYTES, MOST_MESSAGES, BagMessage, Batch, batched, by_log_time, times
 from .channels import Channel, Definition, definition_of
 from .files import ZSTD_MAGIC, NewFolder, decompressed, storage_suffix, with_journal
 from .raw_file import open_raw
@@ -56,7 +56,7 @@ class Source:
     ) -> None:
         self.path = path
         self.counts = counts
-        self.span_ns = span_ns
+        self.span_ns = min(span_ns[0], LATEST_NS), min(span_ns[1], LATEST_NS)
         self.batches = batches
         self.damage_noted = damage_noted
         self._by_topic: dict[str, list[Channel]] = {}
@@ -208,28 +208,29 @@ def _until_damage(batches: Batches, path: Path, salvage: Salvage, counts: Mappin
 
 
 class _Given:
-    """The first so many messages of batches, which a reader has; each is known once for each time that it was given.
+    """The first messages of batches, which a reader has; each is recognised as often as it was given.
 
-    They are known by themselves: of a damaged recording no time, and no place, says which came before.
+    They are recognised by content: in a damaged recording neither a log time nor a place says which message came first.
     """
 
     def __init__(self, batches: Iterator[Batch], count: int) -> None:
         messages = (message for batch in batches for message in batch.messages())
-        keys = np.fromiter((self._key(message) for message in islice(messages, count)), np.int64)
-        self._keys, self._left = np.unique(keys, return_counts=True)
+        keys = np.sort(np.fromiter((_key(message) for message in islice(messages, count)), np.int64))
+        first = np.flatnonzero(np.diff(keys, prepend=~keys[:1]))
+        self._keys, self._left = keys[first], np.diff(first, append=len(keys))
 
     def __contains__(self, message: BagMessage) -> bool:
-        key = self._key(message)
+        key = _key(message)
         at = int(np.searchsorted(self._keys, key))
         if at == len(self._keys) or self._keys[at] != key or not self._left[at]:
             return False
         self._left[at] -= 1
         return True
 
-    @staticmethod
-    def _key(message: BagMessage) -> int:
-        log_ns, channel, data = message
-        return hash((log_ns, channel.topic, data))
+
+def _key(message: BagMessage) -> int:
+    _, channel, data = message
+    return hash((channel.topic, data))
 
 
 def _rest(salvaged: Iterator[Salvaged], topics: Collection[str], given: _Given) -> Generator[Batch, None, str]:

@@ -24,6 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from ..disk.atomic import NO_SPACE
 from ..disk.yaml_files import load_yaml
 from ..errors import InputError
+from .batches import LATEST_NS
 from .channels import Channel, Definition, DefinitionError, typestore
 
 
@@ -140,6 +141,8 @@ class BagWriter:
         part = self._part_of.get(channel)
         if part is None:
             part = self._part_of[channel] = self._part_for(channel)
+        if self._storage is Storage.SQLITE3:
+            log_ns = min(log_ns, LATEST_NS)  # SQLite has no larger number
         part.writer.write(part.connections[channel], log_ns, data)
 
     def _part_for(self, channel: Channel) -> _Part:

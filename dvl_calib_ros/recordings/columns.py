@@ -152,8 +152,8 @@ class Singles:
         whole = self.end[at] - starts >= STAMP_END
         head = self.content[np.where(whole, starts, 0)[:, None] + np.arange(STAMP_END if whole.any() else 0)]
         stamps_ns = np.zeros(len(at), dtype=np.int64)
-        for order, of_order in (("<", head[:, 1:2] % 2 == 1), (">", head[:, 1:2] % 2 == 0)):
-            own = whole & of_order.any(axis=1)
+        for order, number in (("<", 1), (">", 0)):
+            own = whole & ((head[:, :1] == 0) & (head[:, 1:2] == number)).any(axis=1)
             seconds, nanoseconds = (
                 np.ascontiguousarray(head[own, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
                 for first, kind in ((STAMP_END - 8, "i"), (STAMP_END - 4, "u"))

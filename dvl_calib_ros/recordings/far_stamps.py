@@ -100,7 +100,7 @@ def without_far(
         aside[~recorded] = stamped
         findings += chain(_named(name, "recorded", own_log, recorded), _named(name, "stamped", own, aside & ~recorded))
         kept[name] = columns[name].part(~aside) if aside.any() else columns[name]
-    return kept, _within(spans_ns, joined[~by_log]) if by_log.any() else tuple(spans_ns), findings
+    return kept, tuple(_within(spans_ns, joined[~by_log], bool(by_log.any()))), findings
 
 
 def _named(topic: str, how: str, times_ns: Stamps, aside: Mask) -> Iterator[Reason]:
@@ -118,7 +118,19 @@ def _date(at_ns: int) -> str:
     return datetime.fromtimestamp(at_ns // SECOND_NS, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def _within(spans_ns: Sequence[Span], kept_ns: Stamps) -> tuple[Span, ...]:
-    """Return the spans as far as they hold times that are kept."""
-    own = (kept_ns[(kept_ns >= start_ns) & (kept_ns <= end_ns)] for start_ns, end_ns in spans_ns)
-    return tuple((int(times.min()), int(times.max())) for times in own if len(times))
+def _within(spans_ns: Sequence[Span], kept_ns: Stamps, has_far: bool) -> Iterator[Span]:
+    """Yield the spans without ends that are absurdly far from the times (N,) kept.
+
+    Such an end is a message that was set aside, or of a topic that nobody reads. has_far: whether any was set aside; a
+    file that holds nothing else is left out.
+    """
+    for start_ns, end_ns in spans_ns:
+        own = kept_ns[(kept_ns >= start_ns) & (kept_ns <= end_ns)]
+        if len(own):
+            first_ns, last_ns = int(own.min()), int(own.max())
+            yield (
+                first_ns if first_ns - start_ns > SEGMENT_GAP_NS else start_ns,
+                last_ns if end_ns - last_ns > SEGMENT_GAP_NS else end_ns,
+            )
+        elif not has_far:
+            yield start_ns, end_ns

@@ -110,12 +110,11 @@ def look_of(
     every_s = seconds / count if count else 0.0
     is_seldom = every_s > SELDOM_S and is_position(msgtype)
     numbers = _Numbers(msgtype, every_s if is_seldom else 1.0)
-    if whole or is_seldom:
+    taken = np.zeros(0, dtype=np.int64) if whole or is_seldom else in_bursts(parts, spans_ns)
+    if not len(taken):  # no burst may hold a message of a topic: a recording is long where one log time is wrong
         taken = np.sort(np.concatenate([part.arrivals[0] for part in parts]))
         if not is_position(msgtype):  # of which velocities are made, from one to the next
             taken = taken[:: -(-len(taken) // MOST) or 1]
-    else:
-        taken = in_bursts(parts, spans_ns)
     for part in parts:
         numbers.add_columns(part, _places(part.laid.arrival, taken))
     singly = sorted(

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import struct
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
@@ -25,6 +28,7 @@ from rosbags.typesys import Stores, get_typestore
 from wholes import Names, names_seeds, run_names, run_settings, run_stamps, settings_seeds, stamps_seeds
 
 from dvl_calib_ros.bags.channels import Definition, DefinitionError, typestore
+from dvl_calib_ros.bags.columns import NoLayoutError, layout_of
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.salvage.damage import DamagedError
 from dvl_calib_ros.bags.salvage.mcap_file import salvage_mcap_stream
@@ -34,6 +38,7 @@ from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import Stream
+from dvl_calib_ros.calibration.streams.stream_order import SEGMENT_GAP_NS
 from dvl_calib_ros.disk.yaml_files import parse_scalar
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import load_parameters
@@ -163,10 +168,39 @@ def run_definition(data: bytes) -> None:
         types = typestore(Definition(kind, data[1:].decode("utf-8", "replace")), "a/msg/B")
     except DefinitionError:
         return
+    data = b"\0\1\0\0" + bytes(64)
+    with suppress(NoLayoutError, LookupError):  # that it has none, which the reader knows
+        layout_of(types, "a/msg/B", data)
     try:
-        types.deserialize_cdr(b"\0\1\0\0" + bytes(64), "a/msg/B")
+        types.deserialize_cdr(data, "a/msg/B")
     except Exception:  # the reader counts whatever a decoder raises as a message that cannot be decoded
         return
+
+
+def run_log_times(data: bytes) -> None:
+    """Messages of any log times, eight bytes each: all come out, in order, or are set aside.
+
+    The first byte says how they are stored.
+    """
+    if len(data) < 9:
+        return
+    times = [int.from_bytes(data[at : at + 8], "little") for at in range(1, len(data) - 7, 8)][:400]
+    topics = ("dvl/twist", "gnss/twist", "imu/data")
+    messages = [(topics[i % 3], log_ns, _MESSAGE_ENDS[i % 3]) for i, log_ns in enumerate(times)]
+    options = {"use_chunking": data[0] % 2 == 0, "chunk_size": (1000, 10**6)[data[0] // 2 % 2]}
+    path = _file("times.mcap", mcap_bytes(messages, **options))
+    with BagReader([path]) as bag:
+        found = [(channel.topic, log_ns) for log_ns, channel, _ in bag.raw_messages(bag.topics)]
+    assert Counter(found) == Counter((topic, log_ns) for topic, log_ns, _ in messages)
+    assert all(before <= after for (_, before), (_, after) in pairwise(found))
+    recording = open_recording([path])
+    kept = {topic: sum(map(len, parts)) for topic, parts in recording.columns.items()}
+    aside = [int(each[1]) for note in recording.notes for each in re.finditer(r"(\d+) of \d+ messages are set", note)]
+    assert sum(kept.values()) + sum(aside) == len(messages)
+    assert set(recording.survey.looks) == {topic for topic, count in kept.items() if count}
+    if len(times) >= 200 and len(usual := [each for each in times if each >> 40 == times[0] >> 40]) > 0.99 * len(times):
+        first_ns, last_ns = recording.span_ns
+        assert last_ns - first_ns <= max(usual) - min(usual) + 2 * SEGMENT_GAP_NS
 
 
 def run_result_file(data: bytes) -> None:
@@ -304,6 +338,17 @@ def _column_seeds() -> Iterator[bytes]:
     yield bytes([99]) + b"".join(each[:100] for each in (dvl, dvl.replace(b"dvl_link", b"map\0\0\0\0\0"), imu) * 3)
 
 
+def _log_time_seeds() -> Iterator[bytes]:
+    usual = [1_700_000_000_000_000_000 + 50_000_000 * i for i in range(300)]
+    for kind in range(4):
+        for wild in ([], [(150, 0)], [(150, 2**63 - 1)], [(0, 2**64 - 1), (299, 2**62)]):
+            times = list(usual)
+            for place, log_ns in wild:
+                times[place] = log_ns
+            yield bytes([kind]) + struct.pack("<300Q", *times)
+    yield b"\0" + struct.pack("<4Q", 5, 2**64 - 1, 2**63, 7)
+
+
 def _definition_seeds() -> Iterator[bytes]:
     for msgtype in (TWIST_TYPE, IMU_TYPE, "diagnostic_msgs/msg/DiagnosticArray"):
         yield b"\0" + JAZZY.generate_msgdef(msgtype, ros_version=2)[0].encode()
@@ -396,6 +441,7 @@ TARGETS = {
     "metadata": Target(run_metadata, _metadata_seeds),
     "message": Target(run_message, _message_seeds),
     "columns": Target(run_columns, _column_seeds),
+    "log_times": Target(run_log_times, _log_time_seeds),
     "definition": Target(run_definition, _definition_seeds),
     "result_file": Target(run_result_file, _result_seeds),
     "parameters": Target(run_parameters, _parameter_seeds),

@@ -50,6 +50,6 @@ class Damage:
         """Raise DamagedError with all of it in one sentence."""
         if self:
             more = f" (the first of {self._places} damaged places)" if self._places > 1 else ""
-            what = f"{self._first}{more}, {self.skipped} bytes skipped" if self._places else "it counts more messages"
+            what = f"{self._first}{more}, {self.skipped} bytes skipped" if self._places else "less than it counts"
             lost = f", {self.lost} message{'s' if self.lost > 1 else ''} lost" if self.lost else ""
             raise DamagedError(what + lost)

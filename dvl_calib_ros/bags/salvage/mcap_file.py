@@ -13,6 +13,7 @@ import struct
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from itertools import accumulate, chain
 from operator import attrgetter
 from pathlib import Path
@@ -40,6 +41,7 @@ from .mcap_records import (
     Found,
     Resumed,
     Tables,
+    head_at,
     is_chunk,
     likeness,
     message_head,
@@ -59,7 +61,6 @@ FIRST_PRIVATE = 0x80
 _ENDS = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
 # Of a message's head length, channel and log time
 ALL_BUT_OPCODE = 3
-_MESSAGE_OPCODE = bytes([MESSAGE])
 _CHUNK_BEGIN_SIZE = 64
 # Before a summary the data end: opcode and length
 _DATA_END = RECORD_HEAD.pack(Opcode.DATA_END, 4)
@@ -287,7 +288,7 @@ def _joined(file: BinaryIO, at: int, size: int) -> int | None:
         while at < size:
             opcode, length = record_head(file, at)
             at += RECORD_HEAD.size + length
-            if opcode == Opcode.FOOTER:
+            if opcode == Opcode.FOOTER and at < size:
                 file.seek(at)
                 begins = file.read(2 * len(MCAP_MAGIC)) == 2 * MCAP_MAGIC
                 return at + 2 * len(MCAP_MAGIC) if begins else None
@@ -341,7 +342,7 @@ class _FileWalk:
         is_read = SCHEMA <= opcode <= MESSAGE
         if end > self._size or (is_read and length > LARGEST_RECORD):
             raise DamagedError(f"the record at byte {at} is cut off or damaged")
-        head = self._head_at(at)
+        head = head_at(self._file, at)
         is_message = likeness(head, self._size - at, self._tables) >= ALL_BUT_OPCODE and bool(self._tables.eras)
         # an index behind a chunk begins as a message does, but for its opcode
         is_index = self._holds_chunks and is_message and _INDEX_HEAD.unpack_from(head)[-1] == length - _INDEX_OWN
@@ -350,22 +351,18 @@ class _FileWalk:
         self.has_ended = is_end
         if is_end and opcode == Opcode.FOOTER:  # the end of the data itself is damaged
             return [], at, None
-        if not is_read:
-            return [], end, at
+        if not is_read:  # a wrong length may have led into several such in a row
+            return [], end, at if self._before is None else self._before
         self._file.seek(at)
         content = self._file.read(end - at)
         if holes_in(self._file, at, end):
             self._damage.note(f"at byte {at}: a record cannot be read from the disk", end - at)
         elif opcode == MESSAGE:
-            channel, log_ns = message_head(head, at, at, self._size, self._tables, self._head_at)
+            channel, log_ns = message_head(head, at, at, self._size, self._tables, partial(head_at, self._file))
             return [(log_ns, channel, content[MESSAGE_START:])], end, at
         else:
             self._tables.note(at, opcode, content[RECORD_HEAD.size :])
         return [], end, at
-
-    def _head_at(self, at: int) -> bytes:
-        self._file.seek(at)
-        return self._file.read(MESSAGE_START)
 
     def _index_instead_of_head(self, at: int) -> ChunkIndex | None:
         """What the index says of the chunk at `at`, if the disk cannot read how the chunk begins."""
@@ -395,7 +392,7 @@ class _FileWalk:
 
     def _resumed(self, at: int) -> Resumed:
         """Where to go on after the damaged record at `at`."""
-        if self._before is None and not self._head_at(at).startswith(_MESSAGE_OPCODE):
+        if self._before is None and not head_at(self._file, at).startswith(bytes([MESSAGE])):
             end = sound_end(self._file, at, self._size, self._tables)
             if end is not None:
                 return Resumed(end, False)

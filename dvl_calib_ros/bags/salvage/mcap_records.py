@@ -36,7 +36,11 @@ _WINDOW = 1 << 20
 _LARGEST_FILE = 1 << 62
 # Log times with the same upper bits are within 2^48 ns, three days: a flipped bit above is told from a log time
 ERA_BITS = 48
-_SAID_OF_SCHEMA, _SAID_OF_CHANNEL = attrgetter("name", "encoding", "data"), attrgetter("topic", "schema_id")
+# Of schemas and channels the table that has them, and what must be the same each time that one is written
+_DEFINITIONS: Mapping[int, tuple[Any, str, attrgetter[Any]]] = {
+    SCHEMA: (Schema, "schemas", attrgetter("name", "encoding", "data")),
+    CHANNEL: (Channel, "channels", attrgetter("topic", "schema_id")),
+}
 # What damaged bytes make the mcap library raise when it parses records
 PARSING = (McapError, struct.error, ValueError, LookupError, OverflowError, EOFError, MemoryError)
 
@@ -74,10 +78,7 @@ class Tables:
         self.channels: dict[int, Channel] = dict(summary.channels) if summary else {}
         self.eras: set[int] = set()
         self.lengths: dict[int, int] = {}
-        self._met = {
-            *(("schema", number) for number in self.schemas),
-            *(("channel", number) for number in self.channels),
-        }
+        self._met = {(SCHEMA, each) for each in self.schemas} | {(CHANNEL, each) for each in self.channels}
         self._made: dict[int, tuple[str, str, str, str]] = {}
         if summary and summary.statistics and summary.statistics.message_count:
             self.meet(summary.statistics.message_start_time)
@@ -103,24 +104,17 @@ class Tables:
 
     def note(self, at: int, opcode: int, content: bytes) -> None:
         """Take note of a schema or channel; DamagedError if it is none, or not as it was known."""
+        kind, known, says = _DEFINITIONS[opcode]
+        table = getattr(self, known)
         try:
-            if opcode == SCHEMA:
-                schema = Schema.read(ReadDataStream(BytesIO(content)))
-                self._check(at, "schema", schema.id, _SAID_OF_SCHEMA(schema), self.schemas.get(schema.id))
-                self.schemas[schema.id] = schema
-            else:
-                channel = Channel.read(ReadDataStream(BytesIO(content)))
-                self._check(at, "channel", channel.id, _SAID_OF_CHANNEL(channel), self.channels.get(channel.id))
-                self.channels[channel.id] = channel
+            record = kind.read(ReadDataStream(BytesIO(content)))
         except PARSING as error:
             raise DamagedError(f"the record at byte {at} is damaged") from error
+        if (opcode, record.id) in self._met and says(table[record.id]) != says(record):
+            raise DamagedError(f"the record at byte {at} says otherwise of {known} {record.id} than others")
+        self._met.add((opcode, record.id))
+        table[record.id] = record
         self._made.clear()
-
-    def _check(self, at: int, kind: str, number: int, says: Any, known: Any) -> None:
-        said = _SAID_OF_SCHEMA if kind == "schema" else _SAID_OF_CHANNEL
-        if (kind, number) in self._met and known is not None and said(known) != says:
-            raise DamagedError(f"the record at byte {at} says otherwise of {kind} {number} than others")
-        self._met.add((kind, number))
 
     def salvaged(self, message: Found) -> Salvaged:
         """A message with what is known of its channel."""
@@ -211,14 +205,15 @@ def likeness(head: bytes, room: int, tables: Tables) -> int:
     return (opcode == MESSAGE) + is_length + (channel in tables.channels) + is_time
 
 
-def _head_at(file: BinaryIO, at: int) -> bytes:
+def head_at(file: BinaryIO, at: int) -> bytes:
+    """Return the bytes at a place, as many as stand before the content of a message; fewer at the end."""
     file.seek(at)
     return file.read(MESSAGE_START)
 
 
 def _may_be_head(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
     """Whether a record may begin here, some of whose head is damaged."""
-    head = _head_at(file, at)
+    head = head_at(file, at)
     if len(head) < MESSAGE_START:
         return True
     opcode, length = RECORD_HEAD.unpack_from(head)
@@ -227,7 +222,7 @@ def _may_be_head(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
 
 def _begins(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
     """Whether a sound message, schema, channel or end of the data begins here, and a record follows."""
-    head = _head_at(file, at)
+    head = head_at(file, at)
     opcode, length = RECORD_HEAD.unpack_from(head)
     end = at + RECORD_HEAD.size + length
     if end > size:
@@ -245,7 +240,7 @@ def _is_definition(file: BinaryIO, at: int, opcode: int, length: int) -> bool:
     file.seek(at + RECORD_HEAD.size)
     content = BytesIO(file.read(length))
     with suppress(*PARSING):
-        (Schema if opcode == SCHEMA else Channel).read(ReadDataStream(content))
+        _DEFINITIONS[opcode][0].read(ReadDataStream(content))
         return content.tell() == length
     return False
 
@@ -254,7 +249,7 @@ def _record_follows(file: BinaryIO, at: int, size: int, tables: Tables, deep: in
     """Whether a record begins at `at`: a message, of whose head parts may be damaged, or `deep` others in a row."""
     if at == size or not deep:
         return True
-    head = _head_at(file, at)
+    head = head_at(file, at)
     if likeness(head, size - at, tables) >= ENOUGH_ALIKE:
         return True
     if len(head) < RECORD_HEAD.size:
@@ -507,6 +502,8 @@ def _unpack_chunk(file: BinaryIO, at: int, start: int, head: ChunkHead, packed_s
     packed = file.read(packed_size)
     is_cut = len(packed) < packed_size
     end = min(start + packed_size, size)
+    if is_cut and not head.compression:  # both of its lengths may be damaged, and reach over other chunks
+        packed = packed[: head.unpacked_size]
     if holes := [(first - start, last - start) for first, last in holes_in(file, start, start + len(packed))]:
         lost = sum(last - first for first, last in holes)
         damage = f"{lost} bytes of the chunk at byte {at} cannot be read from the disk"

@@ -29,6 +29,7 @@ from dvl_calib_ros.bags.writer import BagWriter, Storage
 from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS, TWIST_TYPE
+from dvl_calib_ros.recordings.recording import open_recording
 
 # ---------------------------------------------------------------------- names
 
@@ -337,10 +338,10 @@ def test_messages_in_big_endian_or_with_padding_are_read_as_they_are(tmp_path, c
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (lambda data: data + b"\xff" * 4, "bytes follow the end of a sensor_msgs/msg/Imu"),
-        (lambda data: data + b"\xff" * 100, "bytes follow the end of a sensor_msgs/msg/Imu"),
-        (lambda data: b"\0\7" + data[2:], "it is encoded as CDR2_LE, only plain CDR is read"),
-        (lambda data: b"abcd" + data[4:], "no CDR: it begins with 61 62 63 64"),
+        (lambda data: data + b"\xff" * 4, "it is longer than a sensor_msgs/msg/Imu"),
+        (lambda data: data + b"\xff" * 100, "it is longer than a sensor_msgs/msg/Imu"),
+        (lambda data: b"\0\7" + data[2:], "it begins with 00 07, plain CDR with 00 00 or 00 01"),
+        (lambda data: b"abcd" + data[4:], "it begins with 61 62, plain CDR"),
         (lambda data: data[:60], "Could not deserialize"),
     ],
 )
@@ -361,7 +362,7 @@ def test_why_a_dvl_cannot_be_decoded_is_said_where_none_is_found(tmp_path, capsy
     (tmp_path / "changed.mcap").write_bytes(mcap_bytes(changed, {"a50/velocity": twist}))
     assert main(["doctor", str(tmp_path / "changed.mcap")]) == 2
     error = capsys.readouterr().err
-    assert f"a50/velocity ({TWIST_TYPE}, which cannot be decoded: it is encoded as CDR2_LE" in error
+    assert f"a50/velocity ({TWIST_TYPE}, which cannot be decoded: it begins with 00 07" in error
 
 
 def test_thousands_of_channels_are_opened_in_a_time_that_goes_with_their_number(tmp_path):
@@ -426,14 +427,59 @@ def test_what_a_damaged_definition_makes_of_messages_is_told_of_each(tmp_path):
                 assert str(error)
 
 
-def test_log_times_beyond_all_reason_are_no_reason_to_stop(tmp_path):
-    messages = [
-        ("dvl/twist", log_ns, data)
-        for log_ns, (_, _, data) in zip((5, 2**64 - 1, 2**63, 7), raw_twists(), strict=False)
-    ]
-    for name, options in (("index", {}), ("flat", {"use_chunking": False})):
-        (tmp_path / f"{name}.mcap").write_bytes(mcap_bytes(messages, **options))
-        assert sorted(raw(tmp_path / f"{name}.mcap")) == sorted(messages)
+@pytest.mark.parametrize("options", [{}, {"use_chunking": False}])
+@pytest.mark.parametrize("log_times", [(5, 2**64 - 1, 2**63, 7), (2**64 - 1,) * 4, (2**63 - 1,) * 4])
+def test_log_times_beyond_all_reason_are_no_reason_to_stop(tmp_path, log_times, options):
+    messages = [("dvl/twist", log_ns, data) for log_ns, (_, _, data) in zip(log_times, raw_twists(), strict=True)]
+    (tmp_path / "wild.mcap").write_bytes(mcap_bytes(messages, **options))
+    assert sorted(raw(tmp_path / "wild.mcap")) == sorted(messages)
+    for kind, latest_ns in (("mcap", 2**64 - 1), ("sqlite3", 2**63 - 1)):  # SQLite has no larger number
+        assert main(["salvage", str(tmp_path / "wild.mcap"), "-o", str(tmp_path / kind), "--storage", kind]) == 0
+        expected = [(topic, min(log_ns, latest_ns), data) for topic, log_ns, data in messages]
+        assert sorted(raw(tmp_path / kind)) == sorted(expected)
+        assert main(["doctor", str(tmp_path / kind)]) == 0
+
+
+@pytest.mark.parametrize("wild_ns", [0, 10**18, 2**62, 2**63 - 1, 2**63, 2**64 - 1])
+@pytest.mark.parametrize("topic", ["chatter", "imu/data"])
+@pytest.mark.parametrize("kind", ["index", "flat", "sqlite3"])
+def test_a_wild_log_time_costs_no_more_than_its_message(tmp_path, capsys, kind, topic, wild_ns):
+    """One message of another topic, or one of the IMU: rates were 1e-7 Hz, and pauses centuries long."""
+    samples = raw(write_bag(tmp_path / "bag", run(60.0)))
+    text = bytes(JAZZY.serialize_cdr(JAZZY.types["std_msgs/msg/String"]("x"), "std_msgs/msg/String"))
+    number = next(number for number in range(500, 600) if samples[number][0] == "imu/data")
+    sound = samples if topic == "chatter" else samples[:number] + samples[number + 1 :]
+    data = text if topic == "chatter" else samples[number][2]
+    rows = [*sound[:number], (topic, wild_ns, data), *sound[number:]]
+    definitions = {"chatter": ("std_msgs/msg/String", "string data\n")}
+    if kind == "sqlite3":
+        with BagWriter(tmp_path / "wild", Storage.SQLITE3) as bag:
+            for name, log_ns, content in rows:
+                msgtype, of_type = definitions.get(name) or (TOPICS[name], JAZZY.generate_msgdef(TOPICS[name])[0])
+                bag.raw(Channel(name, msgtype, Definition(channels.FORMATS["ros2msg"], of_type)), log_ns, content)
+        path = tmp_path / "wild"
+    else:
+        path = tmp_path / "wild.mcap"
+        path.write_bytes(mcap_bytes(rows, definitions, use_chunking=kind == "index"))
+    (tmp_path / "sound.mcap").write_bytes(mcap_bytes(sound))
+    one, other = open_recording([tmp_path / "sound.mcap"]), open_recording([path])
+    assert other.file_spans_ns == one.file_spans_ns
+    assert {name: look.rate_hz for name, look in other.survey.looks.items()} == {
+        name: look.rate_hz for name, look in one.survey.looks.items()
+    }
+    is_named = [f"{topic}: 1 of 1200 messages are set aside" in note for note in other.notes]
+    assert is_named == [True] * (topic == "imu/data")
+    assert main(["doctor", str(path)]) == 0
+    assert "GAPS" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("days", [-6, -1, 1, 6])
+def test_topics_are_found_where_a_log_time_is_off_by_days(tmp_path, days):
+    samples = raw(write_bag(tmp_path / "bag", run(60.0)))
+    chatter = ("chatter", samples[500][1] + days * 86_400 * 10**9, b"\0\1\0\0\2\0\0\0x\0")
+    definitions = {"chatter": ("std_msgs/msg/String", "string data\n")}
+    (tmp_path / "wild.mcap").write_bytes(mcap_bytes([*samples, chatter], definitions))
+    assert set(open_recording([tmp_path / "wild.mcap"]).survey.looks) == set(TOPICS)
 
 
 def raw_twists():
