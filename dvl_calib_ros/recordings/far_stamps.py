@@ -78,28 +78,25 @@ def without_far(
     findings: What was set aside.
 
     """
-    names = list(columns)
-    arrivals, log_ns = [], []
-    for part in columns.values():
-        arrival, own = part.arrivals
-        arrivals.append(arrival)
-        log_ns.append(own)
+    names = [name for name, part in columns.items() if len(part)]
+    log_ns = [columns[name].arrivals[1] for name in names]
     joined = np.concatenate([np.zeros(0, dtype=np.int64), *log_ns])
     [by_log] = far([joined])
     of_log = np.split(by_log, np.cumsum([len(own) for own in log_ns])[:-1]) if names else []
     # a topic that is far as a whole has another clock, which is found and said later
     of_log = [np.zeros_like(own) if len(own) >= FEWEST_OF_A_CLOCK and own.all() else own for own in of_log]
     by_log = np.concatenate([by_log[:0], *of_log])
-    stamps_ns = [part.stamps_ns for part in columns.values()]
+    stamps_ns = [columns[name].stamps_ns for name in names]
     # what was recorded far away may be stamped by the same clock: it has no say
     of_stamps = far([own[~aside] for own, aside in zip(stamps_ns, of_log, strict=True)])
-    kept: dict[str, TopicColumns] = {}
+    kept = dict(columns)
     findings: list[Reason] = []
     for name, own, own_log, recorded, stamped in zip(names, stamps_ns, log_ns, of_log, of_stamps, strict=True):
         aside = recorded.copy()
         aside[~recorded] = stamped
         findings += chain(_named(name, "recorded", own_log, recorded), _named(name, "stamped", own, aside & ~recorded))
-        kept[name] = columns[name].part(~aside) if aside.any() else columns[name]
+        if aside.any():
+            kept[name] = columns[name].part(~aside)
     return kept, tuple(_within(spans_ns, joined[~by_log], bool(by_log.any()))), findings
 
 
