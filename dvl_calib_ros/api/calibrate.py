@@ -33,7 +33,7 @@ def replay(
     Parameters
     ----------
     bags
-        A rosbag2 folder, a .mcap or .db3 file, or several of them, which are read as one.
+        A rosbag2 folder, a .mcap, .db3 or (ROS 1) .bag file, or several of them, which are read as one.
     dvl_topic, gnss_topic, imu_topic
         Topics; found by type, name and content where not named. gnss_topic, imu_topic: "none" does without.
     params

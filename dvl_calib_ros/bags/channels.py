@@ -20,12 +20,13 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 FORMATS = {
+    "ros1msg": MessageDefinitionFormat.MSG,
     "ros2msg": MessageDefinitionFormat.MSG,
     "ros2idl": MessageDefinitionFormat.IDL,
     "omgidl": MessageDefinitionFormat.IDL,
 }
 # What damaged bytes, or a definition that does not fit them, make rosbags' generated decoders raise
-_DECODING = (SerdeError, struct.error, ValueError, LookupError, OverflowError, RecursionError)
+DECODING = (SerdeError, struct.error, ValueError, LookupError, OverflowError, RecursionError)
 
 
 class Channel(NamedTuple):
@@ -42,7 +43,7 @@ class DecodingError(Exception):
 
 def definition_of(encoding: str, text: str) -> Definition:
     """A definition as recordings name its format."""
-    return Definition(FORMATS.get(encoding, MessageDefinitionFormat.NONE), text)
+    return Definition(FORMATS.get(encoding, MessageDefinitionFormat.NONE), text, encoding == "ros1msg")
 
 
 class Decoder:
@@ -72,14 +73,14 @@ class Decoder:
         try:
             stores = self._typestores(channel)
             for store in stores[:-1]:  # of several versions, the one that a message fits from beginning to end
-                with suppress(*_DECODING):
+                with suppress(*DECODING):
                     message = store.deserialize_cdr(data, channel.msgtype)
                     self._stores[channel] = [store]
                     return message
             return _decoded(stores[-1], data, channel.msgtype)
         except (SerdeError, DefinitionError) as error:
             raise DecodingError(str(error)) from error
-        except _DECODING as error:
+        except DECODING as error:
             raise DecodingError(f"{type(error).__name__}: {error}") from error
 
     def _typestores(self, channel: Channel) -> list[Typestore]:
@@ -136,14 +137,15 @@ _FIELD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _TYPE = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
 # rosbags evaluates the constants of IDL: a shift can take all memory, and nested brackets for ever to parse
 _EXPENSIVE_IDL = re.compile(r"<<|\(\s*\(\s*\(")
-_SEPARATOR = "=" * 80 + "\n"
+SEPARATOR = "=" * 80 + "\n"
 
 
 class Definition(NamedTuple):
-    """The text of a message definition."""
+    """The text of a message definition. is_ros1: whether its messages are laid out as ROS 1 does (ros1.py)."""
 
     format: MessageDefinitionFormat
     text: str
+    is_ros1: bool = False
 
 
 class DefinitionError(Exception):
@@ -200,7 +202,7 @@ def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
     if _EXPENSIVE_IDL.search(definition.text):
         raise DefinitionError(f"the definition of {msgtype} has constants that are computed")
     types: dict[str, Any] = {}
-    for part in definition.text.split(_SEPARATOR):
+    for part in definition.text.split(SEPARATOR):
         idl = part.split("\n", 1)[1] if part.startswith("IDL: ") else part
         if idl.strip():
             types.update(get_types_from_idl(idl))

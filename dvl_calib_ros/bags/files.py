@@ -19,7 +19,7 @@ else:
     from backports import zstd
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-STORAGE_SUFFIXES = (".mcap", ".db3")
+STORAGE_SUFFIXES = (".mcap", ".db3", ".bag")
 
 
 def is_bag(path: Path) -> bool:
@@ -43,7 +43,9 @@ def files_of(folder: Path, notes: list[str]) -> list[Path]:
     """The recordings in a folder: those that its metadata.yaml lists, or all if that is missing or damaged."""
     files = sorted((file for file in folder.iterdir() if storage_suffix(file) in STORAGE_SUFFIXES), key=_natural_order)
     if not files:
-        raise InputError(f"{folder}: no bag, there is no .mcap or .db3 file in it")
+        raise InputError(f"{folder}: no bag, there is no .mcap, .db3 or .bag file in it")
+    if all(storage_suffix(file) == ".bag" for file in files):  # ROS 1 lists nothing
+        return files
     listed = _listed(folder, notes)
     if not listed:
         return files

@@ -164,7 +164,9 @@ class BagReader:
             if not path.exists():
                 raise InputError(f"{path}: no such file or folder")
             if not path.is_file():
-                raise InputError(f"{path}: neither file nor folder; give a rosbag2 folder, or a .mcap or .db3 file")
+                raise InputError(
+                    f"{path}: neither file nor folder; give a rosbag2 folder, or a .mcap, .db3 or .bag file"
+                )
             return [self._open_file(path)]
         except OSError as error:
             raise _unreadable(path, error) from error

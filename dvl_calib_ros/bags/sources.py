@@ -1,4 +1,4 @@
-"""One recorded file: MCAP or SQLite, whole or damaged.
+"""One recorded file: MCAP, SQLite or a .bag of ROS 1, whole or damaged.
 
 It is read by its index while that is sound, SQLite's or MCAP's, and after the first damage by the salvaging readers.
 What is caught here is what damaged bytes and bad disks cause, and no more: that a library of another version does not
@@ -12,6 +12,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
+from functools import partial
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
@@ -24,11 +25,11 @@ from .batches import LATEST_NS, MOST_BYTES, MOST_MESSAGES, BagMessage, Batch, ba
 from .channels import Channel, Definition, definition_of
 from .files import ZSTD_MAGIC, NewFolder, decompressed, storage_suffix, with_journal
 from .raw_file import open_raw
+from .ros1 import ROS1_MAGIC, as_ros2, bag_batches, batch_as_ros2, is_ros1, open_bag
 from .salvage.damage import LARGEST_RECORD, DamagedError, Salvaged
 from .salvage.mcap_file import MCAP_MAGIC, bytes_at_once, indexed_messages, read_summary, salvage_mcap
 from .salvage.sqlite_file import SQLITE_MAGIC, salvage_sqlite
 
-ROS1_MAGIC = b"#ROSBAG"
 # Chunks that overlap in time, as of a recorder that caches by topic, are merged in memory up to so many bytes.
 MERGED_AT_ONCE = 64 << 20
 DAMAGE = (DamagedError, OSError, sqlite3.Error, struct.error)
@@ -84,7 +85,7 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
     if magic.startswith(ZSTD_MAGIC) and path == shown:
         return open_source(decompressed(path, new_folder, notes), new_folder, notes, shown)
     if magic.startswith(ROS1_MAGIC):
-        raise InputError(f"{shown}: a ROS 1 bag; convert it first: rosbags-convert --src {shown.name} --dst NEW")
+        return _in_ros2(Source(shown, *open_bag(path, shown), partial(bag_batches, path)))
     # of a file whose first bytes were never written, or are lost, the name has to do
     kinds = {MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
     kind = next((kinds[each] for each in kinds if magic.startswith(each)), storage_suffix(shown))
@@ -92,7 +93,7 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
         return _opened(path, shown, _mcap, salvage_mcap, notes)
     if kind == ".db3":
         return _opened(with_journal(path, new_folder, notes), shown, _sqlite, salvage_sqlite, notes)
-    raise InputError(f"{shown}: no bag; give a rosbag2 folder, or a .mcap or .db3 file")
+    raise InputError(f"{shown}: no bag; give a rosbag2 folder, or a .mcap, .db3 or .bag file")
 
 
 def _opened(
@@ -106,7 +107,21 @@ def _opened(
         source, why = by_index(path, shown, notes), ""
     except DAMAGE as error:
         source, why = None, said(error)
-    return source or _salvaged(path, shown, salvage, why, notes)
+    return _in_ros2(source or _salvaged(path, shown, salvage, why, notes))
+
+
+def _in_ros2(source: Source) -> Source:
+    """Return the source with messages of ROS 1 laid out as those of ROS 2."""
+    if not any(map(is_ros1, source.counts)):
+        return source
+    counts: Counter[Channel] = Counter()
+    for channel, new in as_ros2(source.counts).items():
+        counts[new] += source.counts[channel]
+
+    def batches(topics: Collection[str]) -> Iterator[Batch]:
+        return map(batch_as_ros2, source.batches(topics))
+
+    return Source(source.path, counts, source.span_ns, batches, source.damage_noted)
 
 
 def _mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:

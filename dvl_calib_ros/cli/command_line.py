@@ -145,7 +145,7 @@ def _fail(command: str, message: str) -> int:
 State = tuple[int, int, int]
 """Of a file: which it is, its size, and when it was last written."""
 # Of recordings, and of what their recorder keeps beside
-_SUFFIXES = (".mcap", ".db3", ".db3-wal", ".db3-journal", ".zstd")
+_SUFFIXES = (".mcap", ".db3", ".bag", ".db3-wal", ".db3-journal", ".zstd")
 
 
 def recordings_now(arguments: argparse.Namespace) -> dict[Path, State]:

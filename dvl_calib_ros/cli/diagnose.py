@@ -26,7 +26,7 @@ DEFAULTS = {"min_speed": 0.0}
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument(
         "--apply", type=Path, metavar="FILE",

@@ -24,7 +24,7 @@ LOOK_S = 0.2
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
     parser.add_argument(
         "--live", nargs="?", type=float, const=LIVE_S, metavar="S",
         help="instead of a bag, the topics there are on ROS 2, for so many seconds; without a number: %(const)g",

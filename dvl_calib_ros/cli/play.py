@@ -27,7 +27,7 @@ CLOCKS_HZ = (0.1, 1000.0)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3 file")
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag file")
     parser.add_argument("-r", "--rate", type=float, default=1.0, help="times as fast as recorded; default: %(default)g")
     parser.add_argument("-l", "--loop", action="store_true", help="again and again, until Ctrl-C")
     parser.add_argument(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
     parser.add_argument("--models", metavar="NAMES", help="show these models beside the answer, such as M3,M7 or all")
     parser.add_argument("--merge", action="store_true", help="calibrate bags together even if the mounting moved")
     parser.add_argument("-v", "--verbose", action="store_true", help="show counts, selection and all models as well")

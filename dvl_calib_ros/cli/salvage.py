@@ -11,7 +11,7 @@ from . import common
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap or .db3")
+    parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
     parser.add_argument("-o", "--output", type=Path, required=True, help="bag to write")
     common.add_storage_options(parser)
 

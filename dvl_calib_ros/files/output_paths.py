@@ -16,7 +16,7 @@ from ..errors import InputError
 
 # What SQLite keeps beside a recording, and reads with it
 _BESIDE = ("-wal", "-shm", "-journal")
-_RECORDED = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_RECORDED = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 
 
 def check_outputs(files: Mapping[str, Path], inputs: Iterable[Path], folders: Mapping[str, Path] | None = None) -> None:

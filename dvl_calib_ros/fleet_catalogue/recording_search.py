@@ -1,7 +1,7 @@
 """Recordings below folders and object stores: which files are one, and whose vehicle it is.
 
 A recording is what `replay` takes: a folder with metadata.yaml, a folder whose files are numbered by its own name, else
-each .mcap or .db3 file by itself. Object stores are read by fsspec; what is there is copied for the time it is read.
+each .mcap, .db3, .bag by itself. Object stores are read by fsspec; what is there is copied for the time it is read.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def recordings_in(places: Sequence[str]) -> tuple[list[StoredRecording], list[st
         for each in _grouped(*files):
             found.setdefault(each.where, each)
     if not found:
-        raise InputError(f"{', '.join(places)}: no recording (.mcap, .db3) there or below; name another place")
+        raise InputError(f"{', '.join(places)}: no recording (.mcap, .db3, .bag) there or below; name another place")
     return [found[where] for where in sorted(found)], unread
 
 

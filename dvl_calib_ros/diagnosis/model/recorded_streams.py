@@ -89,7 +89,7 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
 
 SECOND_NS = 1_000_000_000
 # Of files that are recordings by themselves
-SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3")
+SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3", ".bag")
 # A reference that moves faster than this shows that a DVL's zero is none, m/s
 MOVING_MPS = 0.1
 # However long a recording is, its streams are averaged to no less
