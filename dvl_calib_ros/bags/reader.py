@@ -13,6 +13,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from rosbags.typesys.store import Typestore
+
 from ..errors import InputError
 from .batches import BagMessage, Batch, batched, one_batch
 from .channels import Channel, Decoder, DecodingError
@@ -58,6 +60,10 @@ class BagReader:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Remove what was unpacked."""
         self._stack.close()
 
     @property
@@ -79,12 +85,16 @@ class BagReader:
 
     def fields_of(self, topic: str) -> tuple[str, ...]:
         """Names of the fields of a topic's messages; none if that is not known."""
-        names: list[str] = []
+        store = self.typestore(topic)
+        return () if store is None else tuple(name for name, _ in store.fielddefs[self.topics[topic]][1])
+
+    def typestore(self, topic: str) -> Typestore | None:
+        """Types that decode a topic's messages; None if that is not known."""
         for channel in self.channels(topic):
             store = self.decoder.typestore(channel)
             if store is not None and channel.msgtype in store.fielddefs:
-                names += [name for name, _ in store.fielddefs[channel.msgtype][1]]
-        return tuple(dict.fromkeys(names))
+                return store
+        return None
 
     @property
     def message_counts(self) -> Counter[str]:

@@ -51,6 +51,9 @@ def add_discovery_options(parser: argparse.ArgumentParser) -> None:
         none = "" if role == "dvl" else "; none: do without"
         help_ = f"default: {default}, else found by type and content{none}"
         parser.add_argument(f"--{role}-topic", metavar="TOPIC", help=help_)
+    add = parser.add_argument
+    add("--dvl-fields", dest="overrides", action="append", type="dvl_fields:={}".format, metavar="MAP",
+        help="how a DVL's type that is not listed is read: velocity=vel.x,vel.y,vel.z,valid=lock")  # fmt: skip
 
 
 def opened(bags: Sequence[Path], parameters: Parameters) -> Recording:

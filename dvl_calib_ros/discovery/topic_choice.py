@@ -68,7 +68,10 @@ def checked_topic(option: str, name: str, kinds: Sequence[str], survey: Survey, 
     wanted = set(kinds)
     if there is not None and present[there] not in wanted:
         expected = " or ".join(kinds)
-        raise InputError(f"{where}: topic {there} holds {present[there]}, expected {expected}; set {option}")
+        fields = f"; set {option}"
+        if option == "--dvl-topic" and there in survey.field_maps:
+            fields = f"; read it with --dvl-fields {survey.field_maps[there]}"
+        raise InputError(f"{where}: topic {there} holds {present[there]}, expected {expected}{fields}")
     if there is None:
         fitting = sorted(topic for topic, kind in present.items() if kind in wanted)
         near = difflib.get_close_matches(name, fitting, n=1, cutoff=0.5)
@@ -92,7 +95,10 @@ def choose_dvl(survey: Survey, default: str, where: str) -> str:
         velocities = [look for look in looks if not _has(look, (*GNSS_WORDS, *TRUTH_WORDS)) and not is_derived(look)]
         if len(velocities) == 1 and len(looks) > 1:
             return velocities[0].topic
-        raise InputError(f"{where}: no topic looks like a DVL's; name it with --dvl-topic. {_listing(survey)}")
+        unlisted = [name for name in survey.field_maps if not _names(name, (*DERIVED_WORDS, *COMMAND_WORDS))]
+        unlisted.sort(key=lambda name: not _names(f"{name} {present[name]}", DVL_WORDS))
+        fields = "".join(f", or read {name} with --dvl-fields {survey.field_maps[name]}" for name in unlisted[:1])
+        raise InputError(f"{where}: no topic looks like a DVL's; name it with --dvl-topic{fields}. {_listing(survey)}")
     order = list(DVL_TYPES)
     # a driver that sends several forms sends the plain one, the raw type, in full
     order.sort(key=lambda name: (name in REFERENCE_TYPES, name != TWIST_TYPE))

@@ -18,6 +18,7 @@ from ..calibration.models.parameters import SCHEMA, Parameters
 from ..disk.yaml_files import compose_yaml, load_yaml, parse_scalar
 from ..errors import InputError
 from ..messages.drivers import TYPES_OF, may_be_recognised, velocity_type
+from ..messages.field_map import field_map
 
 NODE_NAME = "dvl_calibration"
 # rclpy's own parameters, which a file for the node may hold as well
@@ -49,8 +50,10 @@ def load_parameters(
     except ParameterError as error:
         raise InputError(f"-p {error}") from error
     for name in TYPES_OF:
-        if name != "dvl_type" or not may_be_recognised(parameters.dvl_type):
+        if name != "dvl_type" or not (may_be_recognised(parameters.dvl_type) or parameters.dvl_fields):
             velocity_type(name, getattr(parameters, name))
+    if parameters.dvl_fields:
+        field_map(parameters.dvl_fields)
     return parameters
 
 

@@ -194,7 +194,8 @@ class MessageDecoder:
 
     `problems` keeps the latest finding of each kind; on_problem is told in words when one is new. on_fix is told of
     every position: stamp, place (3,) m in ENU from the first, and its variances (3,) m², nan where not known. What is
-    remembered of the messages before are their frames: the DVL's first is its own. Raises InputError for a type that is
+    remembered of the messages before are their frames: the DVL's first is its own. adapted: by the node's topic what
+    messages go through before. Raises InputError for a type that is
     none.
     """
 
@@ -204,6 +205,7 @@ class MessageDecoder:
         self.reference_type = velocity_type("gnss_type", parameters.gnss_type)
         self.imu_alignment = ImuAlignment(parameters)
         self._reference_readers: dict[Axes, _VelocityReader] = {}
+        self.adapted = {"dvl/twist": self.dvl_type.adapted, "gnss/twist": self.reference_type.adapted}
         self._on_problem = on_problem
         self.on_fix: OnFix = lambda *_: None
         self.forget()

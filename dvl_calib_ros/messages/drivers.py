@@ -146,10 +146,10 @@ def _zero_velocity(read: Callable[[Any], Any]) -> Rule:
 
 def _flagged(field: str) -> Rule:
     flag = attrgetter(field)
-    return Rule("flagged_invalid", f"`{field}` is false", lambda message, _: flag(message) == 0, _CHECK_LOCK)
+    return Rule("flagged_invalid", f"`{field}` is false", lambda message, _: flag(message) == 0, CHECK_LOCK)
 
 
-_CHECK_LOCK = "check that the bottom is in range and nothing blocks the beams"
+CHECK_LOCK = "check that the bottom is in range and nothing blocks the beams"
 
 
 def _has_no_altitude(message: Any) -> Any:
@@ -168,13 +168,13 @@ _NO_BOTTOM = Rule(
     "no_bottom",
     "`altitude` is negative or not finite",
     lambda message, _: _has_no_altitude(message),
-    _CHECK_LOCK,
+    CHECK_LOCK,
 )
 _NO_BOTTOM_NOR_RANGES = Rule(
     "no_bottom",
     f"`altitude` is negative or not finite, and fewer than {ENOUGH_BEAMS} beams have a range",
     lambda message, _: _has_no_altitude(message) & _has_no_range(message),
-    _CHECK_LOCK,
+    CHECK_LOCK,
 )
 
 
@@ -282,7 +282,7 @@ _FEW_BEAMS = Rule(
     "few_beams",
     f"`num_good_beams` below {ENOUGH_BEAMS}",
     lambda message, _: message.num_good_beams < ENOUGH_BEAMS,
-    _CHECK_LOCK,
+    CHECK_LOCK,
 )
 
 _TYPES: dict[str, VelocityType] = {
@@ -360,14 +360,14 @@ _TYPES: dict[str, VelocityType] = {
             rules=(
                 _flagged("velocity_valid"),
                 Rule(
-                    "few_beams", f"fewer than {ENOUGH_BEAMS} of its `beams` are `valid`", _few_beams_listed, _CHECK_LOCK
+                    "few_beams", f"fewer than {ENOUGH_BEAMS} of its `beams` are `valid`", _few_beams_listed, CHECK_LOCK
                 ),
                 _NO_BOTTOM,
                 Rule(
                     "poor_fom",
                     "`fom` (m/s) above `max_fom`, negative or not finite",
                     lambda message, parameters: _is_outside(message.fom, 0.0, parameters.max_fom),
-                    _CHECK_LOCK,
+                    CHECK_LOCK,
                 ),
                 _zero_velocity(_VELOCITY),
             ),
@@ -390,7 +390,7 @@ _TYPES: dict[str, VelocityType] = {
                         "flagged_invalid",
                         "`velocity_covariance` begins with -1",
                         lambda message, _: np.asarray(message.velocity_covariance)[..., 0] == -1.0,
-                        _CHECK_LOCK,
+                        CHECK_LOCK,
                     ),
                     _zero_velocity(_VELOCITY),
                 ),
@@ -492,11 +492,22 @@ def add_type(name: str, like: str) -> VelocityType:
     """A type of another name that is read as one that is known; known by its name from here on."""
     package = name.partition("/")[0]
     same = VELOCITY_TYPES[like]
-    added = replace(same, name=name, sent_by=f"as {like}", definitions=(), install=f"build {package} in your workspace")
+    install = f"build {package} in your workspace"
+    return register(replace(same, name=name, sent_by=f"as {like}", definitions=(), install=install))
+
+
+def register(added: VelocityType) -> VelocityType:
+    """Make a type known by its name."""
     for types, belongs in ((_TYPES, True), (_DVLS, added.is_dvl), (_REFERENCES, added.is_reference)):
         if belongs:
-            types[name] = added
+            types[added.name] = added
     return added
+
+
+def forget(name: str) -> None:
+    """Make a type that was registered unknown again."""
+    for types in (_TYPES, _DVLS, _REFERENCES):
+        types.pop(name, None)
 
 
 def may_be_recognised(name: str) -> bool:

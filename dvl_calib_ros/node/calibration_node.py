@@ -84,7 +84,7 @@ class CalibrationNode(AnsweringNode):
         named = set(self.get_parameters_by_prefix(""))
         parameters = declare_parameters(self, parameter_files)
         self._parameter_files = parameter_files
-        dvl_class = velocity_class("dvl_type", parameters.dvl_type)
+        dvl_class = velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields)
         gnss_class = velocity_class("gnss_type", parameters.gnss_type)
         self._result_folder = Path(parameters.result_file).absolute().parent if parameters.result_file else Path.cwd()
         self._check_result_file(parameters.result_file)
@@ -126,7 +126,7 @@ class CalibrationNode(AnsweringNode):
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
-        self._adapted = self._feed.decoder.reference_type.adapted
+        self._adapted = self._feed.decoder.adapted
         self._feed_from: Mapping[str, Callable[[Any, int], Any]] = {
             "dvl/twist": self._feed_dvl,
             "gnss/twist": lambda message, received_ns: self._feed.reference(message, received_ns),
@@ -194,7 +194,7 @@ class CalibrationNode(AnsweringNode):
         there = {name for name, _ in self.get_topic_names_and_types()}
         self._found_names = {own: name for own, name in names.items() if name in there}
         classes = {
-            "dvl/twist": velocity_class("dvl_type", parameters.dvl_type),
+            "dvl/twist": velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields),
             "gnss/twist": velocity_class("gnss_type", parameters.gnss_type),
             "imu/data": Imu,
         }
@@ -203,7 +203,7 @@ class CalibrationNode(AnsweringNode):
             self._subscribe(classes[own], own)
             self.destroy_subscription(old)
         self._begin(parameters, self._initial)
-        self._adapted = self._feed.decoder.reference_type.adapted
+        self._adapted = self._feed.decoder.adapted
         self._heading_is_open = self._heading_is_open and "heading_deviation_std" not in discovery.values
         now_s = self._pauses.running_s(steady_s())
         heard = {own: subscription.topic_name for own, subscription in self._inputs.items()}
@@ -318,8 +318,8 @@ class CalibrationNode(AnsweringNode):
     def _deliver(self, taken: Mapping[str, Arrived], ready: Collection[str] | None = None) -> None:
         """Feed messages that were taken, by topic, and all that wait."""
         for topic, message in in_order_of_arrival(self._inputs, take, taken, ready=ready):
-            if self._adapted is not None and topic == "gnss/twist":
-                message = self._adapted(message)
+            if (adapted := self._adapted.get(topic)) is not None:
+                message = adapted(message)
             self._feed_from[topic](message, self._received_ns(message))
             self._publish_if_updated()
 

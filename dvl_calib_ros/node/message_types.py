@@ -12,6 +12,7 @@ import numpy as np
 from ..calibration.numerics.frames import FLU_FROM_FRD
 from ..calibration.numerics.samples import DvlSample
 from ..errors import InputError
+from ..messages.decode import UNREADABLE
 from ..messages.drivers import (
     BOTTOM_TRACK,
     DS_INSTRUMENT,
@@ -20,17 +21,27 @@ from ..messages.drivers import (
     may_be_recognised,
     velocity_type,
 )
+from ..messages.field_map import mapped_type, may_be_mapped
 from ..messages.type_recognition import recognised
 
 
-def velocity_class(parameter: str, name: str) -> Any:
+def velocity_class(parameter: str, name: str, dvl_fields: str = "") -> Any:
     """The class of the type that parameter dvl_type or gnss_type names; one that nobody knows is known by its fields.
 
-    Raises InputError if it is none, or its package is not installed.
+    dvl_fields: the parameter, of a DVL. Raises InputError if it is none, or its package is not installed.
     """
-    if parameter == "dvl_type" and name not in VELOCITY_TYPES and may_be_recognised(name):
-        package, _, rest = name.partition("/")
-        full = f"{package}/msg/{rest.removeprefix('msg/')}"
+    package, _, rest = name.partition("/")
+    full = f"{package}/msg/{rest.removeprefix('msg/')}"
+    if dvl_fields and may_be_mapped(full):
+        found = message_class(parameter, full)
+        read = mapped_type(full, dvl_fields).adapted
+        try:
+            assert read is not None
+            read(found())
+        except UNREADABLE as error:
+            raise InputError(f"dvl_fields: {dvl_fields!r} does not fit {full}: {error}") from error
+        name = full
+    elif parameter == "dvl_type" and name not in VELOCITY_TYPES and may_be_recognised(name):
         found = message_class(parameter, full)
         recognised(full, found.get_fields_and_field_types())
         name = full

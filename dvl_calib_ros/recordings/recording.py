@@ -23,8 +23,10 @@ from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.samples import Stamps, Stream, Streams, no_samples
 from ..calibration.registration.registration import Registration
+from ..errors import InputError
 from ..messages.decode import MessageDecoder
 from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, VELOCITY_TYPES
+from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, suggested
 from ..messages.type_recognition import recognised
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from .columns import Collector, TopicColumns, is_kept
@@ -52,7 +54,7 @@ class Recording:
     (damage). columns: of the topics that are kept, a part for each path. transforms: of tf_static; descriptions: of
     robot_description. parts: the recordings that it is made of; none, if it is one. registrations: how its instruments
     stand, by what it was registered with, for who asks the same again (`register_as`, `registration`). waters: what
-    it says of its water.
+    it says of its water. field_maps: topic of an unlisted type -> the map that reads what looks like its velocity.
     """
 
     paths: tuple[Path, ...]
@@ -67,6 +69,7 @@ class Recording:
     parts: tuple[Recording, ...] = field(default=(), repr=False)
     registrations: dict[tuple[Topics, Parameters], Registration] = field(default_factory=dict, repr=False)
     waters: tuple[OfWater, ...] = ()
+    field_maps: Mapping[str, str] = field(default_factory=dict)
 
     def register_as(self, found: Registration, topics: Topics, parameters: Parameters) -> None:
         """Keep what a registration with these topics, mounting, frames and clocks found."""
@@ -146,7 +149,7 @@ class Recording:
             for topic, parts in columns.items() if topic not in seen
             for *_, why in islice((row for part in parts for row in part.singles.messages(slice(1))), 1) if why
         }  # fmt: skip
-        return Survey(self.types, self.counts, seen, self.transforms, self.descriptions, unread)
+        return Survey(self.types, self.counts, seen, self.transforms, self.descriptions, unread, self.field_maps)
 
     def water(self, topics: Topics) -> Water | None:
         """What it says of its water, and the speed of sound that the DVL used; None if nothing."""
@@ -210,7 +213,8 @@ def open_recording(
     parameters = parameters or Parameters()
     each = []
     with ExitStack() as stack:
-        bags = [stack.enter_context(open_bags([path])) for path in paths]  # what is wrong with the last is said first
+        # what is wrong with the last is said first
+        bags = [stack.enter_context(open_bags([path], parameters.dvl_fields)) for path in paths]
         for index, (path, bag) in enumerate(zip(paths, bags, strict=True)):
 
             def progress(share: float, index: int = index) -> None:
@@ -245,6 +249,7 @@ def together(each: Sequence[Recording]) -> Recording:
         tuple(dict.fromkeys(text for one in each for text in one.descriptions)),
         tuple(each),
         waters=_of_all(each),
+        field_maps={topic: text for one in each for topic, text in one.field_maps.items()},
     )
 
 
@@ -341,7 +346,15 @@ def _read(
         tuple(transforms),
         tuple(dict.fromkeys(descriptions)),
         waters=tuple(reading for each in waters.values() for reading in each.readings()),
+        field_maps=_field_maps(bag),
     )
+
+
+def _field_maps(bag: BagReader) -> dict[str, str]:
+    """Return of each topic of an unlisted type the map that may read its velocity."""
+    stores = {topic: bag.typestore(topic) for topic, kind in bag.topics.items() if not is_kept(kind)}
+    found = {topic: suggested(store, bag.topics[topic]) for topic, store in stores.items() if store is not None}
+    return {topic: text for topic, text in found.items() if text}
 
 
 def _is_read_in_columns(kind: str) -> bool:
@@ -354,10 +367,34 @@ def is_static(topic: str, kind: str) -> bool:
     return (kind == TF_TYPE and name == "tf_static") or (kind == STRING_TYPE and name == "robot_description")
 
 
-def open_bags(paths: Sequence[Path]) -> BagReader:
-    """A reader of recordings whose types are recognised. Raises InputError for what is no bag."""
+def open_bags(paths: Sequence[Path], dvl_fields: str = "") -> BagReader:
+    """A reader of recordings whose types are recognised. Raises InputError for what is no bag, or a map that fits none.
+
+    dvl_fields: as the parameter.
+    """
     bag = BagReader(paths, KNOWN_DEFINITIONS)
+    forget_mapped(dvl_fields)
+    if dvl_fields:
+        try:
+            _map_types(bag, dvl_fields, ", ".join(map(str, paths)))
+        except InputError:
+            bag.close()
+            raise
     for topic, name in bag.topics.items():
         if name not in VELOCITY_TYPES:
             recognised(name, bag.fields_of(topic))
     return bag
+
+
+def _map_types(bag: BagReader, text: str, where: str) -> None:
+    """Make the types known that a map of fields fits. Raises InputError if there is none."""
+    opened = {kind: bag.typestore(topic) for topic, kind in bag.topics.items() if may_be_mapped(kind)}
+    stores = {kind: store for kind, store in opened.items() if store is not None}
+    said = {kind: misfit(text, store, kind) for kind, store in stores.items()}
+    for kind, why in said.items():
+        if not why:
+            mapped_type(kind, text)
+    if all(said.values()):
+        # the type of which a map of its own is known is more likely meant than any other
+        nearest = min(said, key=lambda kind: not suggested(stores[kind], kind), default="")
+        raise InputError(f"{where}: dvl_fields: {said.get(nearest) or 'no topic is of a type that is not listed'}")

@@ -82,6 +82,7 @@ class Survey:
     """What was seen. looks: by topic. transforms: messages of tf_static; descriptions: of robot_description.
 
     unread: topic -> why none of its messages can be decoded.
+    field_maps: as of `Recording`.
     """
 
     topics: Mapping[str, str]
@@ -90,6 +91,7 @@ class Survey:
     transforms: tuple[Any, ...]
     descriptions: tuple[str, ...]
     unread: Mapping[str, str] = field(default_factory=dict)
+    field_maps: Mapping[str, str] = field(default_factory=dict)
 
 
 def look_of(

@@ -166,7 +166,7 @@ def completed(tmp_path, typed: str) -> list[str]:
     ("typed", "expected"),
     [
         ("dvl-calib re", ["replay"]),
-        ("dvl-calib replay --dv", ["--dvl-topic"]),
+        ("dvl-calib replay --dvl-t", ["--dvl-topic"]),
         ("dvl-calib replay bag -p min_s", ["min_speed:="]),
         ("dvl-calib replay bag -p gnss_free_model:=F", ["gnss_free_model:=F1"]),
         ("dvl-calib simulate bag --storage m", ["mcap"]),

@@ -123,6 +123,11 @@ class Parameters:
         "geometry_msgs/msg/TwistWithCovarianceStamped",
         "Message type of the DVL's topic, live (a bag says its types itself).",
     )
+    dvl_fields: str = _parameter(
+        "",
+        "Fields of DVL messages whose type is not listed: velocity=vel.x,vel.y,vel.z,valid=lock; a vector or three "
+        "fields, or beams=list,direction,velocity; also variance, stamp, frame. Axes as dvl_axes says.",
+    )
     gnss_type: str = _parameter(
         "geometry_msgs/msg/TwistWithCovarianceStamped",
         "Message type of the reference's topic, live.",

@@ -1,0 +1,271 @@
+"""DVL messages of unlisted types, read by a map of fields (parameter dvl_fields).
+
+A map is ``velocity=vel.x,vel.y,vel.z,valid=lock``: keys, each with paths of fields. ``beams=LIST,DIRECTION,VELOCITY``,
+of which the last two are fields of the list's elements, gives the velocity by least squares.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from operator import attrgetter
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys.store import Typestore
+
+from ..calibration.numerics.frames import Array
+from ..errors import InputError
+from .drivers import CHECK_LOCK, ENOUGH_BEAMS, IMU_TYPE, VELOCITY_TYPES, Rule, VelocityType, forget, register
+
+# Keys of a map, and how many paths each may have
+_KEYS: Mapping[str, tuple[int, ...]] = {
+    "velocity": (1, 3), "beams": (3,), "valid": (1, 2, 3, 4), "variance": (1, 3), "stamp": (1,), "frame": (1,)
+}  # fmt: skip
+_WRITTEN = frozenset({*VELOCITY_TYPES, IMU_TYPE})
+# Of a type so many fields are named in an error.
+_NAMED = 30
+# Types that are known by a map, and the map
+_MAPPED: dict[str, str] = {}
+FieldMap = Mapping[str, tuple[str, ...]]
+
+
+def field_map(text: str) -> FieldMap:
+    """Return the paths of each key of a map. Raises InputError."""
+    paths: dict[str, list[str]] = {}
+    key = ""
+    for part in text.split(","):
+        name, is_key, path = part.rpartition("=")
+        key = name.strip() if is_key else key
+        if key not in _KEYS or not path.strip():
+            raise InputError(
+                f"dvl_fields: {part.strip()!r} of {text!r} is not KEY=FIELD, with a KEY of {', '.join(_KEYS)}; "
+                "write velocity=vel.x,vel.y,vel.z,valid=lock"
+            )
+        paths.setdefault(key, []).append(path.strip())
+    for key, counts in _KEYS.items():
+        if key in paths and len(paths[key]) not in counts:
+            expected = " or ".join(map(str, counts))
+            raise InputError(f"dvl_fields: {key} names {len(paths[key])} fields, expected {expected}")
+    if ("velocity" in paths) == ("beams" in paths):
+        raise InputError(f"dvl_fields: {text!r} must name either velocity or beams")
+    return {key: tuple(own) for key, own in paths.items()}
+
+
+def may_be_mapped(msgtype: str) -> bool:
+    """Return whether a map may say how messages of a type are read: of those that are listed it does not."""
+    return msgtype not in _WRITTEN
+
+
+def forget_mapped(text: str) -> None:
+    """Forget the types that are known by another map than this, '' for none."""
+    for name in [name for name, known in _MAPPED.items() if known != text]:
+        forget(name)
+        del _MAPPED[name]
+
+
+def mapped_type(name: str, text: str) -> VelocityType:
+    """Return the type of this name as a map reads it, known until one is opened by another. Raises InputError."""
+    fields = field_map(text)
+    _MAPPED[name] = text
+    return register(
+        VelocityType(
+            name=name,
+            sent_by="as dvl_fields says",
+            velocity=attrgetter("velocity"),
+            covariance=attrgetter("covariance"),
+            covariance_says="as dvl_fields says",
+            is_read_in_columns=False,
+            rules=(Rule("flagged_invalid", "`valid` is false", lambda message, _: not message.valid, CHECK_LOCK),),
+            adapted=_reader(fields),
+        )
+    )
+
+
+def _reader(fields: FieldMap) -> Callable[[Any], Any]:
+    """Return the function that gives a message the names that a type's are read by."""
+    getters = {key: tuple(map(attrgetter, paths)) for key, paths in fields.items() if key != "beams"}
+
+    def read(key: str, message: Any) -> list[Any]:
+        return [getter(message) for getter in getters.get(key, ())]
+
+    def adapted(message: Any) -> Any:
+        header = getattr(message, "header", None)
+        stamp = _stamp(read("stamp", message) or ([header.stamp] if header is not None else [0.0]))
+        frame = read("frame", message) or ([header.frame_id] if header is not None else [""])
+        velocity = _of_beams(fields["beams"], message) if "beams" in fields else _three(read("velocity", message))
+        variance = read("variance", message)
+        return SimpleNamespace(
+            header=SimpleNamespace(stamp=stamp, frame_id=str(frame[0])),
+            velocity=SimpleNamespace(**dict(zip("xyz", velocity, strict=True))),
+            covariance=_covariance(variance) if variance else None,
+            valid=all(read("valid", message)) and all(map(math.isfinite, velocity)),
+        )
+
+    return adapted
+
+
+def _three(values: Sequence[Any]) -> list[float]:
+    """Return three numbers, of a vector, an array, or one by one; nan where there are not three."""
+    if len(values) == 1:
+        [vector] = values
+        values = (vector.x, vector.y, vector.z) if hasattr(vector, "x") else vector
+    return [*map(float, values)] if len(values) == 3 else [math.nan] * 3
+
+
+def _of_beams(paths: Sequence[str], message: Any) -> list[float]:
+    """Return the velocity whose parts along the beams' directions are those measured; nan of fewer than three."""
+    beams, direction, speed = map(attrgetter, paths)
+    rows = [(*_three([direction(beam)]), float(speed(beam))) for beam in beams(message)]
+    table = np.array([row for row in rows if all(map(math.isfinite, row))]).reshape(-1, 4)
+    if np.linalg.matrix_rank(table[:, :3]) < ENOUGH_BEAMS:
+        return [math.nan] * 3
+    return [*map(float, np.linalg.lstsq(table[:, :3], table[:, 3], rcond=None)[0])]
+
+
+def _covariance(values: Sequence[Any]) -> Array | None:
+    """Return (3, 3) (m/s)² of one variance, one of each axis, or of a covariance of 9 numbers or of a twist's 36."""
+    if hasattr(values[0], "x"):
+        values = _three(values)
+    flat = np.concatenate([np.ravel(np.asarray(value, dtype=float)) for value in values])
+    if flat.size in (9, 36):
+        side = math.isqrt(flat.size)
+        return flat.reshape(side, side)[:3, :3]
+    return np.diag(np.broadcast_to(flat, 3)) if flat.size in (1, 3) else None
+
+
+def _stamp(values: Sequence[Any]) -> Any:
+    """Return a stamp as a header has it, of one or of seconds since 1970."""
+    [stamp] = values
+    if hasattr(stamp, "sec"):
+        return stamp
+    seconds, nanoseconds = divmod(round(float(stamp) * 1e9) if math.isfinite(stamp) else 0, 1_000_000_000)
+    return SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+
+
+# ---------------------------------------------------------------------- the fields of a type
+
+Description = Any
+"""What rosbags says of a field: its kind, then a type's name, a base type, or what an array is of."""
+
+
+class _Fields(NamedTuple):
+    """Fields of message types."""
+
+    store: Typestore
+
+    def of(self, description: Description) -> dict[str, Description]:
+        """Return the fields of a message by name, none of what is no message."""
+        kind, what = description
+        known = self.store.fielddefs.get(what) if kind == Nodetype.NAME else None
+        return {} if known is None else dict(known[1])
+
+    def at(self, description: Description, path: str) -> Description | None:
+        """Return what lies at a path below a message; None if nothing does."""
+        for step in path.split("."):
+            description = self.of(description).get(step)
+            if description is None:
+                return None
+        return description
+
+    def walk(self, description: Description, prefix: str = "") -> Iterator[tuple[str, Description]]:
+        """Yield the paths below a message, and what lies there, all but those of its header."""
+        for name, each in self.of(description).items():
+            if prefix or name != "header":
+                yield prefix + name, each
+                yield from self.walk(each, f"{prefix}{name}.")
+
+    def is_number(self, description: Description) -> bool:
+        kind, what = description
+        return bool(kind == Nodetype.BASE and what[0] != "string")
+
+    def is_array(self, description: Description) -> bool:
+        kind, what = description
+        return kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and self.is_number(what[0])
+
+    def is_vector(self, description: Description) -> bool:
+        fields = self.of(description)
+        return "w" not in fields and all(name in fields and self.is_number(fields[name]) for name in "xyz")
+
+    def element(self, description: Description) -> Description | None:
+        """Return what messages a list is of; None of what is no list of messages."""
+        kind, what = description
+        is_list = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and what[0][0] == Nodetype.NAME
+        return what[0] if is_list else None
+
+
+def misfit(text: str, store: Typestore, msgtype: str) -> str:
+    """Return in words which field of a map a type does not have, or of another kind; '' if the map fits."""
+    fields, whole = _Fields(store), (Nodetype.NAME, msgtype)
+    for key, paths in field_map(text).items():
+        within: Description | None = whole
+        for place, path in enumerate(paths):
+            found = fields.at(within, path)
+            if found is None:
+                return f"{msgtype} has no field {path!r}; it has {_listed(fields, within)}"
+            if key == "beams":
+                fits, expected = (
+                    (fields.element(found) is not None, "a list of beams"), (_is_three(fields, found), "a vector"),
+                    (fields.is_number(found), "a number"),
+                )[place]  # fmt: skip
+                within = fields.element(found) if place == 0 else within
+            else:
+                fits, expected = _fits(fields, key, found, len(paths))
+            if not fits:
+                return f"field {path!r} of {msgtype} is not {expected}, as {key} must be"
+    return ""
+
+
+def _fits(fields: _Fields, key: str, found: Description, count: int) -> tuple[bool, str]:
+    """Return whether a field is of the kind that a key takes, and which kind that is."""
+    if key == "frame":
+        return found == (Nodetype.BASE, ("string", 0)), "text"
+    if key == "stamp":
+        return fields.is_number(found) or "nanosec" in fields.of(found), "a time, or seconds"
+    if key == "variance" and count == 1:
+        return fields.is_number(found) or _is_three(fields, found), "a number, a vector or an array"
+    if key == "velocity" and count == 1:
+        return _is_three(fields, found), "a vector"
+    return fields.is_number(found), "a number"
+
+
+def _is_three(fields: _Fields, found: Description) -> bool:
+    return fields.is_vector(found) or fields.is_array(found)
+
+
+def _listed(fields: _Fields, description: Description) -> str:
+    names = [path for path, each in fields.walk(description) if not fields.of(each)]
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return (", ".join(names[:_NAMED]) or "none but its header") + more
+
+
+def suggested(store: Typestore, msgtype: str) -> str:
+    """Return the map that reads what looks like a velocity in a type; '' if nothing does."""
+    fields = _Fields(store)
+    below = dict(fields.walk((Nodetype.NAME, msgtype)))
+    found = next(_velocities(fields, below), "")
+    valid = [
+        path
+        for path, (kind, what) in below.items()
+        if kind == Nodetype.BASE and what[0] == "bool" and re.search("valid|lock", path, re.I) and "beam" not in path
+    ]
+    return f"{found},valid={','.join(valid)}" if found.startswith("velocity") and 0 < len(valid) <= 4 else found
+
+
+def _velocities(fields: _Fields, below: Mapping[str, Description]) -> Iterator[str]:
+    """Yield maps of what may be a velocity, the likeliest first."""
+    named = {path: each for path, each in below.items() if re.search(r"vel|linear|(^|_|\.)v[xyz]$", path, re.I)}
+    yield from (f"velocity={path}" for path, each in named.items() if _is_three(fields, each))
+    for path, each in named.items():
+        y, z = (re.sub(r"(?<![a-uw-z])x(?![a-z])", axis, path) for axis in "yz")
+        if y != path and fields.is_number(each) and each[1][0] != "bool" and y in below and z in below:
+            yield f"velocity={path},{y},{z}"
+    for path, each in below.items():
+        own = dict(fields.walk(element)) if (element := fields.element(each)) is not None else {}
+        vectors = [name for name, of in own.items() if fields.is_vector(of)]
+        speeds = [name for name, of in own.items() if "vel" in name and fields.is_number(of)]
+        if vectors and speeds:
+            yield f"beams={path},{vectors[0]},{speeds[0]}"
