@@ -54,6 +54,8 @@ def add_discovery_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--dvl-fields", dest="overrides", action="append", type="dvl_fields:={}".format, metavar="MAP",
         help="how a DVL's type that is not listed is read: velocity=vel.x,vel.y,vel.z,valid=lock")  # fmt: skip
+    add("--restamp", dest="overrides", action="append", type="restamp:={}".format, metavar="log|TOPICS",
+        help="times of recording instead of stamps, of all messages or of topics (A,B)")  # fmt: skip
 
 
 def opened(bags: Sequence[Path], parameters: Parameters) -> Recording:

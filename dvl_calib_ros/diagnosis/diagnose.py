@@ -164,7 +164,7 @@ def _check_bounds(selection: EffectSelection) -> None:
             name = selection.fitter.problem.recordings[each.recording or 0].name
             raise InputError(
                 f"{name}: {each.effect.name} comes out at {value:+.3g} {spec.unit}, the end of what can be diagnosed "
-                "and taken off: set that clock right, or correct the stamps in the bag"
+                "and taken off: set that clock right, or take the times of recording (--restamp log)"
             )
 
 

@@ -132,10 +132,10 @@ def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> li
         fields = {
             "seconds": abs(each.ahead),
             "side": "after" if each.ahead > 0.0 else "before",
-            "here": f"for this bag: -p {name}:={late:.2f}" if can_be_taken_off else "correct the stamps",
         }
         topic, other = topics[each.stream.value].topic, topics[each.other.value].topic
-        found.append(finding("DOCTOR_CLOCKS", topic=topic, other=other, **fields))
+        here = f"-p {name}:={late:.2f}" if can_be_taken_off else f"--restamp {topic}"
+        found.append(finding("DOCTOR_CLOCKS", topic=topic, other=other, here=here, **fields))
     return found
 
 

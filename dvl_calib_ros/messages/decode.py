@@ -26,6 +26,8 @@ INVALID, WRONG_FRAME = "invalid", "wrong_frame"
 NO_FIX, FIRST_FIX = "no_fix", "first_fix"
 # How the covariance begins of what an IMU does not measure
 NO_DATA = -1.0
+# Of parameter restamp: every message
+RESTAMP_ALL = "log"
 # Different frame_ids of the reference that are remembered.
 MAX_FRAMES = 64
 # What is kept of a name that garbage may make megabytes long: results and messages repeat it.
@@ -297,7 +299,7 @@ class MessageDecoder:
         return Refusal(INVALID)
 
     def _stamp_ns(self, stream: Stream, header: Any, received_ns: int) -> int:
-        stamp = stamp_ns(header.stamp)
+        stamp = received_ns if self.parameters.restamp == RESTAMP_ALL else stamp_ns(header.stamp)
         if stamp:
             return stamp
         self.note_zero_stamps(stream, 1)

@@ -48,7 +48,7 @@ from ..files.result_file import (
     result_text,
     save_result,
 )
-from ..messages.decode import frame_name, heading_variance
+from ..messages.decode import RESTAMP_ALL, frame_name, heading_variance
 from ..messages.live_feed import MessageFeed
 from ..standard_streams import say
 from ..verdict.kinds import Severity
@@ -324,9 +324,10 @@ class CalibrationNode(AnsweringNode):
             self._publish_if_updated()
 
     def _received_ns(self, message: Any) -> int:
-        """Time of reception, asked of the clock only for a message that has no stamp of its own."""
+        """Time of reception, asked of the clock only for a message whose stamp is missing or not believed."""
         stamp = message.header.stamp
-        return 0 if stamp.sec or stamp.nanosec else self.get_clock().now().nanoseconds
+        believed = self._calibrator.parameters.restamp != RESTAMP_ALL
+        return 0 if believed and (stamp.sec or stamp.nanosec) else self.get_clock().now().nanoseconds
 
     def _feed_dvl(self, message: Any, received_ns: int) -> None:
         self._place(message)

@@ -80,8 +80,8 @@ def next_commands(examined: Examination, is_live: bool = False) -> list[tuple[st
     given = [
         word
         for found in examined.findings
-        if found.code in ("DOCTOR_CLOCKS", "DOCTOR_COVARIANCE") and "-p " in found.remedy
-        for word in found.remedy[found.remedy.index("-p ") :].split(" leaves")[0].split()
+        if found.code in ("DOCTOR_CLOCKS", "DOCTOR_COVARIANCE")
+        for word in found.remedy.partition("for this bag: ")[2].split(" leaves")[0].split()
     ]
     if examined.verdict == "no" and not given:
         return [("next", "dvl-calib doctor BAG   (once it is recorded again)")]

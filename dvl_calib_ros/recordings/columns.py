@@ -9,6 +9,7 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -94,6 +95,7 @@ class Singles:
     """M messages that are decoded one by one, in their order of arrival.
 
     arrival, log_ns: (M,). channel: (M,) places in channels. end: (M,) where each ends in content, which is bytes.
+    is_restamped: whether messages are stamped by log time instead.
     """
 
     arrival: Stamps
@@ -103,6 +105,7 @@ class Singles:
     content: Codes
     channels: tuple[Channel, ...]
     decoder: Decoder
+    is_restamped: bool = False
 
     def __len__(self) -> int:
         return len(self.arrival)
@@ -119,7 +122,11 @@ class Singles:
             kind = VELOCITY_TYPES.get(self.channels[channel].msgtype)
             try:
                 message = self.decoder(self.channels[channel], self.content[start:end].tobytes())
-                yield arrival, log_ns, message if kind is None or kind.adapted is None else kind.adapted(message), ""
+                message = message if kind is None or kind.adapted is None else kind.adapted(message)
+                if self.is_restamped:
+                    seconds, nanoseconds = divmod(log_ns, 1_000_000_000)
+                    message.header.stamp = SimpleNamespace(sec=seconds, nanosec=nanoseconds)
+                yield arrival, log_ns, message, ""
             except DecodingError as error:
                 yield arrival, log_ns, None, str(error)
 
@@ -136,6 +143,8 @@ class Singles:
     @property
     def stamps_ns(self) -> Stamps:
         """(M,) of the headers, 0 where there is none or a message cannot be decoded."""
+        if self.is_restamped:
+            return self.log_ns
         stamps_ns = np.zeros(len(self), dtype=np.int64)
         for number, channel in enumerate(self.channels):
             own = np.flatnonzero(self.channel == number)
@@ -192,6 +201,11 @@ class TopicColumns:
             order = np.argsort(np.concatenate([self.laid.arrival, self.singles.arrival]), kind="stable")
             stamps_ns = np.concatenate([stamps_ns, self.singles.stamps_ns])[order]
         return stamps_ns if stamps_ns.all() else np.where(stamps_ns == 0, log_ns, stamps_ns)
+
+    def restamped(self) -> TopicColumns:
+        """Return the messages stamped by log time."""
+        laid = replace(self.laid, stamps_ns=self.laid.log_ns)
+        return replace(self, laid=laid, singles=replace(self.singles, is_restamped=True))
 
     def part(self, kept: Mask) -> TopicColumns:
         """Return the messages of a mask (N,), in the order of `arrivals`."""
@@ -302,10 +316,8 @@ class Collector:
         )
         if (laid.arrival[1:] < laid.arrival[:-1]).any():  # of several layouts in turn
             laid = laid.part(np.argsort(laid.arrival, kind="stable"))
-        singles = Singles(
-            **{name: column.array() for name, column in self._singles.items()},
-            channels=tuple(self._channels), decoder=self._decoder,
-        )  # fmt: skip
+        arrival, log_ns, channel, end, content = (column.array() for column in self._singles.values())
+        singles = Singles(arrival, log_ns, channel, end, content, tuple(self._channels), self._decoder)
         if (singles.arrival[1:] < singles.arrival[:-1]).any():
             singles = singles.part(np.argsort(singles.arrival, kind="stable"))
         return TopicColumns(self._topic, self._msgtype, laid, singles)

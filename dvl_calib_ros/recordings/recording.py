@@ -24,7 +24,7 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.samples import Stamps, Stream, Streams, no_samples
 from ..calibration.registration.registration import Registration
 from ..errors import InputError
-from ..messages.decode import MessageDecoder
+from ..messages.decode import RESTAMP_ALL, MessageDecoder
 from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, VELOCITY_TYPES
 from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, suggested
 from ..messages.type_recognition import recognised
@@ -34,7 +34,7 @@ from .far_stamps import without_far
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, recorded
 from .topic_preview import Survey, look_of
-from .topics import Topics
+from .topics import Topics, spelled
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
 # Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
@@ -333,6 +333,8 @@ def _read(
                     descriptions.append(message.data)
         on_progress((window.log_ns - start_ns) / max(end_ns - start_ns, 1))
     columns = {topic: collector.columns() for topic, collector in collectors.items()}
+    for topic in _restamped(columns, parameters.restamp, path):
+        columns[topic] = columns[topic].restamped()
     kept, file_spans_ns, aside = without_far(columns, bag.file_spans_ns)
     counts.subtract({topic: len(columns[topic]) - len(own) for topic, own in kept.items()})
     return Recording(
@@ -348,6 +350,18 @@ def _read(
         waters=tuple(reading for each in waters.values() for reading in each.readings()),
         field_maps=_field_maps(bag),
     )
+
+
+def _restamped(columns: Mapping[str, TopicColumns], restamp: str, path: Path) -> list[str]:
+    """Return the topics whose stamps are not believed. Raises InputError for one that is not there."""
+    if restamp in ("", RESTAMP_ALL):
+        return list(columns) if restamp else []
+    found = {name.strip(): spelled(name.strip(), columns) for name in restamp.split(",")}
+    for name, topic in found.items():
+        if topic is None:
+            there = ", ".join((RESTAMP_ALL, *columns))
+            raise InputError(f"{path}: restamp: no topic {name!r} with stamps; there are {there}")
+    return [topic for topic in found.values() if topic is not None]
 
 
 def _field_maps(bag: BagReader) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 
@@ -19,6 +19,6 @@ class Topics:
         return Topics(*(spelled(name, present) or name for name in (self.dvl, self.gnss, self.imu)))
 
 
-def spelled(name: str, present: Mapping[str, str]) -> str | None:
+def spelled(name: str, present: Collection[str]) -> str | None:
     """A topic as a recording spells it, with or without a leading slash; None if it is not there."""
     return next((each for each in (name, f"/{name}", name.lstrip("/")) if each in present), None)

@@ -226,7 +226,7 @@ CONFIGURATIONS = (
         "CLOCK_FAR",
         "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be found and taken off",
         "Speeds agree only with that much between the stamps.",
-        "set that clock right, or correct the stamps in the bag",
+        "set that clock right; this recording: --restamp log takes the times at which messages were recorded",
     ),
     # what a recording declares
     _Said(

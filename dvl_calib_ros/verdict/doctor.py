@@ -36,7 +36,7 @@ _KINDS = (
         "DOCTOR_CLOCKS",
         "{topic}: stamps are {seconds:.2f} s {side} those of {other}",
         "Two drivers stamp by different clocks, so that velocities of different times are compared.",
-        "synchronise clocks (PTP, NTP or GNSS); {here}",
+        "synchronise clocks (PTP, NTP or GNSS); for this bag: {here}",
         Severity.ERROR,
     ),
     Kind(

@@ -154,7 +154,7 @@ _KINDS = (
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} with which they came{known}",
         "The two drivers stamp by different clocks, further apart than any model looks for.",
-        "set the clocks by one source, correct the recording's stamps",
+        "set the clocks by one source; this recording: --restamp log takes the times at which messages were recorded",
         Severity.REJECT,
     ),
     # several recordings

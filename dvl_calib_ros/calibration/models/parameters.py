@@ -183,6 +183,11 @@ class Parameters:
         "nwu (yaw 0 is north, counter-clockwise).",
         choices=(IMU_ENU, IMU_NED, NWU),
     )
+    restamp: str = _parameter(
+        "",
+        "Whose stamps are not believed: log takes the time at which each message was recorded (live: received); names "
+        "of topics, with commas between, do so for these topics of a recording alone.",
+    )
     dvl_time_offset: float = _parameter(
         0.0,
         "Positive: DVL stamps are late. Taken off before pairing.",
