@@ -410,7 +410,7 @@ class _Search:
             self._values["use_message_covariance"] = False
         self._values["gnss_aided_std"] = float(f"{shown:.2g}")
         whose = "DVL and reference claim" if too_much and not is_position else "the reference claims"
-        size = f"{claimed if too_much else reference.claimed_std:.2g} m/s" if claimed else "no noise"
+        size = "no noise" if claims_none or not claimed else f"{claimed if too_much else reference.claimed_std:.2g} m/s"
         self._found.append(
             f"{whose} {size}; against the DVL it shows {shown:.2g} m/s per axis, which is used "
             f"(-p gnss_aided_std:={shown:.2g})"

@@ -150,7 +150,8 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     looks = {role: recording.survey.looks.get(name) for role, name in there.items()}
     start_ns, end_ns = recording.span_ns
     streams = {role: recording.recorded(name, discovery.parameters) for role, name in there.items()}
-    seconds = 1e-9 * (end_ns - start_ns)
+    recorded_s = 1e-9 * (end_ns - start_ns)
+    seconds = {role: recorded_s * (1.0 if look is None else look.clock_rate) for role, look in looks.items()}
     velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
     replayed, cannot = _replayed(recording, discovery)
@@ -162,9 +163,9 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         findings = [each.weighed(Severity.WARNING) if _has_error([each]) else each for each in findings]
     return Examination(
         recording.paths,
-        seconds,
+        seconds["dvl"],
         tuple(
-            _content(role, topic, looks[role], recording.counts[topic.topic] / seconds if seconds else 0.0)
+            _content(role, topic, looks[role], recording.counts[topic.topic] / (seconds[role] or math.inf))
             for role, topic in streams.items()
         ),
         discovery,

@@ -28,6 +28,9 @@ from .columns import ODOMETRY, TopicColumns, beside_velocity, stamped
 # Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
 # straights, and stamps that are late by seconds; 10 Hz is what a DVL gives at most.
 BURSTS, BURST_NS, BURST_EVERY_NS = 24, 6_000_000_000, 95_000_000
+# Clocks of instruments differ by parts per million, intervals between stamps by jitter. A clock that differs from the
+# log's by more than this share is a simulator's.
+SIMULATED_TIME = 0.1
 # Of all messages of a topic no more than about so many, evenly: of one that is fast for hours, as many as it takes.
 MOST = 100_000
 # What is faster (m/s) is garbage, whose square may be no number any more; millimetres per second still pass.
@@ -40,12 +43,13 @@ class Look:
 
     count: messages in the recording. rate_hz: over the whole of it, 0 if that is an instant. frame_id: of the velocity
     or of the IMU's data, the first. stamps_s: (N,) s since the first log time of the recordings, of the header; of the
-    log where it is zero. ahead_s: by how much they are ahead of the log, in the median. values: velocity (N, 3) m/s, as
-    in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan where not
-    given. rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero where it has none. world:
-    frame_id of the header, which of an odometry is that of its pose. claimed_std: noise per axis that the messages
-    claim, m/s, of an IMU that of its heading, rad, in the median; nan where they claim none. pose: (N, 7) position, m,
-    and quaternion x y z w of an odometry.
+    log where it is zero. ahead_s: by how much they are ahead of the log, in the median; in simulated time, at its
+    start. values: velocity (N, 3) m/s, as in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s
+    and acceleration m/s², nan where not given. rates: angular velocity (N, 3) rad/s of a twist, in the axes of its
+    velocity; zero where it has none. world: frame_id of the header, which of an odometry is that of its pose.
+    claimed_std: noise per axis that the messages claim, m/s, of an IMU that of its heading, rad, in the median; nan
+    where they claim none. clock_rate: seconds of stamps per second of log, other than 1 in simulated time alone.
+    pose: (N, 7) position, m, and quaternion x y z w of an odometry.
     """
 
     topic: str
@@ -59,6 +63,7 @@ class Look:
     rates: Array | None = None
     world: str = ""
     claimed_std: float = math.nan
+    clock_rate: float = 1.0
     pose: Array | None = None
 
     @property
@@ -128,17 +133,31 @@ def look_of(
     if found is None:
         return None
     stamps_ns, log_ns, values, beside, kept = found
-    ahead_s = 1e-9 * float(median(np.asarray(stamps_ns - log_ns, dtype=float)))
+    clock_rate = _clock_rate(stamps_ns, log_ns)
+    ahead_s = 1e-9 * float(median(stamps_ns - start_ns - clock_rate * (log_ns - start_ns)))
     stamps_s = 1e-9 * (stamps_ns[kept] - start_ns)
-    rate_hz = count / seconds if seconds else 0.0
+    rate_hz = count / (seconds * clock_rate) if seconds else 0.0
     rates, pose = beside[kept, :3], beside[kept, 3:] if msgtype == ODOMETRY else None
     if msgtype == IMU_TYPE:
         values, rates = np.hstack([values, beside]), np.full((0, 3), np.nan)
     turns = None if np.isnan(rates).all() else rates
     frame_id, claimed = numbers.frame_id, numbers.claimed_std
     return Look(
-        topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], turns, numbers.world, claimed, pose
-    )
+        topic, msgtype, count, rate_hz, frame_id, stamps_s, ahead_s, values[kept], turns, numbers.world, claimed,
+        clock_rate, pose,
+    )  # fmt: skip
+
+
+def _clock_rate(stamps_ns: Stamps, log_ns: Stamps) -> float:
+    """Return seconds of stamps per second of log, of simulated time; 1 where that is no more than jitter.
+
+    stamps_ns, log_ns: (N,), in any order.
+    """
+    if len(stamps_ns) < 2:
+        return 1.0
+    stamped, logged = (float(median(np.diff(np.sort(each)).astype(float))) for each in (stamps_ns, log_ns))
+    rates = (stamped / logged, float(np.ptp(stamps_ns) / np.ptp(log_ns))) if stamped > 0.0 and logged > 0.0 else (1.0,)
+    return rates[-1] if min(abs(math.log(rate)) for rate in rates) > SIMULATED_TIME else 1.0
 
 
 def _places(arrival: Stamps, taken: Stamps) -> Index:
