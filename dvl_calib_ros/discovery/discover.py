@@ -26,6 +26,7 @@ from ..calibration.registration.frame_hypotheses import (
     nominal_rpy,
 )
 from ..calibration.registration.gauss_newton import white_noise
+from ..calibration.streams.screening import NOT_MEASURED_VARIANCE
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named, turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
@@ -60,6 +61,8 @@ QUIETEST, CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE, WHITE_FROM_HZ = 0.01, 3.0, 2.0, 3.
 # ... and one that sends velocities: so much that it would be rejected for agreeing too well (verification.IMPLAUSIBLE).
 # A filter of the DVL does as well, and is no noisier from sample to sample; a reference so many times noisier is none.
 CLAIMS_FAR_TOO_MUCH, NOISIER = 4.0, 1.5
+# Standard deviation from which on a DVL's claim says nothing, m/s
+SAYS_NOTHING = math.sqrt(NOT_MEASURED_VARIANCE)
 # Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
 BETTER = 0.8
 
@@ -198,6 +201,12 @@ class _Search:
             self._parameters, self._given.parameters, base, dvl, placed, imu, imu_placed
         )
         chosen = None
+        if dvl.claimed_std >= SAYS_NOTHING and not self._gives("use_message_covariance"):
+            self._values["use_message_covariance"] = False
+            self._found.append(
+                f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which says nothing and is not used "
+                "(-p use_message_covariance:=false)"
+            )
         if reference is not None:
             chosen = self._fit(dvl, reference, imu, known, placed)
         taken = frames.imu if chosen is None else chosen.imu
@@ -386,6 +395,7 @@ class _Search:
         """The noise of a reference that claims none, or far too little, or one that its velocities do not have."""
         if self._gives("gnss_aided_std") or self._gives("use_message_covariance"):
             return
+        says_nothing = "use_message_covariance" in self._values
         if self._readings.beside_noise(chosen.best_left) > FITS:
             return
         is_position = VELOCITY_TYPES[reference.msgtype].position is not None
@@ -397,14 +407,16 @@ class _Search:
         claims = [reference.claimed_std] if is_position else [reference.claimed_std, dvl.claimed_std]
         claimed = math.hypot(*np.nan_to_num(claims))  # both are in what is predicted
         most = claimed / (CLAIMS_TOO_MUCH if is_position else CLAIMS_FAR_TOO_MUCH)
-        may_claim_less = is_position or own > NOISIER * math.sqrt(white_noise(dvl.values))
+        may_claim_less = is_position or says_nothing or own > NOISIER * math.sqrt(white_noise(dvl.values))
         claims_none = not is_position and math.isnan(reference.claimed_std)
-        if not (too_little or claims_none or (may_claim_less and most > max(least * per_axis, QUIETEST))):
+        if not (
+            too_little or claims_none or says_nothing or (may_claim_less and most > max(least * per_axis, QUIETEST))
+        ):
             return
         best, _ = self._readings.registered(chosen.reading, None if known is None else known.T)
         shown = max(max(min(best, chosen.best_left), least) * per_axis, QUIETEST)
         too_much = may_claim_less and most > shown
-        if not (too_much or too_little or claims_none):
+        if not (too_much or too_little or claims_none or says_nothing):
             return
         if too_much or too_little:
             self._values["use_message_covariance"] = False

@@ -20,6 +20,7 @@ import numpy as np
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import median
 from ..calibration.numerics.samples import Index, Stamps
+from ..calibration.streams.screening import NOT_MEASURED_VARIANCE
 from ..messages.decode import NO_DATA, UNREADABLE, frame_name, heading_variance
 from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.positions import SELDOM_S, FixDifference, PositionType
@@ -215,9 +216,11 @@ class _Numbers:
 
     @property
     def claimed_std(self) -> float:
-        """Per axis, m/s, in the median; nan where none is claimed."""
+        """Per axis, m/s, in the median of messages that are measured, if any are; nan where none is claimed."""
         of_each = np.concatenate([*self._variances, np.zeros(0)])
         given = of_each[np.isfinite(of_each) & (of_each > 0.0)]
+        measured = given[given < NOT_MEASURED_VARIANCE]
+        given = measured if len(measured) else given
         return math.sqrt(float(median(given))) if len(given) else math.nan
 
     @property

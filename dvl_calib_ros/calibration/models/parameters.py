@@ -281,7 +281,8 @@ class Parameters:
     )
     use_message_covariance: bool = _parameter(
         True,
-        "R of the GNSS models from the messages' covariances (rotated, added) where given.",
+        "R of the GNSS models from the messages' covariances (rotated, added) where given. Without, samples whose "
+        "variances are 1000 (m/s)² and more on all axes are used, which are invalid else.",
     )
     gnss_aided_std: float = _parameter(
         0.2,

@@ -48,7 +48,7 @@ class Aligner(LiveAlignment):
         count = sum(map(len, streams))
         if count < COLUMNS_FROM or self._before_restart:
             self._take_rows(streams)
-        elif not self._take_columns(screened(streams, self.parameters.max_speed)):
+        elif not self._take_columns(screened(streams, self.parameters)):
             for half in streams.halves():  # the leap is in one of them
                 self.take(half)
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.samples import Codes, Index, Mask, Stamps, Stream, Streams
 from .clock_correction import Clocks
@@ -98,10 +99,11 @@ class Events(NamedTuple):
         return Events(arrival[order], *places, newest[1], newest[2], horizon_ns)
 
 
-def screened(streams: Streams, max_speed: float) -> ScreenedStreams:
-    """Which rows are valid, and what is made of them. max_speed: m/s, of a DVL or a reference."""
+def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
+    """Which rows are valid, and what is made of them."""
     dvl, reference, imu = streams
-    of_dvl, of_reference = screen_columns(dvl.covariances), screen_columns(reference.covariances)
+    max_speed, believed = parameters.max_speed, parameters.use_message_covariance
+    of_dvl, of_reference = (screen_columns(each.covariances, believed) for each in (dvl, reference))
     orientation, rates = unit_quaternions(imu.orientation), valid_rates(imu.angular_velocity)
     return ScreenedStreams(
         streams,

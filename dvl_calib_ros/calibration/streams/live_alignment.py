@@ -67,7 +67,8 @@ class LiveAlignment:
         self.before_clearing: Callable[[], None] = lambda: None
         self._clocks = Clocks.of(parameters)
         self._new_days = NewDays(round(parameters.new_day_after * 1e9), recordings_ns)
-        self._dvl_covariance, self._reference_covariance = CovarianceScreen(), CovarianceScreen()
+        believed = parameters.use_message_covariance
+        self._dvl_covariance, self._reference_covariance = CovarianceScreen(believed), CovarianceScreen(believed)
         self._max_jump_ns = round(parameters.max_time_jump * 1e9)
         self.reset()
 

@@ -55,17 +55,20 @@ class Screened(NamedTuple):
 _NOT_GIVEN = Screened(True, None)
 
 
-def screened_covariance(covariance: Array | None) -> Screened:
+def screened_covariance(covariance: Array | None, believed: bool = True) -> Screened:
     """Judge one covariance (3, 3).
 
     A zero variance means "not given" (the whole covariance then is); a negative or non-finite one, or a matrix that
     is not positive definite, is invalid. A variance of -1 or of `NOT_MEASURED_VARIANCE` and more: not measured.
+
+    believed: whether covariances are used (parameter use_message_covariance); where they are not, one that says that
+    no axis is measured is not given.
     """
     if covariance is None:
         return _NOT_GIVEN
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = covariance.tolist()
     if not (min(xx, yy, zz) >= 0.0 and max(xx, yy, zz) < NOT_MEASURED_VARIANCE):
-        valid, given, found, unmeasured = screened_covariances(covariance[None])
+        valid, given, found, unmeasured = screened_covariances(covariance[None], believed)
         return Screened(bool(valid[0]), found[0] if given[0] else None, int(unmeasured[0]))
     if not math.isfinite(xx + xy + xz + yx + yy + yz + zx + zy + zz):
         return Screened(False, None)
@@ -79,14 +82,16 @@ def screened_covariance(covariance: Array | None) -> Screened:
     return Screened(minor > 0.0 and determinant > 0.0, covariance)
 
 
-def screened_covariances(covariance: Array) -> tuple[Mask, Mask, Array, Codes]:
+def screened_covariances(covariance: Array, believed: bool = True) -> tuple[Mask, Mask, Array, Codes]:
     """`screened_covariance` of (C, 3, 3): valid (C,), given (C,), covariance (C, 3, 3), unmeasured (C,)."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     with np.errstate(invalid="ignore", over="ignore"):
         finite = np.isfinite(covariance.reshape(-1, 9).sum(axis=1))
-        unmeasured = (variance == _NOT_MEASURED_FLAG) | (variance >= NOT_MEASURED_VARIANCE)
+        is_large = variance >= NOT_MEASURED_VARIANCE
+        says_nothing: Mask = np.logical_and(is_large.all(axis=1), not believed)
+        unmeasured = (variance == _NOT_MEASURED_FLAG) | (is_large & ~says_nothing[:, None])
         least = np.where(unmeasured, 1.0, variance).min(axis=1)
-        given = least >= SMALLEST_VARIANCE
+        given = (least >= SMALLEST_VARIANCE) & ~says_nothing
         found = 0.5 * (covariance + covariance.swapaxes(1, 2))
         found = np.where(unmeasured[:, :, None] | unmeasured[:, None, :], 0.0, found)
         found[:, range(3), range(3)] = np.where(unmeasured, 1.0, variance)
@@ -103,6 +108,7 @@ def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[b
 
     velocity: (N, 3) m/s. unmeasured: (N,) as of `Screened`. gnss_axes: as the parameter.
     """
+    unmeasured = np.where(unmeasured == ALL_AXES, 0, unmeasured)  # such a message says nothing of a single axis
     measured = [2 * np.count_nonzero(unmeasured & bit) < len(unmeasured) for bit in _BITS]
     if gnss_axes != "auto":
         measured[2] = gnss_axes == "xyz"
@@ -113,14 +119,15 @@ def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[b
 class CovarianceScreen:
     """`screened_covariance` that recognises the covariance of the sample before: most streams repeat it."""
 
-    def __init__(self) -> None:
+    def __init__(self, believed: bool) -> None:
+        self._believed = believed
         self._seen: Array | None = None
         self._result = _NOT_GIVEN
 
     def __call__(self, covariance: Array | None) -> Screened:
         """As `screened_covariance`; the same object in gives the same object out."""
         if covariance is not self._seen:
-            self._result = screened_covariance(covariance)
+            self._result = screened_covariance(covariance, self._believed)
             self._seen = covariance
         return self._result
 
@@ -133,9 +140,9 @@ class ScreenedColumns(NamedTuple):
     unmeasured: Codes
 
 
-def screen_columns(covariances: Covariances) -> ScreenedColumns:
+def screen_columns(covariances: Covariances, believed: bool = True) -> ScreenedColumns:
     """`screened_covariance` of N rows."""
-    valid, given, found, unmeasured = screened_covariances(covariances.distinct)
+    valid, given, found, unmeasured = screened_covariances(covariances.distinct, believed)
     # the last ones are for rows without, whose index is -1
     valid, unmeasured = np.append(valid, True), np.append(unmeasured, np.uint8(0))
     found = np.concatenate([np.where(given[:, None, None], found, np.nan), np.full((1, 3, 3), np.nan)])
