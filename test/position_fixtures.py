@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample
-from dvl_calib_ros.messages.drivers import POSE_TYPE
+from dvl_calib_ros.messages.drivers import POSE_TYPES
 from dvl_calib_ros.messages.encode import SampleWriter
 
 USBL = "usbl/pose"
@@ -40,6 +40,6 @@ def write_positions(path: Path, driven_run, topic: str = USBL) -> Path:
                 types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
             )
             inner = types["geometry_msgs/msg/PoseWithCovariance"](pose, covariance.ravel())
-            message = types[POSE_TYPE](writer._header(int(fixes.stamps_ns[row]), "map"), inner)
-            bag.message(topic, POSE_TYPE, log_ns, message)
+            message = types[POSE_TYPES[0]](writer._header(int(fixes.stamps_ns[row]), "map"), inner)
+            bag.message(topic, POSE_TYPES[0], log_ns, message)
     return path

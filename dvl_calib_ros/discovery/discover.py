@@ -408,7 +408,7 @@ class _Search:
         claimed = math.hypot(*np.nan_to_num(claims))  # both are in what is predicted
         most = claimed / (CLAIMS_TOO_MUCH if is_position else CLAIMS_FAR_TOO_MUCH)
         may_claim_less = is_position or says_nothing or own > NOISIER * math.sqrt(white_noise(dvl.values))
-        claims_none = not is_position and math.isnan(reference.claimed_std)
+        claims_none = math.isnan(reference.claimed_std)
         if not (
             too_little or claims_none or says_nothing or (may_claim_less and most > max(least * per_axis, QUIETEST))
         ):

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from ..messages.drivers import DVL_TYPES, IMU_TYPE, POSE_TYPE, REFERENCE_TYPES, TWIST_TYPE
+from ..messages.drivers import DVL_TYPES, IMU_TYPE, POSE_TYPES, REFERENCE_TYPES, TWIST_TYPE
 from ..recordings.topics import spelled
 from ..verdict.reasons import Reason, finding
 
@@ -19,7 +19,9 @@ NONE = "none"
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
 # Satellites first, then what knows its motion otherwise. A simulator's truth is as good as either.
 GNSS_WORDS = ("gnss", "gps", "navsat", "rtk", "ublox", "septentrio", "novatel", "fix", "nmea")
-TRUTH_WORDS = ("truth", "pose_gt", "p3d", "mocap", "qualisys", "optitrack")
+TRUTH_WORDS = (
+    "truth", "pose_gt", "p3d", "mocap", "motion_capture", "qualisys", "optitrack", "vicon", "vrpn", "natnet"
+)  # fmt: skip
 INS_WORDS = ("ins", "spatial", "sbg", "phins", "xsens", "mti", "vectornav", "microstrain", "navigation", "rovins")
 # What is made from the DVL proves nothing about it; what is commanded is not measured.
 # Poses are sent by all that navigates, with the DVL in it: only those of these are measured.
@@ -137,7 +139,7 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
     for look in survey.looks.values():
         if look.topic == dvl or look.msgtype not in REFERENCE_TYPES or _has(look, COMMAND_WORDS):
             continue
-        if look.msgtype == POSE_TYPE and not _has(look, ACOUSTIC_WORDS):
+        if look.msgtype in POSE_TYPES and not _has(look, (*ACOUSTIC_WORDS, *TRUTH_WORDS)):
             continue
         if look.speed < MOVES_FROM:
             said.append(finding("TOPIC_DOES_NOT_MOVE", topic=look.topic))

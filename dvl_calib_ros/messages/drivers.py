@@ -49,7 +49,7 @@ def _vector(values: Any) -> SimpleNamespace:
 
 
 TWIST_TYPE = "geometry_msgs/msg/TwistWithCovarianceStamped"
-POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+POSE_TYPES = ("geometry_msgs/msg/PoseWithCovarianceStamped", "geometry_msgs/msg/PoseStamped")
 IMU_TYPE = "sensor_msgs/msg/Imu"
 BOTTOM_TRACK, WATER_TRACK = 1, 2
 # coordinate_mode of ds_sensor_msgs/Dvl for the instrument's own axes
@@ -448,16 +448,26 @@ _TYPES: dict[str, VelocityType] = {
             adapted=of_vehicle_odometry,
             install="build px4_msgs in your workspace",
         ),
-        VelocityType(
-            name=POSE_TYPE,
-            sent_by="acoustic positioning (USBL), motion capture",
-            velocity=_no_velocity,
-            covariance=lambda _: None,
-            is_read_in_columns=False,
-            covariance_says="of the difference of two positions, from `pose.covariance`; zero: not given",
-            is_reference=True,
-            is_dvl=False,
-            position=POSE,
+        *(
+            VelocityType(
+                name=name,
+                sent_by=sent_by,
+                velocity=_no_velocity,
+                covariance=lambda _: None,
+                is_read_in_columns=False,
+                covariance_says=covariance_says,
+                is_reference=True,
+                is_dvl=False,
+                position=POSE,
+            )
+            for name, sent_by, covariance_says in (
+                (
+                    POSE_TYPES[0],
+                    "acoustic positioning (USBL), motion capture",
+                    "of the difference of two positions, from `pose.covariance`; zero: not given",
+                ),
+                (POSE_TYPES[1], "motion capture", "none"),
+            )
         ),
         VelocityType(
             name="sensor_msgs/msg/NavSatFix",

@@ -138,11 +138,13 @@ def _geodetic(message: Any) -> Place:
 
 
 def _of_pose(message: Any) -> Place:
-    position = message.pose.pose.position
+    position = getattr(message.pose, "pose", message.pose).position
     return position.x, position.y, position.z
 
 
 def _pose_covariance(message: Any) -> Any:
+    if not hasattr(message.pose, "covariance"):
+        return None
     given = np.asarray(message.pose.covariance, dtype=float)
     return None if given[0] <= 0.0 or given[7] <= 0.0 else given
 

@@ -28,7 +28,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.messages.drivers import POSE_TYPE, VELOCITY_TYPES
+from dvl_calib_ros.messages.drivers import POSE_TYPES, VELOCITY_TYPES
 from dvl_calib_ros.messages.live_feed import MessageFeed
 from dvl_calib_ros.node import calibration_node
 from dvl_calib_ros.node.calibration_node import CalibrationNode
@@ -84,7 +84,7 @@ def test_the_node_takes_noisy_positions_over_legs_as_the_replay_does(world, tmp_
     positions, saved = driven(np.random.default_rng(3), 500.0, truth=Truth((0.0, 0.0, 0.03))), tmp_path / "live.yaml"
     patient = {"max_latency": 100.0}
     bag = write_positions(tmp_path / "bag", positions, "gnss/twist")
-    with world.calibration_node(*as_arguments(patient | {"gnss_type": POSE_TYPE}), f"result_file:={saved}"):
+    with world.calibration_node(*as_arguments(patient | {"gnss_type": POSE_TYPES[0]}), f"result_file:={saved}"):
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         sent = play(world, bag)
         for topic, stream in (("dvl/twist", "dvl"), ("gnss/twist", "reference"), ("imu/data", "imu")):

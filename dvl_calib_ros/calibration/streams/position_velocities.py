@@ -15,7 +15,7 @@ NOISY_MPS = 0.3
 
 def are_positions(parameters: Parameters) -> bool:
     """Whether the reference is positions."""
-    return parameters.gnss_type.endswith(("/NavSatFix", "/PoseWithCovarianceStamped"))
+    return parameters.gnss_type.endswith(("/NavSatFix", "/PoseWithCovarianceStamped", "/PoseStamped"))
 
 
 def check_model(parameters: Parameters) -> None:
