@@ -61,6 +61,7 @@ def import_files(
     dvl_std: float = 0.0,
     gnss_std: float = 0.0,
     start: float = 1_600_000_000.0,
+    columns: str = "",
     storage: str = "mcap",
     compression: str = "none",
 ) -> dict[Path, Imported]:
@@ -80,6 +81,8 @@ def import_files(
         Standard deviations to write as covariance, m/s; 0: none.
     start
         Stamp of time 0, s since 1970.
+    columns
+        Columns of the DVL's file, where it is a table of another layout: ``"time=t,vx=u,vy=v,vz=w,valid=lock"``.
     storage, compression
         As of `salvage`.
 
@@ -96,7 +99,9 @@ def import_files(
     from ..logs.trajectories import ImportOptions
     from ..logs.trajectories import import_files as run
 
-    options = ImportOptions(frame, gnss_frame, dvl_std, gnss_std, start, *storage_and_compression(storage, compression))
+    options = ImportOptions(
+        frame, gnss_frame, dvl_std, gnss_std, start, columns, *storage_and_compression(storage, compression)
+    )
     return run(Path(dvl), as_path(gnss), as_path(attitude), Path(output), options)
 
 

@@ -7,9 +7,12 @@ forward-right-down body in north-east-down. Files whose header names speed and c
 heading (of a compass, with pitch and roll or without), are read by their columns; units are in the names (_deg, knots).
 Latitude and longitude beside or instead of the speed become NavSatFix on gnss/fix.
 
-A log of Water Linked's JSON reports, of RDI's PD0 ensembles (with the DVL's own heading, pitch and roll, and the NMEA
-that WinRiver II put into them), of Nortek's DVLs or of ArduPilot (.BIN, .tlog: DVL, GNSS and attitude in one) is known
-by its content; so are a receiver's RMC sentences.
+Of a table of another layout --columns names the DVL's columns, by header or number; time is in seconds, in ISO 8601, or
+a date and a time of day (time=Date+Time).
+
+A log of Water Linked's JSON reports, of text (Teledyne's PD6, Nortek's PNORBT, Cerulean's DVPDL), of RDI's PD0
+ensembles (with the DVL's own heading, pitch and roll, and the NMEA that WinRiver II put into them), of Nortek's DVLs or
+of ArduPilot (.BIN, .tlog: DVL, GNSS and attitude in one) is known by its content; so are a receiver's RMC sentences.
 They have their own times: give --start 0 with a GNSS or attitude file whose times are seconds since 1970 as well.
 """
 
@@ -36,6 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frame", choices=("frd", "flu"), default="frd", help="of the DVL; default: %(default)s")
     frames = ("frd", "flu", "enu", "ned")
     parser.add_argument("--gnss-frame", choices=frames, default="frd", help="default: %(default)s")
+    parser.add_argument(
+        "--columns",
+        default="",
+        metavar="MAP",
+        help="columns of a DVL's table: time=NAME,vx=NAME,vy=NAME,vz=NAME,valid=NAME",
+    )
     parser.add_argument("--dvl-std", type=float, default=0.0, metavar="M/S", help="covariance to write; 0: not given")
     parser.add_argument("--gnss-std", type=float, default=0.0, metavar="M/S", help="covariance to write; 0: not given")
     parser.add_argument(
@@ -55,6 +64,7 @@ def run(arguments: argparse.Namespace) -> None:
         dvl_std=arguments.dvl_std,
         gnss_std=arguments.gnss_std,
         start=arguments.start,
+        columns=arguments.columns,
         storage=Storage(arguments.storage),
         compression=Compression(arguments.compression),
     )

@@ -1,7 +1,7 @@
 """Logs of DVLs as the instruments write them: Water Linked's JSON reports and Teledyne RDI's PD0 ensembles.
 
-Those of Nortek are in `nortek_logs`, those of ArduPilot, which hold DVL, GNSS and attitude of one vehicle, in
-`ardupilot_logs`.
+Those of Nortek are in `nortek_logs`, those in text in `text_logs`, those of ArduPilot, which hold DVL, GNSS and
+attitude of one vehicle, in `ardupilot_logs`.
 
 Water Linked: docs.waterlinked.com/dvl/dvl-json-protocol, reports of type velocity, axes forward-right-down, stamped by
 time_of_validity (µs since 1970). RDI: "WorkHorse Commands and Output Data Format" and Pathfinder guide, bottom track of
@@ -30,6 +30,7 @@ from ..messages.encode import WaterReading
 from .dvl_log import DvlLog, imu_samples
 from .nortek_logs import is_nortek_log, read_nortek_log
 from .pd0_nmea import GENERAL_NMEA, Nmea
+from .text_logs import is_pd6, is_sentences, read_pd6, read_sentences
 
 PD0_START = b"\x7f\x7f"
 _DATAFLASH_START, _MAVLINK_STARTS = b"\xa3\x95", (b"\xfe", b"\xfd")
@@ -54,7 +55,7 @@ def is_dvl_log(path: Path) -> bool:
             start = file.read(_SNIFFED)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    if _is_ardupilot_log(path, start) or is_nortek_log(start):
+    if _is_ardupilot_log(path, start) or is_nortek_log(start) or is_pd6(start) or is_sentences(start):
         return True
     return (PD0_START in start[:4096] and _next_ensemble(start, 0) is not None) or _holds_json(start)
 
@@ -317,4 +318,6 @@ _KINDS: dict[str, tuple[Callable[[bytes], bool], Callable[[Path, bytes], DvlLog]
     "Nortek's records": (is_nortek_log, _read_nortek),
     "Water Linked's reports": (_holds_json, _read_json),
     "RDI's ensembles": (lambda content: _next_ensemble(content, 0) is not None, _read_pd0),
+    "PD6 text": (is_pd6, read_pd6),
+    "sentences of a DVL": (is_sentences, read_sentences),
 }

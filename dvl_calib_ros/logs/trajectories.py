@@ -21,6 +21,7 @@ from ..calibration.numerics.frames import FLU_FROM_FRD, Array
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from ..messages.encode import SampleWriter, SatelliteFix
+from .column_map import column_map, read_table
 from .csv_columns import EXPECTED, N_COLUMNS, SHOWN, _is_number, cells, numbers_of, stamps_ns
 from .dvl_log import DvlLog, imu_samples
 from .dvl_logs import is_dvl_log, read_dvl_log
@@ -81,7 +82,11 @@ def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
 
 def _check_header(path: Path, header: list[str], unit: str) -> None:
     if len(header) != N_COLUMNS:
-        raise InputError(f"{path}: has {len(header)} columns, expected {EXPECTED}")
+        names = ", ".join(cell.strip() for cell in header)[:SHOWN]
+        raise InputError(
+            f"{path}: has {len(header)} columns, expected {EXPECTED}; of a DVL's table name them with --columns "
+            f"time=NAME,vx=NAME,vy=NAME,vz=NAME; there are {names}"
+        )
     units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]
     for cell, found, expected in zip(header, units, ["s", unit, unit, unit], strict=False):
         if found and found.group(1).strip().lower() != expected:
@@ -143,7 +148,7 @@ def read_attitude(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample
 class ImportOptions:
     """How recordings become bags: frames (flu, frd; enu, ned for GNSS), covariances to write (m/s, 0: not given).
 
-    start: stamp of time 0, s since 1970. Raises InputError.
+    start: stamp of time 0, s since 1970. columns: of the DVL's file, by `column_map`. Raises InputError.
     """
 
     frame: str = "frd"
@@ -151,6 +156,7 @@ class ImportOptions:
     dvl_std: float = 0.0
     gnss_std: float = 0.0
     start: float = 1_600_000_000.0
+    columns: str = ""
     storage: Storage = Storage.MCAP
     compression: Compression = Compression.NONE
 
@@ -158,6 +164,8 @@ class ImportOptions:
         for name, std in (("--dvl-std", self.dvl_std), ("--gnss-std", self.gnss_std)):
             if not 0.0 <= std <= 100.0:
                 raise InputError(f"{name}: {std:g} is outside 0 .. 100 m/s")
+        if self.columns:
+            column_map(self.columns)
         if not 0.0 <= self.start < 2.0**31:
             raise InputError("--start: give seconds since 1970, 0 .. 2147483647")
         for option, given, known in (("--frame", self.frame, FRAMES[:2]), ("--gnss-frame", self.gnss_frame, FRAMES)):
@@ -199,7 +207,9 @@ def import_recording(
         raise InputError(f"{output}: exists already; give another name, or remove it first")
     start_ns = options.start_ns
     notes: list[str] = []
-    if dvl.is_file() and dvl.suffix not in (".csv", ".npy") and is_dvl_log(dvl):
+    if options.columns:
+        log = read_table(dvl, options.columns, start_ns, body_from(options.frame), options.dvl_std)
+    elif dvl.is_file() and dvl.suffix not in (".csv", ".npy") and is_dvl_log(dvl):
         log = read_dvl_log(dvl)
     else:
         log = DvlLog(read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes), Counter())

@@ -1,0 +1,117 @@
+"""What DVLs write as text: Teledyne's PD6, Nortek's PNORBT and Cerulean's DVPDL sentences.
+
+PD6 (Pathfinder and Wayfinder guides): ``:TS`` time, ``:SA`` pitch, roll, heading, ``:BI`` the instrument's motion over
+the bottom in mm/s, starboard, forward, up. PNORBT (Nortek, "DVL Integrator's Guide"): forward, starboard, down, stamped
+by a beam's sentence before or by themselves. DVPDL (Cerulean, DVL-75 and Tracker 650): displacement forward, starboard,
+down over an interval, stamped since boot, which becomes time since 1970.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from datetime import datetime, timezone
+from pathlib import Path
+
+import numpy as np
+
+from ..calibration.numerics.samples import DvlSample
+from .dvl_log import DvlLog, imu_samples
+from .nmea import xor
+
+_SECOND_NS = 1_000_000_000
+_SENTENCE = re.compile(rb"\$((?:PNORBT|DVPDL)[^*\r\n]*)\*([0-9A-Fa-f]{2})")
+_PD6 = re.compile(rb":(TS|SA|BI),([^:\r\n]*)")
+# Fields of the sentences with a velocity
+_BEAM_TIME, _VELOCITY, _STAMPED, _DISPLACEMENT = "PNORBT1", "PNORBT4", "PNORBT7", "DVPDL"
+_FASTEST_MPS = 30.0  # instruments write ±32.767 where there is no bottom
+
+
+def is_pd6(content: bytes) -> bool:
+    """Return whether there are bottom-track lines of PD6."""
+    return {b"TS", b"BI"} <= {kind for kind, _ in _PD6.findall(content)}
+
+
+def is_sentences(content: bytes) -> bool:
+    """Return whether there is a sentence with a DVL's velocity."""
+    return re.search(rb"\$(PNORBT[47]|DVPDL),", content) is not None
+
+
+def read_pd6(path: Path, content: bytes) -> DvlLog:
+    """Read PD6; heading, pitch and roll are those of the DVL's own sensors."""
+    samples: list[DvlSample] = []
+    attitudes: dict[int, tuple[float, ...]] = {}
+    left_out: Counter[str] = Counter()
+    stamp_ns = 0
+    tilt: tuple[float, ...] | None = None
+    for kind, text in _PD6.findall(content):
+        fields = text.decode("ascii", "replace").split(",")
+        try:
+            if kind == b"TS":
+                at = datetime.strptime(fields[0][:12], "%y%m%d%H%M%S").replace(tzinfo=timezone.utc)
+                stamp_ns = int(at.timestamp()) * _SECOND_NS + int(fields[0][12:14]) * 10_000_000
+                if tilt is not None:  # which comes before its time
+                    attitudes[stamp_ns] = tilt
+            elif kind == b"SA":
+                pitch, roll, heading = (math.radians(float(field)) for field in fields[:3])
+                tilt = roll, pitch, heading
+            else:
+                starboard, forward, up = (0.001 * float(field) for field in fields[:3])
+                _add(samples, left_out, stamp_ns, (forward, -starboard, up), fields[4].strip() == "A")
+        except (ValueError, IndexError):
+            left_out["damaged"] += 1
+    stamps = sorted(attitudes)
+    rpy = np.array([attitudes[at] for at in stamps]).reshape(-1, 3)
+    note = f"{path}: heading, pitch and roll are those of the DVL's own sensors; give --attitude for another's"
+    own = imu_samples(stamps, rpy) if len(rpy) and np.ptp(rpy, axis=0).any() else []
+    return DvlLog(samples, left_out, (), own, (note,) if own else ())
+
+
+def read_sentences(_: Path, content: bytes) -> DvlLog:
+    """Read sentences of Nortek or Cerulean; those with a wrong checksum are left out."""
+    samples: list[DvlSample] = []
+    left_out: Counter[str] = Counter()
+    beam_ns = 0
+    for text, checksum in _SENTENCE.findall(content):
+        name, *fields = text.decode("ascii", "replace").split(",")
+        if xor(text) != int(checksum, 16):
+            left_out["with a wrong checksum"] += 1
+            continue
+        try:
+            if name == _BEAM_TIME:
+                named = dict(field.split("=") for field in fields)
+                whole, _, fraction = named["TIME"].partition(".")
+                at = datetime.strptime(named["DATE"] + whole, "%m%d%y%H%M%S").replace(tzinfo=timezone.utc)
+                beam_ns = int(at.timestamp()) * _SECOND_NS + round(float(f"0.{fraction or 0}") * 1e9)
+            elif name == _VELOCITY:
+                x, y, _fom, z1, z2 = map(float, fields[2:7])
+                _add(samples, left_out, beam_ns, (x, -y, -0.5 * (z1 + z2)))
+            elif name == _STAMPED:
+                x, y, z = map(float, fields[3:6])
+                _add(samples, left_out, round(float(fields[0]) * 1e9), (x, -y, -z))
+            elif name == _DISPLACEMENT:
+                seconds = 1e-6 * float(fields[1])
+                x, y, z = (float(field) / seconds for field in fields[5:8])
+                # over the interval that ends there
+                middle_ns = round(1e3 * float(fields[0]) - 0.5e9 * seconds)
+                _add(samples, left_out, _SECOND_NS + middle_ns, (x, -y, -z), float(fields[8]) > 0.0)
+        except (ValueError, KeyError, IndexError, ZeroDivisionError):
+            left_out["damaged"] += 1
+    return DvlLog(samples, left_out)
+
+
+def _add(
+    samples: list[DvlSample],
+    left_out: Counter[str],
+    stamp_ns: int,
+    velocity: tuple[float, float, float],
+    is_valid: bool = True,
+) -> None:
+    """Take a velocity (forward-left-up, m/s), or count why there is none."""
+    if not is_valid or not max(map(abs, velocity)) < _FASTEST_MPS:
+        left_out["without bottom lock"] += 1
+    elif stamp_ns <= 0:
+        left_out["without a time"] += 1
+    else:
+        samples.append(DvlSample(stamp_ns, velocity, None))
