@@ -110,6 +110,13 @@ class _Tried:
         """Its reading."""
         return self.agreement.reading
 
+    @property
+    def left(self) -> float:
+        """What it leaves, as a share of the speed, but for a misalignment."""
+        of_best, known = self.agreement.rotation_dvl_from_body, self.mounting
+        is_misaligned = known is not None and angle_between(of_best, known) < TURNED_FROM
+        return self.agreement.best_left if is_misaligned else self.agreement.left
+
     def odds(self, found: Array) -> float:
         """Return the prior with that of the mounting (3, 3) that fits, where none is known, and of the travel."""
         prior = self.prior + (0.0 if self.agreement.is_ahead else SIDEWAYS)
@@ -286,9 +293,13 @@ class FrameChooser:
         tried = [_Tried(each, mounting, priors[each.reading]) for each in found]
         if mounting is not None:  # or it is wrong, and the DVL's axes are as declared
             free = readings.agreements([each for each in priors if each.turned == as_declared[each]], None)
-            tried += [_Tried(each, None, priors[each.reading] + MOUNTING_OTHER) for each in free]
+            tried += [
+                _Tried(each, None, priors[each.reading] + MOUNTING_OTHER)
+                for each in free
+                if angle_between(each.rotation_dvl_from_body, mounting) > TURNED_FROM
+            ]
         first = {
-            each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.agreement.left)
+            each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.left)
             for each in tried
         }
         ranked = sorted(tried, key=lambda each: -first[each])
@@ -305,9 +316,10 @@ class FrameChooser:
         if likely == [expected] and expected.mounting is mounting:
             return FrameChoice(expected.agreement, imus[expected.reading], says)
         fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
+        likelihoods = readings.log_likelihoods([left for left, _ in fits.values()])
         odds = {
-            each: each.odds(rotation) + readings.log_likelihood(left, registered=True)
-            for each, (left, rotation) in fits.items()
+            each: each.odds(rotation) + likelihood
+            for (each, (_, rotation)), likelihood in zip(fits.items(), likelihoods, strict=True)
         }
         best, *others = sorted(likely, key=lambda each: -odds[each])
         alike = [each for each in others if odds[each] > odds[best] - AS_LIKELY]

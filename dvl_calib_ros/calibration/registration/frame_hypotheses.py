@@ -51,7 +51,7 @@ FITS = 0.3
 ROLLED = 0.8
 # Independent samples of three axes that a comparison counts for, and rows of a registration for each more of them; a
 # residual below this share of the speed is none.
-INDEPENDENT, ROWS_A_SAMPLE, LEAST_LEFT = 4.0, 50.0, 0.005
+INDEPENDENT, ROWS_A_SAMPLE, LEAST_LEFT = 4.0, 10.0, 0.005
 # A mean velocity to the side below this share of the speed is none that a vehicle travels by.
 SIDEWAYS = 0.5
 # Turn rates below this (rad/s) do not say which way a body's axes point.
@@ -150,14 +150,23 @@ class Readings:
         square = float(squared(self._dvl).mean())
         return math.sqrt(max(left**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
 
-    def log_likelihood(self, left: float, registered: bool = False) -> float:
-        """Return the tempered log likelihood of a residual, as a share of the speed.
+    def log_likelihood(self, left: float) -> float:
+        """Return the tempered log likelihood of what a comparison leaves, as a share of the speed.
 
-        What a fit misses of arms, delays and waves is alike from sample to sample, so few of them count; more once
-        lever arm and delay are registered.
+        What it misses of arms, delays and waves is alike from sample to sample, so few of them count.
         """
-        n = INDEPENDENT + (min(len(self), FEW_ROWS) / ROWS_A_SAMPLE if registered else 0.0)
-        return -3.0 * n * math.log(max(self.beside_noise(left), LEAST_LEFT))
+        return -3.0 * INDEPENDENT * math.log(max(self.beside_noise(left), LEAST_LEFT))
+
+    def log_likelihoods(self, left: Sequence[float]) -> list[float]:
+        """Return the tempered log likelihoods of what registrations leave, as shares of the speed.
+
+        Where the best leaves little but the reference's white noise, a tenth of its samples count. What else it leaves
+        is alike from sample to sample, and few do.
+        """
+        least = max(min(left), LEAST_LEFT)
+        white = min(1.0, 1.0 - (self.beside_noise(least) / least) ** 2)
+        n = INDEPENDENT + white * min(len(self._motion.reference), FEW_ROWS) / ROWS_A_SAMPLE
+        return [-3.0 * n * math.log(max(each, LEAST_LEFT)) for each in left]
 
     def agreements(self, readings: Sequence[Reading], rotation_dvl_from_body: Array | None) -> list[Agreement]:
         """All readings that can be tried, the best first, with clocks in time and no other lever arm.

@@ -239,9 +239,9 @@ class Verification:
     mounting: Reason | None = None
 
     def with_objections(self, objections: Sequence[Reason]) -> Verification:
-        """With what else is known of it, as said first; the verdict is the worst of all."""
-        reasons = (*objections, *self.reasons)
-        return replace(self, verdict=by_severity(reasons)[0].severity, reasons=reasons)
+        """With what else is known of it; the verdict is the worst of all."""
+        reasons = tuple(by_severity((*objections, *self.reasons)))
+        return replace(self, verdict=reasons[0].severity, reasons=reasons)
 
 
 _ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")

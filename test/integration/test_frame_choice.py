@@ -1,0 +1,131 @@
+"""Recordings whose axes are other than they say, or of which two readings fit: what is taken, and what is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from stacks import LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, true_mounting
+
+from dvl_calib_ros import doctor, replay
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NWU, FLU_FROM_FRD, rpy_from_rotation
+from dvl_calib_ros.discovery.discover import discover
+
+ODOMETRY_FRAMES = {"as its child frame says": np.eye(3), "forward-right-down": FLU_FROM_FRD}
+
+
+def truth_deg(mounting_rpy=(0.0, 0.0, 0.0)):
+    """Roll, pitch, yaw (degrees) of the DVL in a forward-left-up body."""
+    return np.degrees(rpy_from_rotation(true_mounting(mounting_rpy)))
+
+
+def found_deg(calibration):
+    parameters = Parameters.from_mapping(calibration.replayed.result.parameters)
+    estimate = calibration.replayed.result.estimate
+    return np.degrees(rpy_from_rotation(estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)))
+
+
+def is_right(calibration, truth, atol=(2.0, 0.5, 0.5)):
+    """Whether roll, pitch, yaw (degrees) are; 150 s hardly show the roll."""
+    return bool((np.abs(found_deg(calibration) - truth) < atol).all())
+
+
+def codes(reasons):
+    return [reason.code for reason in reasons]
+
+
+def vehicle(z_down: bool, position=LEVER_ARM, dvl_rpy=(0.0, 0.0, 0.0), axes="enu", std=0.05) -> Told:
+    """A vehicle of which all is z up, or all z down: base_link, DVL, IMU and reference."""
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link", frd=z_down)
+    told.imu("/imu", "base_link", FLU_FROM_FRD if z_down else None, "ned" if z_down else "enu")
+    told.reference("/gps/velocity", TWIST, "ned" if z_down else "map", "ned" if z_down else axes, std=std)
+    place = FLU_FROM_FRD @ np.array(position) if z_down else position
+    told.tf_static(told.transform("base_link", "dvl_link", dvl_rpy, place))
+    return told
+
+
+def odometry(told: Told, axes, pose: bool) -> None:
+    """An INS whose pose is that of a forward-left-up base_link in ENU, with its twist turned by axes (3, 3)."""
+    m = motion()
+    quaternions = Rotation.from_matrix(m.rotation_enu_from_body).as_quat()
+    for i, stamp in told.every(10.0, 0.02):
+        velocity = axes @ (m.velocity_body[i] + told.rng.normal(0.0, 0.01, 3))
+        message = told.make.velocity(ODOMETRY, Sample(stamp, velocity, 1e-4 * np.eye(3)), "base_link")
+        message.header.frame_id = "odom"
+        if pose:
+            p, q = message.pose.pose.position, message.pose.pose.orientation
+            (p.x, p.y, p.z), (q.x, q.y, q.z, q.w) = positions()[i].tolist(), quaternions[i].tolist()
+        told.say(stamp, "/ins/odometry", ODOMETRY, message)
+
+
+@pytest.mark.spread(1)
+def test_a_vehicle_that_is_z_down_gets_its_mounting_in_its_own_axes(tmp_path, capsys):
+    up, down = (replay(vehicle(z_down, std=0.002).write(tmp_path / str(z_down))) for z_down in (False, True))
+    assert up.replayed.result.parameters["base_axes"] == "flu" and down.replayed.result.parameters["base_axes"] == "frd"
+    assert is_right(up, truth_deg())
+    np.testing.assert_allclose(found_deg(down), found_deg(up) * [1.0, -1.0, -1.0], atol=0.1)
+    arms = [each.replayed.result.parameters["lever_arm"] for each in (up, down)]
+    np.testing.assert_allclose(arms[1], FLU_FROM_FRD @ arms[0])
+    assert "base_axes frd" in " ".join(down.discovery.found)
+    assert "lever arm, to starboard" in str(down) or "to port" not in str(down)
+
+
+@pytest.mark.spread(1)
+@pytest.mark.parametrize("twist", ODOMETRY_FRAMES)
+def test_a_twist_is_in_the_axes_in_which_it_moves_its_own_pose(tmp_path, twist):
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    told.imu("/imu", "base_link")
+    odometry(told, ODOMETRY_FRAMES[twist], pose=True)
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
+    calibration = replay(told.write(tmp_path / "bag"))
+    assert is_right(calibration, truth_deg())
+    said = "REFERENCE_FRAME_OTHER" in codes(calibration.discovery.contradictions)
+    assert said == (twist != "as its child frame says")
+
+
+@pytest.mark.spread(1)
+def test_two_readings_that_fit_as_well_are_both_said_and_the_answer_is_marginal(tmp_path):
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link", frd=True)
+    told.imu("/imu", "base_link")
+    odometry(told, np.eye(3), pose=False)
+    bag = told.write(tmp_path / "bag")
+    told_axes = replay(bag, dvl_axes="frd", gnss_frame="body")
+    assert not told_axes.discovery.objections
+    assert is_right(told_axes, truth_deg())
+
+
+@pytest.mark.spread(1)
+def test_a_reference_in_north_west_up_is_turned_not_the_dvl(tmp_path):
+    told, m = Told(), motion()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    told.imu("/imu", "base_link")
+    for i, stamp in told.every(5.0, 0.04):
+        velocity = ENU_FROM_NWU.T @ (m.rotation_enu_from_body[i] @ m.velocity_body[i] + told.rng.normal(0.0, 0.03, 3))
+        message = told.make.velocity(TWIST, Sample(stamp, velocity, 9e-4 * np.eye(3)), "world")
+        told.say(stamp, "/gps/vel", TWIST, message)
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
+    bag = told.write(tmp_path / "bag")
+    found = discover([bag], Parameters())
+    assert found.parameters.gnss_frame == "nwu" and codes(found.contradictions) == ["REFERENCE_FRAME_OTHER"]
+    assert is_right(replay(bag), truth_deg())
+
+
+@pytest.mark.spread(1)
+def test_a_yaw_of_the_wrong_sign_in_a_transform_is_named_and_its_remedy_works(tmp_path):
+    quarter = np.radians(135.0)
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link", (0.0, 0.0, -quarter))
+    told.imu("/imu", "base_link")
+    told.reference("/gps/velocity", TWIST, "map", "enu")
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, quarter), LEVER_ARM))
+    bag = told.write(tmp_path / "bag")
+    wrong = doctor(bag)
+    assert wrong.verdict == "no" and wrong.reasons[0].code == "CONFIGURATION_WRONG"
+    assert "mounting_rpy to [0, 0, -2.356]" in wrong.reasons[0].sentence
+    mended = replay(bag, mounting_rpy=(0.0, 0.0, -quarter))
+    assert mended.verdict != "reject"
+    assert is_right(mended, truth_deg((0.0, 0.0, -quarter)), (2.0, 2.0, 0.5))
