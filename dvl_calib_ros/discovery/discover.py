@@ -45,7 +45,7 @@ from .discovery import (
     in_time_of,
     mounting_guessed,
 )
-from .frame_choice import FrameChoice, FrameChooser
+from .frame_choice import FrameChoice, FrameChooser, declared_reference
 from .gravity import Gravity, believed_heading
 from .transforms import FrameTree, Placed
 
@@ -179,7 +179,7 @@ class _Search:
             frame = ""
             if role == "reference" and look is not None:
                 chosen = self._values.get("gnss_frame") or self._parameters.gnss_frame
-                declared = self._declared.declared_reference(look)
+                declared = self._declared_reference(look)
                 shown = chosen if chosen != FROM_FRAME_ID else "" if declared is None else declared.name
                 frame = f", {shown}" if shown else ""
             parts.append(f"{role} {name} ({kind.split('/')[-1]}{frame}{rate})")
@@ -196,10 +196,10 @@ class _Search:
         if known is None and placed is not None:
             known = placed.rotation
         imu_placed = None if imu is None else self._tree.placed(imu.frame_id, self._parameters.base_frame)
+        if placed is None and imu_placed is not None:
+            self._take_base(imu_placed.base)
         base = self._values.get("base_frame", self._parameters.base_frame)
-        frames = self._declared = FrameChooser(
-            self._parameters, self._given.parameters, base, dvl, placed, imu, imu_placed
-        )
+        frames = FrameChooser(self._parameters, self._given.parameters, base, dvl, placed, imu, imu_placed)
         chosen = None
         if dvl.claimed_std >= SAYS_NOTHING and not self._gives("use_message_covariance"):
             self._values["use_message_covariance"] = False
@@ -208,7 +208,7 @@ class _Search:
                 "(-p use_message_covariance:=false)"
             )
         if reference is not None:
-            chosen = self._fit(dvl, reference, imu, known, placed)
+            chosen = self._fit(frames, dvl, reference, imu, known, placed)
         taken = frames.imu if chosen is None else chosen.imu
         self._take_base_axes(taken is not None and taken.z_down)
         turned = frames.dvl_is_turned(self._is_z_down)
@@ -316,20 +316,28 @@ class _Search:
             placed = None if like is None else self._tree.placed(like, base_frame)
             if placed is not None:
                 self._notes.append(finding("FRAME_NOT_IN_TREE", frame=frame, other=placed.frame))
-        if placed is not None and placed.base != base_frame.strip("/") and not self._gives("base_frame"):
-            self._values["base_frame"] = placed.base
+        if placed is not None:
+            self._take_base(placed.base)
         return placed
+
+    def _take_base(self, base: str) -> None:
+        if base != self._parameters.base_frame.strip("/") and not self._gives("base_frame"):
+            self._values["base_frame"] = base
 
     def _is_body_or_earth(self, frame_id: str) -> bool:
         name = frame_id.strip("/")
         return name == self._parameters.base_frame.strip("/") or name.lower() in EARTH_FRAMES
+
+    def _declared_reference(self, reference: Look) -> DeclaredFrame | None:
+        base = self._values.get("base_frame", self._parameters.base_frame)
+        return declared_reference(reference, self._parameters, base)
 
     def _reference_frame(self, reference: Look | None) -> VelocityFrame | None:
         """The frame that the reference is taken in; None without one, or if nothing tells."""
         if reference is None:
             return None
         taken = self._values.get("gnss_frame")
-        said = self._declared.declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
+        said = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
         return None if said is None else said.frame
 
     def _knows_imu(self, imu: Look | None) -> bool:
@@ -343,14 +351,20 @@ class _Search:
         return fit is not None and not fit.reading.in_body and fit.best_left < FITS
 
     def _fit(
-        self, dvl: Look, reference: Look, imu: Look | None, known: Array | None, placed: Placed | None
+        self,
+        frames: FrameChooser,
+        dvl: Look,
+        reference: Look,
+        imu: Look | None,
+        known: Array | None,
+        placed: Placed | None,
     ) -> FrameChoice | None:
         position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
         motion = compared_motion(dvl, reference, imu)
         if motion is None:
             return None
         self._readings = Readings(motion, position)
-        return self._declared.choose(self._readings, reference, None if known is None else known.T)
+        return frames.choose(self._readings, reference, None if known is None else known.T)
 
     def _take(
         self,
@@ -361,7 +375,7 @@ class _Search:
     ) -> None:
         """Write what a reading says into the parameters."""
         reading, parameters = chosen.reading, self._parameters
-        declared = self._declared.declared_reference(reference)
+        declared = self._declared_reference(reference)
         if declared is not None and self._is_z_down and declared.points_down:
             declared = DeclaredFrame(VelocityFrame.BODY)
         taken = DECLARED_FRAMES[reading.reference]

@@ -50,11 +50,11 @@ from .transforms import Placed
 IMU_IN_NED, IMU_IN_OTHER_WORLD, IMU_OTHERWISE = math.log(1 / 10), math.log(1 / 20), math.log(1 / 50)
 DVL_AXES_OTHER = math.log(1 / 20)
 # Where no transform says anything, marine axes are nearly as common as REP-103's.
-UNPLACED_IN_NED = UNPLACED_DVL_AXES_OTHER = math.log(1 / 3)
+UNPLACED_IN_NED, UNPLACED_DVL_AXES_OTHER = math.log(1 / 4), math.log(1 / 10)
 # A transform or parameter of the mounting that is wrong; a mounting nobody says that is not as the body; one upside
 # down, which is the same as other axes.
 MOUNTING_OTHER, MOUNTING_TURNED, UPSIDE_DOWN = math.log(1 / 50), math.log(1 / 3), math.log(1 / 100)
-BASE_Z_DOWN = math.log(1 / 50)
+BASE_Z_DOWN, UNPLACED_BASE_Z_DOWN = math.log(1 / 50), math.log(1 / 500)
 REFERENCE_FRAME_OTHER = math.log(1 / 200)
 REFERENCE_AXES_OTHER = math.log(1 / 50)
 # Of a reference that declares no frame: ENU, the body, NED; other worlds.
@@ -69,7 +69,7 @@ GRAVITY_INVERTED, GRAVITY_CONTRADICTS = math.log(1 / 100), math.log(1 / 1000)
 # Readings whose odds at a first look are this much worse (log) than the best are not registered; at most so many are.
 FAR_WORSE, MOST_REGISTERED = 8.0, 6
 # Two readings within these odds fit as well, rad and log.
-AS_LIKELY, SAME_ANSWER = math.log(3.0), math.radians(1.0)
+AS_LIKELY, SAME_ANSWER = math.log(2.0), math.radians(1.0)
 # A mounting is not as the body from here on, rad.
 TURNED_FROM = math.radians(12.0)
 # Over this time (s) a twist is held against the way of its own pose.
@@ -189,7 +189,9 @@ class FrameChooser:
                 prior = 0.0  # the world of a vehicle that is z down
             elif z_down:
                 prior += IMU_IN_OTHER_WORLD
-            prior += BASE_Z_DOWN if z_down != self._says_z_down else 0.0
+            if z_down != self._says_z_down:
+                is_placed = placed is not None or self._dvl_placed is not None
+                prior += BASE_Z_DOWN if is_placed else UNPLACED_BASE_Z_DOWN
             if self._gravity is not None:
                 wrong = self._gravity.contradicts(frame.rotation_body_from_imu, frame.world, z_down)
                 prior += (0.0, GRAVITY_CONTRADICTS, GRAVITY_INVERTED)[wrong]
@@ -222,19 +224,10 @@ class FrameChooser:
     def _dvl_axes_are_said(self) -> bool:
         return self._parameters.dvl_axes != FROM_MESSAGE or self._dvl.frame_id.lower().endswith(("_frd", "_flu"))
 
-    def declared_reference(self, reference: Look) -> DeclaredFrame | None:
-        """The frame that a reference declares; None if it says nothing."""
-        if self._parameters.gnss_frame != FROM_FRAME_ID:
-            return DECLARED_FRAMES[self._parameters.gnss_frame]
-        of_type = VELOCITY_TYPES[reference.msgtype].reference_frame
-        if of_type is not None:
-            return DeclaredFrame(of_type)
-        return frame_named(reference.frame_id, (self._parameters.base_frame, self._base_frame))
-
     def _reference_priors(self, reference: Look, imu: ImuHypothesis | None) -> dict[str, float]:
         """Log odds of the frames that a reference may be in, by name."""
         z_down = self._says_z_down if imu is None else imu.z_down
-        declared = self.declared_reference(reference)
+        declared = declared_reference(reference, self._parameters, self._base_frame)
         if self._parameters.gnss_frame != FROM_FRAME_ID and declared is not None:
             return {declared.in_base(self._parameters.replace(base_axes=FRD)).name if z_down else declared.name: 0.0}
         names = ["enu", "body", *([] if z_down else [FRD]), "ned", NWU]
@@ -286,7 +279,7 @@ class FrameChooser:
                         is_placed = self._dvl_placed is not None
                         priors[reading] += DVL_AXES_OTHER if is_placed else UNPLACED_DVL_AXES_OTHER
         found = readings.agreements(list(priors), mounting)
-        declared_frame = self.declared_reference(reference)
+        declared_frame = declared_reference(reference, self._parameters, self._base_frame)
         in_earth = declared_frame is not None and declared_frame.frame is not VelocityFrame.BODY
         if not found or (in_earth and all(each.reading.in_body for each in found)):
             return None  # what is declared cannot be tried without an attitude, and stands
@@ -326,7 +319,8 @@ class FrameChooser:
         for rival in alike:
             one, other = (self._options(each.reading, imus[each.reading]) for each in (best, rival))
             other_axes = any(one[name] != other[name] for name in ("dvl_axes", "base_axes"))
-            if other_axes or angle_between(fits[best][1], fits[rival][1]) > SAME_ANSWER:
+            in_body = best.reading.in_body and rival.reading.in_body  # where the IMU's frame turns the lever arm alone
+            if other_axes or (not in_body and angle_between(fits[best][1], fits[rival][1]) > SAME_ANSWER):
                 taken, instead = (
                     " and ".join(f"{name} {this[name]}" for name in this if one[name] != other[name]) or "the mounting"
                     for this in (one, other)
@@ -348,6 +342,16 @@ class FrameChooser:
             "dvl_axes": FRD if reading.turned != z_down else FLU,
             "imu_frame": IMU_ENU if imu is None else imu.frame.world,
         }
+
+
+def declared_reference(reference: Look, parameters: Parameters, base_frame: str) -> DeclaredFrame | None:
+    """Return the frame that a reference declares; None if it says nothing."""
+    if parameters.gnss_frame != FROM_FRAME_ID:
+        return DECLARED_FRAMES[parameters.gnss_frame]
+    of_type = VELOCITY_TYPES[reference.msgtype].reference_frame
+    if of_type is not None:
+        return DeclaredFrame(of_type)
+    return frame_named(reference.frame_id, (parameters.base_frame, base_frame))
 
 
 def twist_axes(look: Look) -> str | None:

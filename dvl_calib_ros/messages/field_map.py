@@ -11,16 +11,19 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from operator import attrgetter
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from rosbags.interfaces import Nodetype
-from rosbags.typesys.store import Typestore
 
 from ..calibration.numerics.frames import Array
 from ..errors import InputError
 from .drivers import CHECK_LOCK, ENOUGH_BEAMS, IMU_TYPE, VELOCITY_TYPES, Rule, VelocityType, forget, register
 
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+# Kinds of fields as rosbags numbers them (`rosbags.interfaces.Nodetype`), which a ROS machine need not have.
+BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
 # Keys of a map, and how many paths each may have
 _KEYS: Mapping[str, tuple[int, ...]] = {
     "velocity": (1, 3), "beams": (3,), "valid": (1, 2, 3, 4), "variance": (1, 3), "stamp": (1,), "frame": (1,)
@@ -160,7 +163,7 @@ class _Fields(NamedTuple):
     def of(self, description: Description) -> dict[str, Description]:
         """Return the fields of a message by name, none of what is no message."""
         kind, what = description
-        known = self.store.fielddefs.get(what) if kind == Nodetype.NAME else None
+        known = self.store.fielddefs.get(what) if kind == NAME else None
         return {} if known is None else dict(known[1])
 
     def at(self, description: Description, path: str) -> Description | None:
@@ -180,11 +183,11 @@ class _Fields(NamedTuple):
 
     def is_number(self, description: Description) -> bool:
         kind, what = description
-        return bool(kind == Nodetype.BASE and what[0] != "string")
+        return bool(kind == BASE and what[0] != "string")
 
     def is_array(self, description: Description) -> bool:
         kind, what = description
-        return kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and self.is_number(what[0])
+        return kind in (ARRAY, SEQUENCE) and self.is_number(what[0])
 
     def is_vector(self, description: Description) -> bool:
         fields = self.of(description)
@@ -193,13 +196,13 @@ class _Fields(NamedTuple):
     def element(self, description: Description) -> Description | None:
         """Return what messages a list is of; None of what is no list of messages."""
         kind, what = description
-        is_list = kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and what[0][0] == Nodetype.NAME
+        is_list = kind in (ARRAY, SEQUENCE) and what[0][0] == NAME
         return what[0] if is_list else None
 
 
 def misfit(text: str, store: Typestore, msgtype: str) -> str:
     """Return in words which field of a map a type does not have, or of another kind; '' if the map fits."""
-    fields, whole = _Fields(store), (Nodetype.NAME, msgtype)
+    fields, whole = _Fields(store), (NAME, msgtype)
     for key, paths in field_map(text).items():
         within: Description | None = whole
         for place, path in enumerate(paths):
@@ -222,7 +225,7 @@ def misfit(text: str, store: Typestore, msgtype: str) -> str:
 def _fits(fields: _Fields, key: str, found: Description, count: int) -> tuple[bool, str]:
     """Return whether a field is of the kind that a key takes, and which kind that is."""
     if key == "frame":
-        return found == (Nodetype.BASE, ("string", 0)), "text"
+        return found == (BASE, ("string", 0)), "text"
     if key == "stamp":
         return fields.is_number(found) or "nanosec" in fields.of(found), "a time, or seconds"
     if key == "variance" and count == 1:
@@ -245,12 +248,12 @@ def _listed(fields: _Fields, description: Description) -> str:
 def suggested(store: Typestore, msgtype: str) -> str:
     """Return the map that reads what looks like a velocity in a type; '' if nothing does."""
     fields = _Fields(store)
-    below = dict(fields.walk((Nodetype.NAME, msgtype)))
+    below = dict(fields.walk((NAME, msgtype)))
     found = next(_velocities(fields, below), "")
     valid = [
         path
         for path, (kind, what) in below.items()
-        if kind == Nodetype.BASE and what[0] == "bool" and re.search("valid|lock", path, re.I) and "beam" not in path
+        if kind == BASE and what[0] == "bool" and re.search("valid|lock", path, re.I) and "beam" not in path
     ]
     return f"{found},valid={','.join(valid)}" if found.startswith("velocity") and 0 < len(valid) <= 4 else found
 

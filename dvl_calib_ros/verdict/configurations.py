@@ -34,16 +34,22 @@ CONFIGURATIONS = (
         "let the driver send the velocity in the DVL's own axes",
     ),
     _Said(
-        "DVL_AXES_FRD",
-        "the DVL's axes look forward-right-down",
-        "The data fit much better with y and z negated.",
-        "set dvl_axes to frd",
+        "DVL_AXES_TURNED",
+        "the DVL's axes look turned over: y and z point the other way",
+        "The data fit much better with y and z negated: forward-right-down for forward-left-up, or the other way.",
+        "set dvl_axes to {axes}",
     ),
     _Said(
         "DVL_LEFT_HANDED",
         "the DVL's axes look left-handed: {axis} points the other way",
         "The data fit much better with this one axis negated, which no rotation does.",
         "negate this axis in the DVL's driver; of z, check the sign of the reference's vertical velocity as well",
+    ),
+    _Said(
+        "DVL_AXIS_SCALED",
+        "the DVL's {axis} is {factor:.2g} of what it should be, and its x is not",
+        "An axis that is wrong alone comes from beam angles or a beam matrix that are not those of the instrument.",
+        "check the beam angle and the beam order in the DVL's driver",
     ),
     _Said(
         "MOUNTING_FITS",

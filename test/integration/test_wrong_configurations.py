@@ -117,7 +117,7 @@ WRONG = {
     "yaw off by 45 degrees": (lambda: run(YAW[45]), {}, "MOUNTING_FITS"),
     "yaw off by 90 degrees": (lambda: run(YAW[90]), {}, "MOUNTING_FITS"),
     "yaw off by 180 degrees": (lambda: run(YAW[180]), {}, "MOUNTING_FITS"),
-    "z flipped": (lambda: run((math.pi, 0.0, 0.0)), {}, "DVL_AXES_FRD"),
+    "z flipped": (lambda: run((math.pi, 0.0, 0.0)), {}, "DVL_AXES_TURNED"),
     "x and y swapped": (lambda: run((math.pi, 0.0, math.pi / 2)), {}, "MOUNTING_FITS"),
     "ENU, body claimed": (run, {"gnss_frame": "body"}, "REFERENCE_LOOKS"),
     # of the two next ones roll would tell, which a level vehicle does not show: 180 degrees of it are chance

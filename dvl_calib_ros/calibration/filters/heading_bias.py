@@ -297,6 +297,7 @@ class HeadingEvidence(NamedTuple):
 
 def prior_std(heading: float, bias: float) -> Array:
     """Prior σ of the coefficients (9,), by `heading_deviation_std` (rad) and `dvl_bias_std` (m/s)."""
+    bias = bias if bias > LEAST else 0.0  # whose square is a number
     return np.concatenate([np.full(N_BIAS, bias), [_CONSTANT_STD if heading else 0.0], heading * _SHARE])
 
 

@@ -14,12 +14,13 @@ from dataclasses import replace
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
+from ..models.parameters import FRD
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
 from ..streams.interpolation import attitude_at
 from .earth_frame_velocity import Directions
 from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
-from .motion_streams import GAP_S, MIRRORED, Curves, MotionStreams
+from .motion_streams import GAP_S, Curves, MotionStreams
 from .registration import Registration
 
 # A configuration is wrong from here on: what is left of the motion, as a share of it, is that of 10 degrees.
@@ -30,17 +31,13 @@ FITS_BELOW, BETTER_BY = math.sqrt(0.05), 0.5
 SAME_WITHIN = math.radians(12.0)
 # Mountings are drawn with multiples of such an angle, rad, and one that is the same but for a misalignment is named.
 DRAWN = math.pi / 4.0
-# Axes turned round are the right ones if they leave so much less than those given: in chi-square, were all samples
-# independent; of blocks of ten that are alike it is a tenth.
-CLEARLY = 40.0
-# ... of which a sample counts no more than by so many times what is left of the most.
-OUTLYING = 4.0
-# Delays that differ by less read the DVL at the same times, s.
-ALIKE_S = 0.1
-# ... and no more than so many times what is left with whichever clocks.
-AS_WELL = 1.1
-# ... by few rows, whose median is good to 4 %: what leaves more is not fitted to all.
-FAR_WORSE = 1.5 * AS_WELL
+# Signs of the DVL's axes: as given, y or z mirrored, turned over. A vehicle that goes ahead shows that of x.
+SIGNS: Sequence[Array] = [np.array([1.0, y, z]) for y in (1.0, -1.0) for z in (1.0, -1.0)]
+# What leaves so many times what the registration leaves is no explanation, by few rows and by all.
+AS_WELL, FAR_WORSE = 1.1, 1.5
+# An axis points the other way, or is scaled alone, where its factor says so by this many σ (two-sided p = 6e-7: eight
+# tests of each look, and a look every few blocks), and by so much more than another speed of sound would.
+SIGNIFICANT, SCALED_ALONE = 5.0, 0.2
 # A registration explains the motion with a misalignment (rad) and a scale below these.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
 # So many σ of a turn are chance.
@@ -55,12 +52,17 @@ _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 
 def fitting_configuration(
-    motion: MotionStreams, declared: VelocityFrame, nominal: Array, lever_arm: Array, given: Registration | None
+    motion: MotionStreams,
+    declared: VelocityFrame,
+    nominal: Array,
+    lever_arm: Array,
+    given: Registration | None,
+    dvl_axes: str = "from_message",
 ) -> Reason | None:
     """What fits much better than what is configured; None if nothing does, or the configuration fits.
 
     declared: the frame that the reference is said to be in. nominal: rotation_body_from_dvl (3, 3). given: the motion
-    registered with it.
+    registered with it. dvl_axes: the parameter.
     """
     if not all(motion.measured):
         return None
@@ -76,7 +78,7 @@ def fitting_configuration(
         as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
     if as_given < WRONG_FROM:
         assert given is not None
-        return _other_signs(motion, curves, nominal, lever_arm, given)
+        return _wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
@@ -95,8 +97,9 @@ def fitting_configuration(
     best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
     if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
-    if given is not None and (axis := _mirrored(motion, curves, nominal, lever_arm, given, found[best])):
-        return finding("DVL_LEFT_HANDED", axis=axis)
+    wrong = _wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
+    if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # which leaves less than the best rotation
+        return wrong
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
 
 
@@ -142,88 +145,43 @@ def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame)
     return replace(motion, reference=reference, in_earth=frame is not VelocityFrame.BODY)
 
 
-def _other_signs(
-    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration
+def _wrong_axes(
+    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, most: float, dvl_axes: str
 ) -> Reason | None:
-    """Return the finding of the signs of the DVL's axes that explain most, where others than those given do."""
-    turned = _turned_round(motion, curves, nominal, lever_arm, registered)
-    axis = _mirrored(motion, curves, nominal, lever_arm, registered, turned)
-    if axis:
-        return finding("DVL_LEFT_HANDED", axis=axis)
-    return None if turned is None else finding("DVL_AXES_FRD")
+    """Return the finding of axes of the DVL that are mirrored, turned over, or scaled alone.
 
-
-def _turned_round(
-    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, registered: Registration
-) -> Fitted | None:
-    """Return the fit with y and z turned round, where without a lever arm it explains more than those given with any.
-
-    A vehicle that swims ahead shows its axes only in the sway of turns and the heave of dives, which are small beside
-    its speed; and at one speed the sway of a DVL that points down is that of one with a lever arm. registered: the axes
-    given with whichever clocks; where a clock is off, neither fits with clocks in time.
+    Each pattern of signs is registered with clocks of its own: in waves a clock that is off by half of one looks like a
+    sign. That which leaves least is judged by the factors of its axes, beside lever arm and delay. most: m/s per axis
+    that it may leave.
     """
-    fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
-
-    def fitted(rotation: Array, held: Sequence[Array], most: float = math.inf) -> Fitted | None:
-        near = nearest(quick, rotation, held, most)
-        return None if near is None or near.level > most else fit(0.0, near.dvl_late, rotation, held)
-
-    turned = fitted(nominal @ FLU_FROM_FRD, WITHOUT_ARM, FAR_WORSE * registered.spread)
-    if turned is None or turned.level > AS_WELL * registered.spread:
+    found: list[tuple[float, Array, Fitted]] = []
+    for signs in SIGNS:
+        quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FEW_ROWS)
+        near = nearest(quick, nominal, (REFERENCE,), FAR_WORSE * most)
+        if near is not None:
+            found.append((near.level, signs, near))
+    if not found:
         return None
-    if abs(registered.reference.late) < HELD_TO_S and abs(registered.dvl.late) < LATE_S[-1]:  # found already
-        given = fit(0.0, registered.dvl.late, nominal, (REFERENCE,))
-    else:
-        given = fitted(nominal, (REFERENCE,))
-    if given is None:
+    _, signs, near = min(found, key=lambda each: each[0])
+    fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), MOST_ROWS)
+    fitted = fit(0.0, near.dvl_late, nominal, (REFERENCE,))
+    if fitted is None or fitted.level > most:
         return None
-    # read at other times, the DVL's noise is another one: what is left differs by that alone
-    by_chance = math.sqrt(6.0 * turned.rows) if abs(given.dvl_late - turned.dvl_late) > ALIKE_S else 0.0
-    return turned if _gain(given, turned) > CLEARLY + by_chance else None
+    factors, std, _ = fit.axis_factors(fitted, nominal)
+    is_shown, is_turned = factors > SIGNIFICANT * std, signs < 0.0
+    if (is_shown & is_turned).any():
+        if is_turned.sum() == 1 and (is_shown & ~is_turned)[1:].any():
+            return finding("DVL_LEFT_HANDED", axis="xyz"[int(np.argmax(is_turned))])
+        return finding("DVL_AXES_TURNED", axes={FRD: "flu", "flu": FRD}.get(dvl_axes, "the other of flu and frd"))
+    too_small = np.where(is_shown, factors / factors[0] - SCALED_ALONE - SIGNIFICANT * std, 0.0)
+    if not is_turned.any() and too_small.max() > 1.0:
+        at = int(np.argmax(too_small))
+        return finding("DVL_AXIS_SCALED", axis="xyz"[at], factor=float(factors[0] / factors[at]))
+    return None
 
 
-def _mirrored(
-    motion: MotionStreams,
-    curves: Curves,
-    nominal: Array,
-    lever_arm: Array,
-    registered: Registration,
-    rival: Fitted | None,
-) -> str:
-    """Return the axis of a left-handed DVL, of which the other sign explains more, with any lever arm; '' for none.
-
-    The sign of y is that of the sway of turns, which at one speed is a lever arm of the other sign; the sign of z is
-    that of the heave. rival: another explanation, a rotation, of which it has to explain more as well.
-    """
-    held = (REFERENCE,)
-    given: Fitted | None = None
-    levels: dict[str, float] = {}
-    for axis, signs in MIRRORED.items():
-        other = replace(motion, dvl=motion.dvl._replace(velocity=motion.dvl.velocity * signs))
-        of_other = curves.mirrored(axis)
-        near = nearest(MotionFit(other, lever_arm, of_other, FEW_ROWS), nominal, held, registered.spread)
-        if near is None or near.level > registered.spread:
-            continue
-        turned = MotionFit(other, lever_arm, of_other, MOST_ROWS)(0.0, near.dvl_late, nominal, held)
-        given = given or MotionFit(motion, lever_arm, curves, MOST_ROWS)(0.0, registered.dvl.late, nominal, held)
-        if turned is None or given is None:
-            continue
-        gain = min(_gain(each, turned) for each in (given, rival) if each is not None)
-        # noise that lasts is that of fewer samples (survey 34211)
-        if gain > max(given.inflation, turned.inflation) ** 2 * (CLEARLY + math.sqrt(6.0 * turned.rows)):
-            levels[axis] = turned.level
-    return min(levels, key=levels.__getitem__, default="")
-
-
-def _gain(given: Fitted, turned: Fitted) -> float:
-    """By how much less is left of axes that are turned, in chi-square, were all samples independent.
-
-    Of the same samples but for those at the ends. Outliers judge nothing, and neither does the level, which the middle
-    one tells: of samples of which none fits any better it is another one by chance (survey 47135).
-    """
-    most = (OUTLYING * max(min(given.level, turned.level), 1e-6)) ** 2
-    as_given, as_turned = (float(np.minimum(each.squares, most).mean()) for each in (given, turned))
-    return 3.0 * turned.rows * math.log(max(as_given, 1e-12) / max(as_turned, 1e-12))
+def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
+    return replace(motion, dvl=motion.dvl._replace(velocity=motion.dvl.velocity * signs))
 
 
 def _named(
@@ -243,7 +201,7 @@ def _named(
     if not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
         return finding("IMU_LOOKS_NED")
     if angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
-        turned = finding("DVL_AXES_FRD")
+        turned = finding("DVL_AXES_TURNED", axes="the other of flu and frd")
     else:
         rpy = (round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(_as_drawn(rotation)))
         turned = finding("MOUNTING_FITS", **dict(zip(("roll", "pitch", "yaw"), rpy, strict=True)))

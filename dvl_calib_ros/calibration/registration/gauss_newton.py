@@ -49,6 +49,8 @@ ROUNDS_TO_FALL, FAR_ABOVE, HARDLY_LESS = 3, 2.0, 0.9
 HALF_AT = 3.0
 # Slower, nothing is compared, m/s. Fewer rows tell nothing.
 SLOW_MPS, ENOUGH = 0.1, 20
+# A factor of an axis is within this of 1 (1 σ): ill-conditioned ones stay near it.
+WIDEST_FACTOR = 3.0
 # No more of what is known of δ is taken for noise.
 MOST_OF_NOISE = 0.95
 # Blocks of time by whose scatter σ is found. That noise lasts has to be beyond doubt (`time_blocks.LASTS`): where it is
@@ -130,6 +132,14 @@ class Fitted(NamedTuple):
     def dvl_std(self) -> float:
         """σ of τ, s."""
         return float(np.sqrt(max(self.p[[APART, APART, LATE, LATE], [APART, LATE, APART, LATE]].sum(), 0.0)))
+
+
+class AxisFactors(NamedTuple):
+    """factors, std: (3,) of the DVL's axes; 1 is right, with the scale of the fit. left: m/s per axis, with them."""
+
+    factors: Array
+    std: Array
+    left: float
 
 
 class _Rows(NamedTuple):
@@ -218,6 +228,51 @@ class MotionFit:
         if rows is None:
             return np.zeros(0, dtype=np.intp), np.zeros(0)
         return rows.at, _robust(squared(rows.residual), rows.residual.shape[1], level)
+
+    def axis_factors(self, fitted: Fitted, nominal: Array) -> AxisFactors:
+        """Return by what factors the DVL's axes would fit better, and their standard deviations.
+
+        By least squares about a fit, with turn, lever arm and the DVL's delay as nuisance parameters. A factor of -1 is
+        an axis that points the other way. Noise of the DVL makes a factor smaller, never negative.
+
+        Parameters
+        ----------
+        fitted: A fit, with its robust weights.
+        nominal: rotation_body_from_dvl (3, 3), about which turns are likely.
+
+        """
+        rows, rotation = self._rows(fitted.x, fitted.rotation_body_from_dvl, None), fitted.rotation_body_from_dvl
+        if rows is None:
+            return AxisFactors(np.ones(3), np.full(3, np.inf), math.inf)
+        axes = rows.residual.shape[1]
+        weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_AT**2 * axes * fitted.level**2))
+        own = self._axes_of_dvl(fitted, rows, rotation)
+        kept = [*range(N)[TURN], *range(N)[ARM], APART]
+        h = np.concatenate([own, rows.jacobian[:, :, kept]], axis=2).reshape(-1, 3 + len(kept))
+        w = np.repeat(weight, axes) / fitted.level**2
+        away = fitted.x.copy()
+        away[TURN], away[APART] = turn_between(nominal, rotation), 0.0
+        prior = np.concatenate([np.full(3, WIDEST_FACTOR**-2.0), LIKELY[kept] ** -2.0])
+        information = (h * w[:, None]).T @ h + np.diag(prior)
+        vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), away[kept]])
+        left = rows.residual.ravel() + h @ np.linalg.solve(information, vector)
+        # what the factors explain is no noise
+        share = float((w * left**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
+        std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
+        return AxisFactors(
+            1.0 + np.linalg.solve(information, vector)[:3], std, fitted.level * math.sqrt(min(share, 1.0))
+        )
+
+    def _axes_of_dvl(self, fitted: Fitted, rows: _Rows, rotation: Array) -> Array:
+        """What each axis of the DVL adds to the residuals, (J, A, 3) m/s."""
+        streams = self._streams(float(fitted.x[LATE]), float(fitted.x[APART]))
+        assert streams is not None
+        _, (_, _, velocity, _, attitude, _) = streams
+        own = -(1.0 + fitted.x[SCALE]) * velocity[:, None, :] * rotation
+        measured = np.array(self._motion.measured)
+        if measured.all():
+            return np.asarray(own)
+        return np.asarray((attitude @ own if self._motion.in_earth else own)[:, measured])
 
     def _streams(self, reference: float, apart: float, among: Fitted | None = None) -> _Compared | None:
         """Which references (J,), and B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), noise gain of

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -154,10 +153,6 @@ TURNS_BEYOND_S = 3600.0
 GAP_S = 2.0
 
 
-# Axes of left-handed drivers, by the one that is negated. x is not: a vehicle that goes ahead shows its sign.
-MIRRORED: Mapping[str, Array] = {"y": np.array([1.0, -1.0, 1.0]), "z": np.array([1.0, 1.0, -1.0])}
-
-
 class Curves:
     """Velocity and slope of the DVL, and turn rates, on a fine grid of time, each smoothed once for all places."""
 
@@ -184,10 +179,10 @@ class Curves:
             rates = [angular_velocity_at(motion.turns, grid[at], GAP_S)[0] for at in _parts(len(grid))]
             self._turns = np.nan_to_num(np.concatenate(rates))
 
-    def mirrored(self, axis: str) -> Curves:
-        """Return the same of a DVL of which an axis of `MIRRORED` points the other way."""
+    def signed(self, signs: Array) -> Curves:
+        """Return the same of a DVL whose axes have these signs (3,)."""
         made = copy(self)
-        made._velocity = self._velocity * MIRRORED[axis][[0, 1, 2, 0, 1, 2, 0]]
+        made._velocity = self._velocity * np.concatenate([signs, signs, [1.0]])
         return made
 
     def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:

@@ -73,7 +73,7 @@ def causes(found):
         ({"reference": ENU_FROM_NED}, "REFERENCE_LOOKS", {"name": "NED", "frame": "ned"}),
         ({"frame": VelocityFrame.NED}, "REFERENCE_LOOKS", {"name": "ENU", "frame": "enu"}),
         ({"attitude": (ENU_FROM_NED, FLU_FROM_FRD)}, "IMU_LOOKS_NED", {}),
-        ({"dvl": FLU_FROM_FRD}, "DVL_AXES_FRD", {}),
+        ({"dvl": FLU_FROM_FRD}, "DVL_AXES_TURNED", {"axes": "the other of flu and frd"}),
     ],
     ids=["45 degrees", "NED called ENU", "ENU called NED", "attitude in NED", "flipped axes"],
 )
@@ -123,7 +123,7 @@ def test_a_dvl_that_is_late_by_half_a_wave_is_not_taken_for_one_that_points_down
     assert found <= {"CLOCKS_NOT_TOLD_APART"}  # which they are, by more than a calibration finds
     flipped = straight_in_waves(late_s, FLU_FROM_FRD)
     assert flipped.verdict is Severity.REJECT
-    assert "DVL_AXES_FRD" in {each.code for each in causes(flipped)}
+    assert "DVL_AXES_TURNED" in {each.code for each in causes(flipped)}
 
 
 def judged(**changes):
