@@ -17,6 +17,7 @@ PROGRAM = "python -m validation"
 COMMANDS = {
     "combinations": "one thing at a time that recordings have, drawn at random on physics not ours: as surveys",
     "figures": "the figures and pictures of README.md and docs/: measured, written, checked",
+    "frames": "frames and signs drawn at random, on physics not ours: usable and wrong, rejected, contradictions",
     "late_clocks": "late references and late DVLs: that doctor, replay and diagnose name one cause, by its size",
     "mutants": "faults put into ten rules, each of which the tests must see",
     "peers": "the diagnosis beside four other ways to answer, on the same bags: right, intervals, error, CPU",
@@ -26,6 +27,8 @@ COMMANDS = {
     "trial": "the diagnosis, blindly, on bags whose truth stays sealed until it has answered",
     "repeat": "the suite, or its live part, many times: what fails once in a while",
 }
+# Commands whose module has another name
+MODULES = {"frames": "frame_cases"}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -39,7 +42,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         if name not in COMMANDS:
             raise InputError(f"{name!r} is no command; there are {', '.join(COMMANDS)}")
-        code: int = importlib.import_module(f"{__package__}.{name}").main(rest)
+        code: int = importlib.import_module(f"{__package__}.{MODULES.get(name, name)}").main(rest)
     except InputError as error:
         print(f"{PROGRAM}: {error}", file=sys.stderr)
         return 2

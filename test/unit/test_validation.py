@@ -11,7 +11,7 @@ from conftest import ROOT
 
 import dvl_calib_ros as dc
 from validation import combinations, mutants, repeat, surveys
-from validation.__main__ import COMMANDS, main
+from validation.__main__ import COMMANDS, MODULES, main
 from validation.combinations.recordings import physics_path, write_combination
 from validation.drawn import share
 from validation.stacks import mounting_errors
@@ -22,7 +22,7 @@ def test_every_command_is_listed_and_there(capsys):
     listed = capsys.readouterr().out
     for name, what in COMMANDS.items():
         assert f"  {name:<12}  {what}\n" in listed
-        assert callable(importlib.import_module(f"validation.{name}").main)
+        assert callable(importlib.import_module(f"validation.{MODULES.get(name, name)}").main)
 
 
 @pytest.mark.parametrize("wrong", [["nonsense"], ["repeat", "--times", "0"], ["mutants", "nonsense"]])
