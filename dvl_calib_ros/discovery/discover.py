@@ -364,7 +364,8 @@ class _Search:
         if motion is None:
             return None
         self._readings = Readings(motion, position)
-        return frames.choose(self._readings, reference, None if known is None else known.T)
+        is_known = placed is not None and bool(placed.source) and self._known_reference_position(reference) is not None
+        return frames.choose(self._readings, reference, None if known is None else known.T, is_known)
 
     def _take(
         self,
@@ -394,15 +395,15 @@ class _Search:
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
         if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
-            left, _ = self._readings.registered(reading, np.eye(3))
-            turned_left, rotation = self._readings.registered(reading, None)
+            left = self._readings.registered(reading, np.eye(3)).left
+            turned_left, rotation, *_ = self._readings.registered(reading, None)
             if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(left):
                 agree = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)
                 # a roll that a level vehicle hardly shows is none, unless the data need it
                 level = (0.0, *rpy[1:])
-                level_left, _ = self._readings.registered(reading, rotation_from_rpy(level).T)
+                level_left, *_ = self._readings.registered(reading, rotation_from_rpy(level).T)
                 self._mounting_found(level if BETTER * level_left <= turned_left else rpy, agree)
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
@@ -427,7 +428,7 @@ class _Search:
             too_little or claims_none or says_nothing or (may_claim_less and most > max(least * per_axis, QUIETEST))
         ):
             return
-        best, _ = self._readings.registered(chosen.reading, None if known is None else known.T)
+        best, *_ = self._readings.registered(chosen.reading, None if known is None else known.T)
         shown = max(max(min(best, chosen.best_left), least) * per_axis, QUIETEST)
         too_much = may_claim_less and most > shown
         if not (too_much or too_little or claims_none or says_nothing):

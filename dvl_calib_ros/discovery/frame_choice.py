@@ -31,6 +31,7 @@ from ..calibration.registration.frame_hypotheses import (
     ImuFrame,
     Reading,
     Readings,
+    Registered,
     nominal_rpy,
     turns_right,
 )
@@ -70,6 +71,8 @@ GRAVITY_INVERTED, GRAVITY_CONTRADICTS = math.log(1 / 100), math.log(1 / 1000)
 FAR_WORSE, MOST_REGISTERED = 8.0, 6
 # Two readings within these odds fit as well, rad and log.
 AS_LIKELY, SAME_ANSWER = math.log(2.0), math.radians(1.0)
+# Lever arms of transforms are good to this (1 σ, m); an arm that is wrong costs no more (chi-square).
+ARM_STD_M, MOST_OF_ARM = 0.1, 12.0
 # A mounting is not as the body from here on, rad.
 TURNED_FROM = math.radians(12.0)
 # Over this time (s) a twist is held against the way of its own pose.
@@ -261,8 +264,14 @@ class FrameChooser:
 
     # ------------------------------------------------------------------ posterior
 
-    def choose(self, readings: Readings, reference: Look, mounting: Array | None) -> FrameChoice | None:
-        """Return the likeliest reading; None if none can be tried. mounting: rotation_dvl_from_body (3, 3) if known."""
+    def choose(
+        self, readings: Readings, reference: Look, mounting: Array | None, arm_is_known: bool
+    ) -> FrameChoice | None:
+        """Return the likeliest reading; None if none can be tried.
+
+        mounting: rotation_dvl_from_body (3, 3), None if it is not known. arm_is_known: whether transforms say the
+        lever arm.
+        """
         priors: dict[Reading, float] = {}
         as_declared: dict[Reading, bool] = {}
         imus: dict[Reading, ImuHypothesis | None] = {}
@@ -309,10 +318,10 @@ class FrameChooser:
         if likely == [expected] and expected.mounting is mounting:
             return FrameChoice(expected.agreement, imus[expected.reading], says)
         fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
-        likelihoods = readings.log_likelihoods([left for left, _ in fits.values()])
+        likelihoods = readings.log_likelihoods([fit.left for fit in fits.values()])
         odds = {
-            each: each.odds(rotation) + likelihood
-            for (each, (_, rotation)), likelihood in zip(fits.items(), likelihoods, strict=True)
+            each: each.odds(fit.rotation_dvl_from_body) + (_arm_odds(fit) if arm_is_known else 0.0) + likelihood
+            for (each, fit), likelihood in zip(fits.items(), likelihoods, strict=True)
         }
         best, *others = sorted(likely, key=lambda each: -odds[each])
         alike = [each for each in others if odds[each] > odds[best] - AS_LIKELY]
@@ -320,7 +329,10 @@ class FrameChooser:
             one, other = (self._options(each.reading, imus[each.reading]) for each in (best, rival))
             other_axes = any(one[name] != other[name] for name in ("dvl_axes", "base_axes"))
             in_body = best.reading.in_body and rival.reading.in_body  # where the IMU's frame turns the lever arm alone
-            if other_axes or (not in_body and angle_between(fits[best][1], fits[rival][1]) > SAME_ANSWER):
+            if other_axes or (
+                not in_body
+                and angle_between(fits[best].rotation_dvl_from_body, fits[rival].rotation_dvl_from_body) > SAME_ANSWER
+            ):
                 taken, instead = (
                     " and ".join(f"{name} {this[name]}" for name in this if one[name] != other[name]) or "the mounting"
                     for this in (one, other)
@@ -328,7 +340,7 @@ class FrameChooser:
                 says += (finding("FRAMES_AMBIGUOUS", taken=taken, other=instead),)
                 break
         if mounting is not None and best.mounting is None:
-            given, fitting = in_degrees(rpy_from_rotation(mounting.T)), nominal_rpy(fits[best][1].T)
+            given, fitting = in_degrees(rpy_from_rotation(mounting.T)), nominal_rpy(fits[best].rotation_dvl_from_body.T)
             said = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting)}
             says += (finding("MOUNTING_CONTRADICTED", **said),)
         return FrameChoice(best.agreement, imus[best.reading], says)
@@ -342,6 +354,12 @@ class FrameChooser:
             "dvl_axes": FRD if reading.turned != z_down else FLU,
             "imu_frame": IMU_ENU if imu is None else imu.frame.world,
         }
+
+
+def _arm_odds(fit: Registered) -> float:
+    """Return the log odds of the lever arm of a fit, where transforms give another."""
+    variance = ARM_STD_M**2 + fit.arm_std**2
+    return -0.5 * min(float((fit.arm**2 / variance).sum()), MOST_OF_ARM)
 
 
 def declared_reference(reference: Look, parameters: Parameters, base_frame: str) -> DeclaredFrame | None:

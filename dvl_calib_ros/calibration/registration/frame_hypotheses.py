@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,7 +33,7 @@ from ..streams.imu_frame import ENU_FROM, quaternion_product
 from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from .configuration_check import DRAWN, angle_between, misfit, nearest
 from .earth_frame_velocity import Directions
-from .gauss_newton import FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
+from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
 from .motion_streams import GAP_S, Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at
 
@@ -123,6 +124,22 @@ class Agreement:
         return angle_between(self.rotation_dvl_from_body, np.eye(3))
 
 
+class Registered(NamedTuple):
+    """A reading that is registered.
+
+    left: residual, as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, the lever arm less the
+    one that is known, and its σ.
+    """
+
+    left: float
+    rotation_dvl_from_body: Array
+    arm: Array
+    arm_std: Array
+
+
+NOT_REGISTERED = Registered(math.inf, np.eye(3), np.zeros(3), np.full(3, math.inf))
+
+
 class Readings:
     """What a motion is, read in several ways.
 
@@ -205,37 +222,39 @@ class Readings:
         # turned over fit the same
         return sorted(found, key=lambda each: round(each.left + (0.02 * each.angle if known is None else 0.0), 9))
 
-    def registered(self, reading: Reading, rotation_dvl_from_body: Array | None) -> tuple[float, Array]:
-        """What a reading leaves with the lever arm and the DVL's delay that suit it best, as a share of the speed; and
-        its rotation_dvl_from_body (3, 3). The reference is in time: late on a circle it is any yaw at all.
+    def registered(self, reading: Reading, rotation_dvl_from_body: Array | None) -> Registered:
+        """Register a reading with the lever arm and the DVL's delay that suit it best.
 
-        rotation_dvl_from_body: the mounting, which stands but for a small misalignment; None to find it. Of a rotation
+        The reference is in time: late on a circle it is any yaw at all.
+
+        rotation_dvl_from_body: the mounting, which is kept but for a small misalignment; None to find it. Of a rotation
         that is found and the same turned about the direction of travel, which a lever arm makes alike, that with the
         smaller angle is taken unless the other leaves clearly less.
         """
         turn = FLU_FROM_FRD if reading.turned else np.eye(3)
         motion = self._read(reading)
         if motion is None:
-            return math.inf, np.eye(3)
+            return NOT_REGISTERED
         if reading not in self._fits:
             self._fits[reading] = MotionFit(motion, self._position, Curves(motion), FEW_ROWS)
         fit = self._fits[reading]
 
-        def of(rotation: Array | None) -> tuple[float, Array]:
+        def of(rotation: Array | None) -> Registered:
             nominal = None if rotation is None else rotation.T @ turn
             found = nearest(fit, nominal, (REFERENCE,))
             if found is None:
-                return math.inf, np.eye(3)
+                return NOT_REGISTERED
             left = math.sqrt(float(_better(found.squares).mean())) / max(found.speed, 1e-9)
             given = found.rotation_body_from_dvl if nominal is None else nominal
-            return misfit(found, given, left), turn @ found.rotation_body_from_dvl.T
+            rotation_found = turn @ found.rotation_body_from_dvl.T
+            return Registered(misfit(found, given, left), rotation_found, found.x[ARM], found.std[ARM])
 
         if rotation_dvl_from_body is not None:
             return of(rotation_dvl_from_body)
         best = of(None)
-        turned = of(best[1] @ FLU_FROM_FRD)
-        upright, other = sorted((best, turned), key=lambda each: -float(np.trace(each[1])))
-        return other if other[0] < CLEARLY * upright[0] else upright
+        turned = of(best.rotation_dvl_from_body @ FLU_FROM_FRD)
+        upright, other = sorted((best, turned), key=lambda each: -float(np.trace(each.rotation_dvl_from_body)))
+        return other if other.left < CLEARLY * upright.left else upright
 
     def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
         """A rotation (3, 3) without what it turns about the direction of travel, unless the data need that."""
