@@ -70,7 +70,7 @@ def replay(
         merge=merge,
         with_history=history,
         mounting_is_guessed=bool(discovery.mounting_because),
-        objections=discovery.objections,
+        contradictions=discovery.contradictions,
     )
     return Calibration(replayed, discovery.with_mounting(replayed.result.parameters["mounting_rpy"]), tuple(paths))
 

@@ -23,13 +23,14 @@ from ..calibration.numerics.error_model import corrected_mounting
 from ..calibration.numerics.frames import whole_degrees
 from ..calibration.results.extrinsics import Extrinsics
 from ..calibration.results.held_out_verification import shown_misalignment
-from ..calibration.results.results import Result
+from ..calibration.results.results import Result, Verification
 from ..calibration.streams.stream_order import DROPOUT_NS
 from ..errors import InputError
 from ..files.mounting import load_extrinsics
 from ..recordings.recording import Recording, open_recording, together
 from ..recordings.topics import Topics
-from ..verdict.reasons import Reason, finding
+from ..verdict.kinds import Severity
+from ..verdict.reasons import Reason, finding, is_cause
 from .replay import Replayed, extrinsics_of_replay, replay
 
 # Files of one recording may overlap by what was on its way when the next began.
@@ -83,14 +84,14 @@ def checked_replay(
     merge: bool = False,
     with_history: bool = False,
     mounting_is_guessed: bool = False,
-    objections: Sequence[Reason] = (),
+    contradictions: Sequence[Reason] = (),
 ) -> Replayed:
     """`replay`, after several recordings, or an initial calibration, have been held against each other.
 
     merge: take several recordings together even if the mounting moved between them; that stays a note, not the verdict.
     What `initial_calibration` says is left out, and said to be, if the data contradict it. mounting_is_guessed: nobody
-    told mounting_rpy; of a mounting far from it none is misaligned: it is taken, and all is done once more. objections:
-    what the discovery has against its result.
+    told mounting_rpy; of a mounting far from it none is misaligned: it is taken, and all is done once more. contradictions:
+    those of the discovery, of which some bear on the verdict.
     Raises InputError.
     """
     topics = topics or Topics()
@@ -109,13 +110,26 @@ def checked_replay(
     if mounting_is_guessed and (rpy := _mounting_found(replayed.result)) is not None:
         better = parameters.replace(mounting_rpy=rpy)
         return checked_replay(
-            recording, better, topics, on_progress, merge=merge, with_history=with_history, objections=objections
+            recording,
+            better,
+            topics,
+            on_progress,
+            merge=merge,
+            with_history=with_history,
+            contradictions=contradictions,
         )
-    if objections:
+    if contradictions:
         result = replayed.result
-        judged = {name: each.with_objections(objections) for name, each in result.verifications.items()}
+        judged = {name: _contradicted(each, contradictions) for name, each in result.verifications.items()}
         replayed = replace(replayed, result=replace(result, verifications=judged))
     return replayed if recordings is None else _judged(replayed, recordings, merge)
+
+
+def _contradicted(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
+    """With frames that the data do not settle; and with the cause, where a calibration is rejected anyhow."""
+    is_rejected = verification.verdict is Severity.REJECT
+    said = [each for each in contradictions if each.severity is Severity.MARGINAL or (is_rejected and is_cause(each))]
+    return verification.with_objections(said) if said else verification
 
 
 def _mounting_found(result: Result) -> tuple[float, float, float] | None:

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
             merge=arguments.merge,
             with_history=arguments.report is not None,
             mounting_is_guessed=bool(discovery.mounting_because),
-            objections=discovery.objections,
+            contradictions=discovery.contradictions,
         )
     result = replayed.result
     if asked and not any(name in result.estimates for name in asked):

@@ -39,6 +39,7 @@ from .clock_offsets import compared_motion, difference_of, in_time
 from .discovery import (
     Discovery,
     Given,
+    as_option,
     clocks_of_recording,
     in_degrees,
     in_metres,
@@ -218,8 +219,8 @@ class _Search:
             self._contradictions += chosen.says
             self._take(agreement, known, reference, imu)
             self._measure_noise(agreement, known, dvl, reference)
-        elif reference is None and known is None:
-            self._mounting_from_motion(dvl, turned)
+        elif reference is None:
+            self._mounting_from_motion(dvl, turned, known)
         if taken is not None:
             self._take_imu(taken.frame)
         parameters = self._parameters.replace(base_axes=FRD if self._is_z_down else FLU)
@@ -459,8 +460,11 @@ class _Search:
         self._mounting_because = why
         self._notes.append(mounting_guessed(rpy, why))
 
-    def _mounting_from_motion(self, dvl: Look, turned: bool) -> None:
-        """Without a reference: a vehicle goes ahead, which is what the models without GNSS go by as well."""
+    def _mounting_from_motion(self, dvl: Look, turned: bool, known: Array | None) -> None:
+        """Without a reference: a vehicle goes ahead, which is what the models without GNSS go by as well.
+
+        known: rotation_body_from_dvl (3, 3), None if nothing says it.
+        """
         velocity = dvl.values @ FLU_FROM_FRD if turned else dvl.values
         if not len(velocity):
             return
@@ -470,7 +474,13 @@ class _Search:
         ahead = np.tile([np.linalg.norm(mean), 0.0, 0.0], (2, 1))
         rotation_dvl_from_body = best_rotation(np.tile(mean, (2, 1)), ahead, np.eye(3))
         yaw = math.atan2(rotation_dvl_from_body[0, 1], rotation_dvl_from_body[0, 0])
-        if abs(yaw) > OTHER_MOUNTING:
+        if known is not None:
+            ahead_in_body = known @ mean
+            if abs(ahead_in_body[1]) > abs(ahead_in_body[0]) and not self._gives("mounting_rpy"):
+                given, fits = in_degrees(rpy_from_rotation(known)), nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
+                said = {"given": given, "found": in_degrees(fits), "option": as_option(fits)}
+                self._contradictions.append(finding("TRAVELS_SIDEWAYS", **said))
+        elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "where the vehicle goes ahead")
 
     def _reference_position(self, reference: Look) -> Array:

@@ -14,7 +14,6 @@ from ..calibration.registration.frame_hypotheses import Agreement
 from ..recordings.recording import Recording
 from ..recordings.topic_preview import Look
 from ..recordings.topics import Topics
-from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import FoundClocks, find_clocks
 
@@ -71,11 +70,6 @@ class Discovery:
             values={**self.values, "mounting_rpy": roll_pitch_yaw},
             notes=tuple(again if note.code == again.code else note for note in self.notes),
         )
-
-    @property
-    def objections(self) -> tuple[Reason, ...]:
-        """What keeps a calibration from being accepted: frames of which the data fit two."""
-        return tuple(each for each in self.contradictions if each.severity is Severity.MARGINAL)
 
     @property
     def doubts(self) -> tuple[str, ...]:

@@ -188,7 +188,7 @@ def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | No
             discovery.parameters,
             discovery.topics,
             mounting_is_guessed=guessed,
-            objections=discovery.objections,
+            contradictions=discovery.contradictions,
         )
     except InputError as error:
         return None, str(error).rstrip(".")

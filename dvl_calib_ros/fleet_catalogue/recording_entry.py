@@ -103,7 +103,7 @@ def _calibrated(task: Task, path: Any) -> Entry:
         found.parameters,
         found.topics,
         mounting_is_guessed=bool(found.mounting_because),
-        objections=found.objections,
+        contradictions=found.contradictions,
     )
     return entry_of_replay(replayed, task.recording.name)
 

@@ -261,6 +261,12 @@ CONFIGURATIONS = (
         "try -p mounting_rpy:={option}",
     ),
     _Said(
+        "TRAVELS_SIDEWAYS",
+        "with the mounting {given} the vehicle travels sideways; it goes ahead with {found}",
+        "A transform whose yaw has the wrong sign does that, or a vehicle that drifts.",
+        "try -p mounting_rpy:={option}",
+    ),
+    _Said(
         "FRAMES_AMBIGUOUS",
         "the data fit {taken} and, as well, {other}; the first is taken",
         "Both explain the data, and give another mounting. Which side is port on the DVL, and in which axes is the "

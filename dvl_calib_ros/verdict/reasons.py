@@ -113,12 +113,17 @@ def finding(code: str, **numbers: object) -> Reason:
     return found
 
 
-_CAUSES = ("FRAMES_AMBIGUOUS", "CONFIGURATION_WRONG")
+_CAUSES = ("FRAMES_AMBIGUOUS", "MOUNTING_CONTRADICTED", "TRAVELS_SIDEWAYS", "CONFIGURATION_WRONG", "GRAVITY_")
+
+
+def is_cause(reason: Reason) -> bool:
+    """Return whether a reason is of frames or clocks, which make most of the others."""
+    return reason.code.startswith(_CAUSES)
 
 
 def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
     """The worst first; of one severity frames and clocks first, as causes of the others, else as they came in."""
-    return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), each.code not in _CAUSES))
+    return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), not is_cause(each)))
 
 
 def table(kinds: Iterable[Kind]) -> str:

@@ -94,7 +94,7 @@ def test_two_readings_that_fit_as_well_are_both_said_and_the_answer_is_marginal(
     odometry(told, np.eye(3), pose=False)
     bag = told.write(tmp_path / "bag")
     told_axes = replay(bag, dvl_axes="frd", gnss_frame="body")
-    assert not told_axes.discovery.objections
+    assert "FRAMES_AMBIGUOUS" not in codes(told_axes.discovery.contradictions)
     assert is_right(told_axes, truth_deg())
 
 
@@ -124,8 +124,8 @@ def test_a_yaw_of_the_wrong_sign_in_a_transform_is_named_and_its_remedy_works(tm
     told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, quarter), LEVER_ARM))
     bag = told.write(tmp_path / "bag")
     wrong = doctor(bag)
-    assert wrong.verdict == "no" and wrong.reasons[0].code == "CONFIGURATION_WRONG"
-    assert "mounting_rpy to [0, 0, -2.356]" in wrong.reasons[0].sentence
+    assert wrong.verdict == "no" and wrong.reasons[0].code == "MOUNTING_CONTRADICTED"
+    assert "mounting_rpy:=[0deg,0deg,-135deg]" in wrong.reasons[0].sentence
     mended = replay(bag, mounting_rpy=(0.0, 0.0, -quarter))
     assert mended.verdict != "reject"
     assert is_right(mended, truth_deg((0.0, 0.0, -quarter)), (2.0, 2.0, 0.5))

@@ -127,8 +127,8 @@ class Agreement:
 class Registered(NamedTuple):
     """A reading that is registered.
 
-    left: residual, as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, the lever arm less the
-    one that is known, and its σ.
+    left: residual, as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, the lever arm less
+    the one that is known, and its σ.
     """
 
     left: float
