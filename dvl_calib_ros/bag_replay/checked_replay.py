@@ -90,8 +90,8 @@ def checked_replay(
 
     merge: take several recordings together even if the mounting moved between them; that stays a note, not the verdict.
     What `initial_calibration` says is left out, and said to be, if the data contradict it. mounting_is_guessed: nobody
-    told mounting_rpy; of a mounting far from it none is misaligned: it is taken, and all is done once more. contradictions:
-    those of the discovery, of which some bear on the verdict.
+    told mounting_rpy; of a mounting far from it none is misaligned: it is taken, and all is done once more.
+    contradictions: those of the discovery, of which some bear on the verdict.
     Raises InputError.
     """
     topics = topics or Topics()

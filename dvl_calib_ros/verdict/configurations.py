@@ -82,7 +82,7 @@ CONFIGURATIONS = (
         "IMU_LOOKS_NED",
         "the IMU's orientation looks like NED, forward-right-down",
         "The data fit much better with the orientation taken so.",
-        "set imu_frame to ned",
+        "set imu_frame to ned and imu_rpy to [3.1416, 0, 0]",
     ),
     _Said(
         "IMU_NO_RATES",
