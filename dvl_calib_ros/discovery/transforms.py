@@ -166,7 +166,8 @@ def placement(tree: FrameTree, frames: Frames, parameters: Parameters, given: Co
     if "mounting_rpy" not in given:
         values["mounting_rpy"] = _numbers(rpy_from_rotation(placed.rotation))
         said.append("mounting " + " ".join(f"{math.degrees(angle):.4g}°" for angle in values["mounting_rpy"]))
-        if frames.points_down and placed.rotation[2, 2] < 0.0 and parameters.dvl_axes == FROM_MESSAGE:
+        is_drivers = frames.points_down and placed.rotation[2, 2] < 0.0 and not parameters.is_z_down
+        if is_drivers and parameters.dvl_axes == FROM_MESSAGE:
             values["dvl_axes"] = FLU  # the transform is of the driver's own axes, which the data are in
     if "lever_arm" not in given:
         reference = tree.placed(frames.reference, parameters.base_frame) if frames.reference else None
