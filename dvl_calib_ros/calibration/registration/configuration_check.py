@@ -158,7 +158,8 @@ def _wrong_axes(
     for signs in SIGNS:
         quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FEW_ROWS)
         near = nearest(quick, nominal, (REFERENCE,), FAR_WORSE * most)
-        if near is not None:
+        # axes turned over, and turned back by the fit, are those as given
+        if near is not None and _shown_turn(near.rotation_body_from_dvl, nominal, near.std[TURN]) < MISALIGNED:
             found.append((near.level, signs, near))
     if not found:
         return None
