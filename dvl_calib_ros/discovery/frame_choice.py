@@ -51,7 +51,7 @@ from .transforms import Placed
 IMU_IN_NED, IMU_IN_OTHER_WORLD, IMU_OTHERWISE = math.log(1 / 10), math.log(1 / 20), math.log(1 / 50)
 DVL_AXES_OTHER = math.log(1 / 20)
 # Where no transform says anything, marine axes are nearly as common as REP-103's.
-UNPLACED_IN_NED, UNPLACED_DVL_AXES_OTHER = math.log(1 / 4), math.log(1 / 10)
+UNPLACED_IN_NED = math.log(1 / 4)
 # A transform or parameter of the mounting that is wrong; a mounting nobody says that is not as the body; one upside
 # down, which is the same as other axes.
 MOUNTING_OTHER, MOUNTING_TURNED, UPSIDE_DOWN = math.log(1 / 50), math.log(1 / 3), math.log(1 / 100)
@@ -120,8 +120,10 @@ class _Tried:
         is_misaligned = known is not None and angle_between(of_best, known) < TURNED_FROM
         return self.agreement.best_left if is_misaligned else self.agreement.left
 
-    def odds(self, found: Array) -> float:
-        """Return the prior with that of the mounting (3, 3) that fits, where none is known, and of the travel."""
+    @property
+    def odds(self) -> float:
+        """The prior with that of the mounting that fits, where none is known, and of the travel."""
+        found = self.agreement.rotation_dvl_from_body
         prior = self.prior + (0.0 if self.agreement.is_ahead else SIDEWAYS)
         if self.mounting is None and angle_between(found, np.eye(3)) > TURNED_FROM:
             prior += UPSIDE_DOWN if found[2, 2] < 0.0 else MOUNTING_TURNED
@@ -285,8 +287,7 @@ class FrameChooser:
                     priors[reading] = prior + (0.0 if imu is None else imu.prior)
                     as_declared[reading] = declared
                     if turned != declared:
-                        is_placed = self._dvl_placed is not None
-                        priors[reading] += DVL_AXES_OTHER if is_placed else UNPLACED_DVL_AXES_OTHER
+                        priors[reading] += DVL_AXES_OTHER
         found = readings.agreements(list(priors), mounting)
         declared_frame = declared_reference(reference, self._parameters, self._base_frame)
         in_earth = declared_frame is not None and declared_frame.frame is not VelocityFrame.BODY
@@ -300,10 +301,7 @@ class FrameChooser:
                 for each in free
                 if angle_between(each.rotation_dvl_from_body, mounting) > TURNED_FROM
             ]
-        first = {
-            each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.left)
-            for each in tried
-        }
+        first = {each: each.odds + readings.log_likelihood(each.left) for each in tried}
         ranked = sorted(tried, key=lambda each: -first[each])
         says: tuple[Reason, ...] = ()
         if in_earth:
@@ -318,10 +316,9 @@ class FrameChooser:
         if likely == [expected] and expected.mounting is mounting:
             return FrameChoice(expected.agreement, imus[expected.reading], says)
         fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
-        likelihoods = readings.log_likelihoods([fit.left for fit in fits.values()])
         odds = {
-            each: each.odds(fit.rotation_dvl_from_body) + (_arm_odds(fit) if arm_is_known else 0.0) + likelihood
-            for (each, fit), likelihood in zip(fits.items(), likelihoods, strict=True)
+            each: each.odds + (_arm_odds(fit) if arm_is_known else 0.0) + readings.log_likelihood_registered(fit.left)
+            for each, fit in fits.items()
         }
         best, *others = sorted(likely, key=lambda each: -odds[each])
         alike = [each for each in others if odds[each] > odds[best] - AS_LIKELY]

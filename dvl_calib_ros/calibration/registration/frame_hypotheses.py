@@ -50,9 +50,8 @@ CLEARLY = 0.5
 FITS = 0.3
 # Data need a turn about the direction of travel if it leaves less than this share.
 ROLLED = 0.8
-# Independent samples of three axes that a comparison counts for, and rows of a registration for each more of them; a
-# residual below this share of the speed is none.
-INDEPENDENT, ROWS_A_SAMPLE, LEAST_LEFT = 4.0, 10.0, 0.005
+# Independent samples of three axes that a comparison counts for. A residual below this share of the speed is none.
+INDEPENDENT, LEAST_LEFT = 4.0, 0.005
 # A mean velocity to the side below this share of the speed is none that a vehicle travels by.
 SIDEWAYS = 0.5
 # Turn rates below this (rad/s) do not say which way a body's axes point.
@@ -168,22 +167,16 @@ class Readings:
         return math.sqrt(max(left**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
 
     def log_likelihood(self, left: float) -> float:
-        """Return the tempered log likelihood of what a comparison leaves, as a share of the speed.
+        """Return the tempered log likelihood of a residual, as a share of the speed, beside the reference's noise.
 
-        What it misses of arms, delays and waves is alike from sample to sample, so few of them count.
+        What a comparison misses of arms, delays and waves is alike from sample to sample, so few of them count.
         """
-        return -3.0 * INDEPENDENT * math.log(max(self.beside_noise(left), LEAST_LEFT))
+        return self.log_likelihood_registered(self.beside_noise(left))
 
-    def log_likelihoods(self, left: Sequence[float]) -> list[float]:
-        """Return the tempered log likelihoods of what registrations leave, as shares of the speed.
-
-        Where the best leaves little but the reference's white noise, a tenth of its samples count. What else it leaves
-        is alike from sample to sample, and few do.
-        """
-        least = max(min(left), LEAST_LEFT)
-        white = min(1.0, 1.0 - (self.beside_noise(least) / least) ** 2)
-        n = INDEPENDENT + white * min(len(self._motion.reference), FEW_ROWS) / ROWS_A_SAMPLE
-        return [-3.0 * n * math.log(max(each, LEAST_LEFT)) for each in left]
+    @staticmethod
+    def log_likelihood_registered(left: float) -> float:
+        """Return the same of a registration, which is compared with its noise."""
+        return -3.0 * INDEPENDENT * math.log(max(left, LEAST_LEFT))
 
     def agreements(self, readings: Sequence[Reading], rotation_dvl_from_body: Array | None) -> list[Agreement]:
         """All readings that can be tried, the best first, with clocks in time and no other lever arm.
@@ -228,8 +221,8 @@ class Readings:
         The reference is in time: late on a circle it is any yaw at all.
 
         rotation_dvl_from_body: the mounting, which is kept but for a small misalignment; None to find it. Of a rotation
-        that is found and the same turned about the direction of travel, which a lever arm makes alike, that with the
-        smaller angle is taken unless the other leaves clearly less.
+        that is found and the same turned about the direction of travel, which a lever arm makes alike, the upright one
+        is taken unless the other leaves clearly less.
         """
         turn = FLU_FROM_FRD if reading.turned else np.eye(3)
         motion = self._read(reading)
@@ -253,7 +246,7 @@ class Readings:
             return of(rotation_dvl_from_body)
         best = of(None)
         turned = of(best.rotation_dvl_from_body @ FLU_FROM_FRD)
-        upright, other = sorted((best, turned), key=lambda each: -float(np.trace(each.rotation_dvl_from_body)))
+        upright, other = sorted((best, turned), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
         return other if other.left < CLEARLY * upright.left else upright
 
     def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
