@@ -73,6 +73,8 @@ FAR_WORSE, MOST_REGISTERED = 8.0, 6
 AS_LIKELY, SAME_ANSWER = math.log(2.0), math.radians(1.0)
 # Lever arms of transforms are good to this (1 σ, m); an arm that is wrong costs no more (chi-square).
 ARM_STD_M, MOST_OF_ARM = 0.1, 12.0
+# A mounting whose z is down by this (cosine) is upside down; between, its roll is not shown.
+OVER = -0.9
 # A mounting is not as the body from here on, rad.
 TURNED_FROM = math.radians(12.0)
 # Over this time (s) a twist is held against the way of its own pose.
@@ -120,13 +122,11 @@ class _Tried:
         is_misaligned = known is not None and angle_between(of_best, known) < TURNED_FROM
         return self.agreement.best_left if is_misaligned else self.agreement.left
 
-    @property
-    def odds(self) -> float:
-        """The prior with that of the mounting that fits, where none is known, and of the travel."""
-        found = self.agreement.rotation_dvl_from_body
+    def odds(self, found: Array) -> float:
+        """Return the prior with that of the mounting (3, 3) that fits, where none is known, and of the travel."""
         prior = self.prior + (0.0 if self.agreement.is_ahead else SIDEWAYS)
         if self.mounting is None and angle_between(found, np.eye(3)) > TURNED_FROM:
-            prior += UPSIDE_DOWN if found[2, 2] < 0.0 else MOUNTING_TURNED
+            prior += UPSIDE_DOWN if found[2, 2] < OVER else MOUNTING_TURNED
         return prior
 
 
@@ -301,7 +301,10 @@ class FrameChooser:
                 for each in free
                 if angle_between(each.rotation_dvl_from_body, mounting) > TURNED_FROM
             ]
-        first = {each: each.odds + readings.log_likelihood(each.left) for each in tried}
+        first = {
+            each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.left)
+            for each in tried
+        }
         ranked = sorted(tried, key=lambda each: -first[each])
         says: tuple[Reason, ...] = ()
         if in_earth:
@@ -317,7 +320,9 @@ class FrameChooser:
             return FrameChoice(expected.agreement, imus[expected.reading], says)
         fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
         odds = {
-            each: each.odds + (_arm_odds(fit) if arm_is_known else 0.0) + readings.log_likelihood_registered(fit.left)
+            each: each.odds(fit.rotation_dvl_from_body)
+            + (_arm_odds(fit) if arm_is_known else 0.0)
+            + readings.log_likelihood_registered(fit.left)
             for each, fit in fits.items()
         }
         best, *others = sorted(likely, key=lambda each: -odds[each])
