@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from .arm_clock_ambiguity import (
     moved_arm,
     moved_lag,
     opened_arm,
+    told_apart,
     with_arm,
     with_clocks,
 )
@@ -66,7 +67,7 @@ def identify_effects(
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
     opened = opened_arm(guesses) if ARM in fit.values else None
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened)
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened, told_apart(guesses))
     selected = [_or_else(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
     rivals = [one for each in selected if opened is not None and each.effect.name in CLOCKS for one in each.rivals]
     freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), opened)
@@ -127,11 +128,13 @@ def _clock_or_arm(
     n_effects: int,
     called_for: Sequence[Effect],
     opened: OpenArm | None,
+    known: Collection[str] = (),
 ) -> list[Selected]:
     """Lever arm and clock as one where each would do without the other.
 
     called_for: what the data calls for; a further clock that only stands beside the arm is named where it is shown.
     opened: as `opened_arm` has it; a clock of the reference that is no later than that is not shown.
+    known: as `told_apart` has it; an insignificant arm cannot stand in for such a clock.
     """
     threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
 
@@ -152,6 +155,8 @@ def _clock_or_arm(
     selected = [each for each in selected if each not in beside]
     if is_shown(arm) and is_shown(clock):
         return selected
+    if is_shown(clock) and clock.effect.name in known and arm.log_p > threshold:
+        return [each for each in selected if each is not arm]
     one, other = (arm, clock) if is_shown(arm) else (clock, arm)
     rest = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
     without = fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
