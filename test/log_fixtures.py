@@ -62,15 +62,26 @@ def dataflash(path: Path) -> Path:
     return path
 
 
-def pd0(i: int, heading: int, pitch: int, roll: int, nmea: Sequence[bytes] = ()) -> bytes:
-    """An ensemble of each 0.1 s. nmea: what `general_nmea` gives."""
+def pd0(
+    i: int,
+    heading: int,
+    pitch: int,
+    roll: int,
+    nmea: Sequence[bytes] = (),
+    velocity: Sequence[int] = (10, -1500, 0, 0),
+    axes: int = 2 << 3,
+    alignment: int = 0,
+) -> bytes:
+    """An ensemble of each 0.1 s. nmea: what `general_nmea` gives. velocity: mm/s. axes: EX. alignment: EA, 0.01 deg."""
     fixed, variable, bottom = bytearray(59), bytearray(65), bytearray(81)
-    fixed[25] = 2 << 3
+    fixed[25] = axes
+    struct.pack_into("<h", fixed, 26, alignment)
+    minute, hundredths = divmod(1500 + 10 * i, 6000)
     struct.pack_into("<H", variable, 0, 0x0080)
-    variable[4:11] = bytes([25, 11, 21, 10, 30, 15 + i // 10, 10 * (i % 10)])
+    variable[4:11] = bytes([25, 11, 21, 10, 30 + minute, hundredths // 100, hundredths % 100])
     struct.pack_into("<H2h", variable, 18, heading, pitch, roll)
     struct.pack_into("<H", bottom, 0, 0x0600)
-    struct.pack_into("<4h", bottom, 24, 10, -1500, 0, 0)
+    struct.pack_into("<4h", bottom, 24, *velocity)
     parts = [bytes(fixed), bytes(variable), bytes(bottom), *nmea]
     offsets, at = [], 6 + 2 * len(parts)
     for part in parts:

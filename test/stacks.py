@@ -42,21 +42,21 @@ def motion() -> Motion:
     return make_motion("free", SECONDS, 100.0, rng)
 
 
-@cache
-def positions() -> Array:
-    """East, north, up (N, 3) m at `motion`'s times."""
-    m = motion()
+def positions(m: Motion | None = None) -> Array:
+    """East, north, up (N, 3) m at a motion's times, of `motion` if none is given."""
+    m = m or motion()
     velocity = np.einsum("nij,nj->ni", m.rotation_enu_from_body, m.velocity_body)
     return np.cumsum(velocity, axis=0) * 0.01
 
 
 @dataclass
 class Told:
-    """Writes one vehicle's messages. version: of dvl_msgs."""
+    """Writes one vehicle's messages. version: of dvl_msgs. motion: at 100 Hz."""
 
     version: str = "first"
     rows: list[Row] = field(default_factory=list)
     seed: int = 5
+    motion: Motion = field(default_factory=motion)
 
     def __post_init__(self) -> None:
         self.make = Maker(self.version)
@@ -68,7 +68,7 @@ class Told:
     def every(self, rate_hz: float, phase_s: float = 0.0) -> list[tuple[int, int]]:
         """Places in the motion and stamps of a sensor."""
         step = round(100.0 / rate_hz)
-        return [(i, START_NS + i * 10_000_000) for i in range(round(phase_s * 100), len(motion().time), step)]
+        return [(i, START_NS + i * 10_000_000) for i in range(round(phase_s * 100), len(self.motion.time), step)]
 
     def say(self, stamp_ns: int, topic: str, kind: str, message: Any, late_ns: int = 3_000_000) -> None:
         self.rows.append((stamp_ns + late_ns, topic, kind, message))
@@ -77,7 +77,7 @@ class Told:
 
     def dvl_velocity(self, i: int, mounting_rpy: tuple[float, ...]) -> Array:
         """What the DVL measures in its forward-left-up axes, m/s."""
-        m = motion()
+        m = self.motion
         at_dvl = m.velocity_body[i] + cross(m.angular_velocity[i], np.array(LEVER_ARM))
         body_from_dvl = true_mounting(mounting_rpy)
         return body_from_dvl.T @ at_dvl + self.rng.normal(0.0, DVL_STD, 3)
@@ -110,7 +110,7 @@ class Told:
         std: float = GNSS_STD,
     ) -> None:
         """The velocity of the body's origin, axes: enu, ned or body."""
-        m = motion()
+        m = self.motion
         for i, stamp in self.every(rate_hz, 0.04):
             velocity = m.velocity_body[i]
             if axes != "body":
@@ -131,7 +131,7 @@ class Told:
         orientation: bool = True,
     ) -> None:
         """An IMU. mounting: rotation_body_from_imu of the axes in which it gives its data."""
-        m = motion()
+        m = self.motion
         body_from_imu = np.eye(3) if mounting is None else mounting
         world_from_enu = ENU_FROM_NED.T if world == "ned" else np.eye(3)
         each = self.every(rate_hz)
@@ -146,11 +146,14 @@ class Told:
                 message.orientation_covariance = np.array([-1.0, *[0.0] * 8])
             self.say(stamp, topic, IMU, message)
 
-    def fixes(self, topic: str, frame: str, rate_hz: float, std: float) -> None:
-        """Positions of satellites."""
+    def fixes(
+        self, topic: str, frame: str, rate_hz: float, std: float, antenna: tuple[float, ...] = (0.0, 0.0, 0.0)
+    ) -> None:
+        """Positions of satellites. antenna: m, body."""
         east_m = METRES_PER_DEGREE * math.cos(math.radians(LATITUDE))
+        places = positions(self.motion) + self.motion.rotation_enu_from_body @ np.array(antenna)
         for i, stamp in self.every(rate_hz, 0.04):
-            east, north, up = positions()[i] + self.rng.normal(0.0, std, 3)
+            east, north, up = places[i] + self.rng.normal(0.0, std, 3)
             status = self.types("sensor_msgs/msg/NavSatStatus", 2, 1)
             message = self.types(
                 FIX,

@@ -49,14 +49,14 @@ def vehicle(z_down: bool, position=LEVER_ARM, dvl_rpy=(0.0, 0.0, 0.0), axes="enu
 def odometry(told: Told, axes, pose: bool) -> None:
     """An INS whose pose is that of a forward-left-up base_link in ENU, with its twist turned by axes (3, 3)."""
     m = motion()
-    quaternions = Rotation.from_matrix(m.rotation_enu_from_body).as_quat()
+    quaternions, places = Rotation.from_matrix(m.rotation_enu_from_body).as_quat(), positions()
     for i, stamp in told.every(10.0, 0.02):
         velocity = axes @ (m.velocity_body[i] + told.rng.normal(0.0, 0.01, 3))
         message = told.make.velocity(ODOMETRY, Sample(stamp, velocity, 1e-4 * np.eye(3)), "base_link")
         message.header.frame_id = "odom"
         if pose:
             p, q = message.pose.pose.position, message.pose.pose.orientation
-            (p.x, p.y, p.z), (q.x, q.y, q.z, q.w) = positions()[i].tolist(), quaternions[i].tolist()
+            (p.x, p.y, p.z), (q.x, q.y, q.z, q.w) = places[i].tolist(), quaternions[i].tolist()
         told.say(stamp, "/ins/odometry", ODOMETRY, message)
 
 

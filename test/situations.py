@@ -1,0 +1,241 @@
+"""Recordings of situations that users have reported, each with its fault and without it.
+
+The vehicles are those of `stacks`: the DVL is misaligned by `MISALIGNMENT`, and sits at `LEVER_ARM`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from log_fixtures import general_nmea, pd0, sentence
+from scipy.spatial.transform import Rotation
+from stacks import FIX, GNSS_STD, IMU, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, true_mounting
+
+import dvl_calib_ros
+from dvl_calib_ros.calibration.numerics.frames import Array
+from dvl_calib_ros.messages.decode import RESTAMP_ALL
+from dvl_calib_ros.simulation.trajectories import Motion, make_motion
+
+DVL, REFERENCE = "/dvl/velocity", "/gnss/velocity"
+KNOTS_PER_MPS = 1.0 / 0.514444
+# The surface before and after a dive, s.
+SURFACE_S = 60.0
+# Instrument coordinates, tilts used (EX of an ensemble).
+EX_INSTRUMENT = 0b01111
+SHIP_MPS, BED_MPS = 0.03, (0.10, 0.066, 0.0)
+
+
+def sound(told: Told, reference: bool = True, yaw: float = 0.0, said_yaw: float = 0.0) -> None:
+    """Tell of a vehicle with nothing wrong but a yaw (rad) of the DVL that its transform says otherwise."""
+    told.dvl(DVL, TWIST, "dvl_link", (0.0, 0.0, yaw))
+    told.imu("/imu/data", "base_link")
+    if reference:
+        told.reference(REFERENCE, TWIST, "enu", "enu")
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, said_yaw), LEVER_ARM))
+
+
+def meaningless_covariances(told: Told, wrong: bool) -> None:
+    """A driver that fills its covariance with random numbers up to 1 (m/s)²."""
+    sound(told)
+    for _, topic, _, message in told.rows:
+        if wrong and topic == DVL:
+            message.twist.covariance[[0, 7, 14]] = told.rng.random(3)
+
+
+def one_axis_negated(told: Told, wrong: bool) -> None:
+    """A driver whose z has the wrong sign."""
+    sound(told)
+    for _, topic, _, message in told.rows:
+        if wrong and topic == DVL:
+            message.twist.twist.linear.z *= -1.0
+
+
+def quaternion_components_mixed_up(told: Told, wrong: bool) -> None:
+    """An IMU driver that writes w, y, z, w in place of x, y, z, w."""
+    sound(told)
+    for _, _, kind, message in told.rows:
+        if wrong and kind == IMU:
+            q = message.orientation
+            q.x, q.y, q.z = q.w, q.y, q.z
+
+
+def reference_of_a_filter(told: Told, wrong: bool) -> None:
+    """An INS whose velocity is nine tenths this DVL's, with the nominal mounting; else it has not seen the DVL."""
+    m, held = told.motion, np.zeros(3)
+    for i, stamp in told.every(5.0):
+        measured = told.dvl_velocity(i, (0.0, 0.0, 0.0))
+        covariance = 1e-4 * np.eye(3)
+        told.say(stamp, DVL, TWIST, told.make.velocity(TWIST, Sample(stamp, measured, covariance), "dvl_link"))
+        own = m.velocity_body[i] + told.rng.normal(0.0, GNSS_STD, 3)
+        held = held + 0.5 * (0.9 * measured + 0.1 * own - held)
+        message = told.make.velocity(ODOMETRY, Sample(stamp, held if wrong else own, covariance), "base_link")
+        told.say(stamp + 4_000_000, "/ins/odom", ODOMETRY, message)
+    told.imu("/imu/data", "base_link")
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
+
+
+def wrong_transform_without_reference(told: Told, wrong: bool) -> None:
+    """A transform with the yaw of a DVL at 135 degrees the wrong way round, and nothing to compare with."""
+    yaw = math.radians(-135.0)
+    sound(told, reference=False, yaw=yaw, said_yaw=-yaw if wrong else yaw)
+
+
+def stamps_an_hour_ahead(told: Told, wrong: bool) -> None:
+    """A DVL whose stamps are by a clock in another time zone."""
+    sound(told)
+    for _, topic, _, message in told.rows:
+        if topic == DVL:
+            message.header.stamp.sec += 3600
+
+
+def antenna_on_a_mast(told: Told, wrong: bool) -> None:
+    """RTK positions of an antenna 2 m up that swings with the waves; all is told right."""
+    antenna, m = (-0.6, 0.0, 2.0), told.motion
+    swing = np.radians([7.0, 3.0]) * np.sin(2.0 * np.pi * m.time[:, None] / [3.3, 4.1])
+    yaw = Rotation.from_matrix(m.rotation_enu_from_body).as_euler("ZYX")[:, 0]
+    attitude = Rotation.from_euler("ZYX", np.column_stack([yaw, swing[:, 1], swing[:, 0]]))
+    rates = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(m.time)[:, None]
+    told.motion = replace(
+        m, rotation_enu_from_body=attitude.as_matrix(), angular_velocity=np.vstack([rates, rates[-1:]])
+    )
+    sound(told, reference=False)
+    told.fixes("/gps/fix", "gps_link", 5.0, 0.01, antenna)
+    told.tf_static(told.transform("base_link", "gps_link", (0.0, 0.0, 0.0), antenna))
+
+
+def fixes_around_a_dive(told: Told, wrong: bool) -> None:
+    """Satellite fixes of a minute before a dive and of a minute after it."""
+    sound(told, reference=False)
+    told.fixes("/gps/fix", "gps_link", 1.0, 0.3)
+    told.tf_static(told.transform("base_link", "gps_link", (0.0, 0.0, 0.0), (0.0, 0.0, 0.2)))
+    begin, end = told.rows[0][0] + 1e9 * SURFACE_S, told.rows[0][0] + 1e9 * (told.motion.time[-1] - SURFACE_S)
+    told.rows = [row for row in told.rows if row[2] != FIX or not begin < row[0] < end]
+
+
+def ensembles(path: Path, yaw_deg: float = 0.0, bed_mps: Array | None = None) -> Path:
+    """Import RDI ensembles with sentences of a ship's receiver and gyro; the ship is the body.
+
+    yaw_deg: of the DVL, which its setting EA says. bed_mps: (3,) east, north, up, of what its beams track.
+    """
+    m, rng, written = long_motion(), np.random.default_rng(6), bytearray()
+    body_from_dvl = true_mounting((0.0, 0.0, math.radians(yaw_deg)))
+    bed = np.zeros(3) if bed_mps is None else bed_mps
+    for i in range(0, len(m.time), 50):
+        enu_from_body = m.rotation_enu_from_body[i]
+        own = enu_from_body @ body_from_dvl
+        ahead, left, up = own.T @ (enu_from_body @ m.velocity_body[i] - bed) + rng.normal(0.0, 0.01, 3)
+        pitch, roll = math.asin(own[2, 0]), math.atan2(own[2, 1], own[2, 2])
+        tilt = math.degrees(math.atan(math.tan(pitch) / math.cos(roll)))
+        heading = math.degrees(math.atan2(enu_from_body[0, 0], enu_from_body[1, 0])) % 360.0
+        east, north, _ = enu_from_body @ m.velocity_body[i] + rng.normal(0.0, SHIP_MPS, 3)
+        course, knots = math.degrees(math.atan2(east, north)) % 360.0, math.hypot(east, north) * KNOTS_PER_MPS
+        written += pd0(
+            i // 10,
+            round(100.0 * heading) % 36000,
+            round(100.0 * tilt),
+            round(100.0 * math.degrees(roll)),
+            [
+                general_nmea(105, sentence(f"GPVTG,{course:.2f},T,,M,{knots:.3f},N,,K"), 0.0),
+                general_nmea(107, sentence(f"GPHDT,{heading:.2f},T"), 0.0),
+            ],
+            [round(-1000.0 * each) for each in (-left, ahead, up)] + [3],
+            EX_INSTRUMENT,
+            round(-100.0 * yaw_deg),
+        )
+    return imported(path, bytes(written))
+
+
+def lines(path: Path) -> Path:
+    """Import the lines of text (PD6) that a DVL with a compass writes."""
+    told, written = Told(motion=long_motion()), ""
+    ypr = np.degrees(Rotation.from_matrix(told.motion.rotation_enu_from_body).as_euler("ZYX"))
+    for i, stamp in told.every(4.0):
+        at = datetime.fromtimestamp(1e-9 * stamp, timezone.utc)
+        ahead, left, up = (1000.0 * told.dvl_velocity(i, (0.0, 0.0, 0.0))).tolist()
+        yaw, pitch, roll = ypr[i].tolist()
+        written += f":SA,{-pitch:+6.2f},{roll:+6.2f},{(90.0 - yaw) % 360.0:6.2f}\r\n"
+        written += f":TS,{at:%y%m%d%H%M%S}{at.microsecond // 10_000:02d},35.0,+15.0,0.5,1500.0,0\r\n"
+        written += f":BI,{-left:+6.0f},{ahead:+6.0f},{up:+6.0f},+2,A\r\n"
+    return imported(path, written.encode())
+
+
+def imported(path: Path, log: bytes) -> Path:
+    source = path.with_suffix(".log")
+    source.write_bytes(log)
+    (bag,) = dvl_calib_ros.import_files(source, output=path)
+    return bag
+
+
+@cache
+def long_motion() -> Motion:
+    return make_motion("free", 420.0, 100.0, np.random.default_rng(12))
+
+
+@dataclass(frozen=True)
+class Situation:
+    """A recording with its right answer.
+
+    write: makes the bag, with or without its fault. cause: code of the first reason against it; none: the recording is
+    usable. remedy: of the first reason, a part; parameters: by which that is done; none: it is done before recording.
+    yaw_deg: of the DVL. verdicts: that are right of a usable recording. unseen: why today's answer is another.
+    """
+
+    write: Callable[[Path, bool], Path]
+    cause: str = ""
+    remedy: str = ""
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    yaw_deg: float = 0.0
+    verdicts: tuple[str, ...] = ("accept",)
+    unseen: str = ""
+
+
+def told_by(tell: Callable[[Told, bool], None], of: Callable[[], Motion] = motion) -> Callable[[Path, bool], Path]:
+    def write(path: Path, wrong: bool) -> Path:
+        told = Told(motion=of())
+        tell(told, wrong)
+        return told.write(path)
+
+    return write
+
+
+NOISY = "accept", "marginal"  # speed over ground is noisy, and without a reference nothing is verified
+SITUATIONS = {
+    "meaningless covariances": Situation(told_by(meaningless_covariances)),
+    "one axis negated": Situation(
+        told_by(one_axis_negated, long_motion), "DVL_LEFT_HANDED", "negate this axis in the DVL's driver"
+    ),
+    "quaternion components mixed up": Situation(
+        told_by(quaternion_components_mixed_up), "GRAVITY_LEANS", "check the IMU's mounting in its driver"
+    ),
+    "reference of a filter": Situation(
+        told_by(reference_of_a_filter), "REFERENCE_HOLDS_DVL", "use the velocity of GNSS alone"
+    ),
+    "wrong transform without reference": Situation(
+        told_by(wrong_transform_without_reference),
+        "TRAVELS_SIDEWAYS",
+        "try -p mounting_rpy:=[0deg,0deg,-135deg]",
+        {"mounting_rpy": (0.0, 0.0, math.radians(-135.0))},
+        yaw_deg=-135.0,
+        verdicts=NOISY,
+    ),
+    "stamps an hour ahead": Situation(
+        told_by(stamps_an_hour_ahead), "CLOCKS_APART", "--restamp log", {"restamp": RESTAMP_ALL}
+    ),
+    "alignment of an RDI": Situation(lambda path, _: ensembles(path, -45.0), yaw_deg=-45.0, verdicts=NOISY),
+    "moving bed": Situation(lambda path, _: ensembles(path, bed_mps=np.array(BED_MPS)), verdicts=NOISY),
+    "text of a DVL": Situation(lambda path, _: lines(path), verdicts=NOISY),
+    "antenna on a mast": Situation(
+        told_by(antenna_on_a_mast, long_motion), unseen="needs an estimator of positions with the antenna's swing"
+    ),
+    "fixes around a dive": Situation(
+        told_by(fixes_around_a_dive, long_motion),
+        unseen="needs an estimator of the displacement between fixes before and after",
+    ),
+}
