@@ -1,17 +1,20 @@
 """Segments of time that the messages of a recording lie in: those that are absurdly far from the data are set aside.
 
 A computer without a clock battery begins in 1970, and one broken stamp may name any year. Whatever looks at a recording
-later may so rely on it that time does not span decades. Pauses of hours, and clocks that are set, are left as they are.
+later may so rely on it that time does not span decades. Pauses of hours, and clocks that are set, are left as they are:
+in a pause stamps and log times go on together. A log time that alone is elsewhere is wrong, however near it is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from itertools import chain
 
 import numpy as np
 
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.robust import median
 from ..calibration.numerics.samples import Mask, Stamps
 from ..calibration.streams.clock_correction import SECOND_NS
 from ..calibration.streams.stream_order import SEGMENT_GAP_NS
@@ -24,6 +27,10 @@ FURTHEST_NS = 365 * 86_400 * SECOND_NS
 SMALL_SHARE = 0.1
 # Fewer messages of a topic, all of them far away, are strays and no clock.
 FEWEST_OF_A_CLOCK = 10
+# A recorder writes what it holds back within seconds, so a log time this far outside the others is not its delay.
+LEAST_PAUSE_NS = 10 * SECOND_NS
+# A delay this many times the typical one (median deviation from the median) differs from the neighbours'.
+OTHER_DELAY = 10.0
 Span = tuple[int, int]
 
 
@@ -61,6 +68,42 @@ def far(each: Sequence[Stamps]) -> list[Mask]:
     return found
 
 
+def logged_elsewhere(stamps_ns: Sequence[Stamps], log_ns: Sequence[Stamps]) -> list[Mask]:
+    """Return, per stream, which log times contradict stamps and neighbours, and would stretch the recording.
+
+    The delay from stamp to log time is that of the stream's other messages, but for few. One with another delay is
+    wrongly logged if its log time lies outside all others, and its stamp within.
+
+    Parameters
+    ----------
+    stamps_ns: Stamps (N,) ns of each stream.
+    log_ns: Log times (N,) ns of the same messages.
+
+    """
+    found, due_ns = [], []
+    for stamps, logged in zip(stamps_ns, log_ns, strict=True):
+        other = np.zeros(len(logged), dtype=bool)
+        due: Array = logged.astype(float)
+        if len(logged) > 2 and float(np.diff(due).max()) > LEAST_PAUSE_NS:
+            delay = due - stamps
+            usual = float(median(delay))
+            off = np.abs(delay - usual)
+            other = off > max(LEAST_PAUSE_NS, OTHER_DELAY * float(median(off)))
+            other &= np.count_nonzero(other) <= max(SMALL_SHARE * len(other), 1)
+            due -= delay - usual
+        found.append(other)
+        due_ns.append(due)
+    sound = [logged[~other] for logged, other in zip(log_ns, found, strict=True) if not other.all()]
+    if not any(other.any() for other in found) or not sound:
+        return found
+    first = min(int(own.min()) for own in sound) - LEAST_PAUSE_NS
+    last = max(int(own.max()) for own in sound) + LEAST_PAUSE_NS
+    return [
+        other & ((logged < first) | (logged > last)) & (due >= first) & (due <= last)
+        for other, logged, due in zip(found, log_ns, due_ns, strict=True)
+    ]
+
+
 def without_far(
     columns: Mapping[str, TopicColumns], spans_ns: Sequence[Span]
 ) -> tuple[dict[str, TopicColumns], tuple[Span, ...], list[Reason]]:
@@ -85,8 +128,9 @@ def without_far(
     of_log = np.split(by_log, np.cumsum([len(own) for own in log_ns])[:-1]) if names else []
     # a topic that is far as a whole has another clock, which is found and said later
     of_log = [np.zeros_like(own) if len(own) >= FEWEST_OF_A_CLOCK and own.all() else own for own in of_log]
-    by_log = np.concatenate([by_log[:0], *of_log])
     stamps_ns = [columns[name].stamps_ns for name in names]
+    of_log = [own | other for own, other in zip(of_log, logged_elsewhere(stamps_ns, log_ns), strict=True)]
+    by_log = np.concatenate([by_log[:0], *of_log])
     # what was recorded far away may be stamped by the same clock: it has no say
     of_stamps = far([own[~aside] for own, aside in zip(stamps_ns, of_log, strict=True)])
     kept = dict(columns)
@@ -97,7 +141,7 @@ def without_far(
         findings += chain(_named(name, "recorded", own_log, recorded), _named(name, "stamped", own, aside & ~recorded))
         if aside.any():
             kept[name] = columns[name].part(~aside)
-    return kept, tuple(_within(spans_ns, joined[~by_log], bool(by_log.any()))), findings
+    return kept, tuple(_within(spans_ns, joined[~by_log], set(joined[by_log].tolist()))), findings
 
 
 def _named(topic: str, how: str, times_ns: Stamps, aside: Mask) -> Iterator[Reason]:
@@ -115,19 +159,21 @@ def _date(at_ns: int) -> str:
     return datetime.fromtimestamp(at_ns // SECOND_NS, timezone.utc).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def _within(spans_ns: Sequence[Span], kept_ns: Stamps, has_far: bool) -> Iterator[Span]:
-    """Yield the spans without ends that are absurdly far from the times (N,) kept.
+def _within(spans_ns: Sequence[Span], kept_ns: Stamps, aside_ns: Collection[int]) -> Iterator[Span]:
+    """Yield the spans without ends that were set aside, or are further from the times (N,) kept than these span.
 
-    Such an end is a message that was set aside, or of a topic that nobody reads. has_far: whether any was set aside; a
-    file that holds nothing else is left out.
+    The latter is a message of a topic that nobody reads. aside_ns: times that were set aside; with such, a file that
+    holds nothing else is left out.
     """
+    length_ns = int(kept_ns.max() - kept_ns.min()) if len(kept_ns) else 0
+    most_ns = min(max(length_ns, LEAST_PAUSE_NS), SEGMENT_GAP_NS)
     for start_ns, end_ns in spans_ns:
         own = kept_ns[(kept_ns >= start_ns) & (kept_ns <= end_ns)]
         if len(own):
             first_ns, last_ns = int(own.min()), int(own.max())
             yield (
-                first_ns if first_ns - start_ns > SEGMENT_GAP_NS else start_ns,
-                last_ns if end_ns - last_ns > SEGMENT_GAP_NS else end_ns,
+                first_ns if start_ns in aside_ns or first_ns - start_ns > most_ns else start_ns,
+                last_ns if end_ns in aside_ns or end_ns - last_ns > most_ns else end_ns,
             )
-        elif not has_far:
+        elif not aside_ns:
             yield start_ns, end_ns

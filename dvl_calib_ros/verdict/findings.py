@@ -86,7 +86,8 @@ FINDINGS = (
         "STAMPS_FAR",
         "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, absurdly far from the others",
         "A computer without a clock battery that began in 1970, or a broken stamp. Set aside is what is more than a "
-        "year away, and of less than a tenth of a topic's messages what is more than a week away.",
+        "year away, of less than a tenth of a topic's messages what is more than a week away, and a log time that "
+        "contradicts both the message's stamp and the other log times.",
         "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording",
     ),
     Kind(

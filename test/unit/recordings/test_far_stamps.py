@@ -8,11 +8,11 @@ from driver_fixtures import TWIST, TYPES, write_driver_bag
 from io_fixtures import TOPICS, rewrite, run, write_bag
 
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.bags.writer import BagWriter
+from dvl_calib_ros.bags.writer import BagWriter, Storage
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS
-from dvl_calib_ros.recordings.far_stamps import far
+from dvl_calib_ros.recordings.far_stamps import far, logged_elsewhere
 from dvl_calib_ros.recordings.recording import open_recording
 
 S, DAY = 10**9, 86_400 * 10**9
@@ -130,3 +130,68 @@ def test_stamps_of_messages_that_are_decoded_one_by_one_are_those_of_their_heade
     assert [row[:2] for row in part.part(kept).singles.messages()] == [
         row[:2] for row, is_kept in zip(part.singles.messages(), kept, strict=False) if is_kept
     ]
+
+
+def logged(path, topic: str, off: dict[int, int], storage: str, pause_ns: int = 0):
+    """A bag of 20 s in which some log times of a topic (place -> ns) are off, after a pause from the middle on."""
+    with BagReader([write_bag(path / "sound", run(20.0))]) as bag:
+        messages = [(name, log_ns, message) for name, log_ns, message, _ in bag.messages(TOPICS)]
+    middle_ns = messages[0][1] + 10 * S
+    with BagWriter(path / "bag", Storage(storage)) as bag:
+        rows, seen = [], dict.fromkeys(TOPICS, 0)
+        for name, log_ns, message in messages:
+            later = pause_ns if log_ns >= middle_ns else 0
+            message.header.stamp.sec += later // S
+            rows.append((log_ns + later + (off.get(seen[name], 0) if name == topic else 0), name, message))
+            seen[name] += 1
+        for log_ns, name, message in sorted(rows, key=lambda row: row[0]):
+            bag.message(name, TOPICS[name], log_ns, message)
+    return open_recording([path / "bag"]), messages
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("off", [2 * DAY, -2 * DAY, 3 * 3600 * S, -3 * 3600 * S, 120 * S])
+@pytest.mark.parametrize("topic", ["dvl/twist", "imu/data"])
+def test_one_log_time_does_not_stretch_a_recording(tmp_path, topic, off, storage):
+    recording, messages = logged(tmp_path, topic, {40: off}, storage)
+    assert recording.span_ns == (messages[0][1], messages[-1][1])
+    [note] = recording.notes
+    assert f"{topic}: 1 of " in note and "set aside: recorded at" in note
+    for name, look in recording.survey.looks.items():
+        expected = sum(each == name for each, *_ in messages) / 20.0
+        assert look.rate_hz == pytest.approx(expected, rel=0.03), name
+
+
+def test_a_pause_of_hours_in_which_stamps_go_on_is_none_of_wrong_log_times(tmp_path):
+    pause_ns = 5 * 3600 * S
+    recording, messages = logged(tmp_path, "dvl/twist", {}, "mcap", pause_ns)
+    assert recording.span_ns == (messages[0][1], messages[-1][1] + pause_ns)
+    assert not recording.notes
+
+
+def test_a_log_time_beyond_a_pause_of_hours_is_set_aside(tmp_path):
+    pause_ns = 5 * 3600 * S
+    recording, messages = logged(tmp_path, "dvl/twist", {40: DAY}, "mcap", pause_ns)
+    assert recording.span_ns == (messages[0][1], messages[-1][1] + pause_ns)
+    assert len(recording.notes) == 1
+
+
+def test_stamps_that_are_off_while_log_times_go_on_are_no_wrong_log_times():
+    log = every(120.0)
+    for late in (3600 * S, -3600 * S):
+        stamps = log.copy()
+        stamps[:20] += late  # the clock of a driver, set after 4 s
+        assert not any(mask.any() for mask in logged_elsewhere([stamps, log], [log, log]))
+
+
+@pytest.mark.parametrize("off", [3 * 3600 * S, -3 * 3600 * S])
+def test_a_log_time_of_a_topic_that_nobody_reads_does_not_stretch_a_recording(tmp_path, off):
+    with BagReader([write_bag(tmp_path / "sound", run(20.0))]) as bag:
+        rows = [(log_ns, topic, TOPICS[topic], message) for topic, log_ns, message, _ in bag.messages(TOPICS)]
+    first_ns, last_ns = rows[0][0], rows[-1][0]
+    with BagWriter(tmp_path / "bag") as bag:
+        text = bag.typestore.types["std_msgs/msg/String"]("said")
+        rows.append((first_ns + off, "chatter", "std_msgs/msg/String", text))
+        for log_ns, topic, kind, message in sorted(rows, key=lambda row: row[0]):
+            bag.message(topic, kind, log_ns, message)
+    assert open_recording([tmp_path / "bag"]).span_ns == (first_ns, last_ns)
