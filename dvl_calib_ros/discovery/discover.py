@@ -234,7 +234,7 @@ class _Search:
             self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
         if placed is not None and placed.source:
             self._place_lever_arm(placed, reference)
-        elif reference is not None and not self._gives("lever_arm"):
+        if reference is not None and not (_is_located(placed) or self._gives("lever_arm")):
             self._found.append(
                 f"lever arm {in_metres(self._parameters.lever_arm)} m: no transform of {dvl.frame_id!r} says where the "
                 "DVL sits; half a metre turns the yaw by tenths of a degree (-p lever_arm:=[x,y,z])"
@@ -283,7 +283,7 @@ class _Search:
         """Say what is known of the DVL's position in the body, which the lever arm alone is not."""
         if self._gives("dvl_position"):
             return
-        told = placed is not None and bool(placed.source) and not self._gives("lever_arm")
+        told = _is_located(placed) and not self._gives("lever_arm")
         at = None if reference is None else self._known_reference_position(reference)
         if self._gives("reference_position"):
             at = np.array(self._parameters.reference_position)
@@ -297,7 +297,7 @@ class _Search:
     def _known_reference_position(self, reference: Look) -> Array | None:
         """Where in the body the reference point is; None if nothing says."""
         placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
-        if placed is not None and placed.source:
+        if placed is not None and _is_located(placed):
             return placed.position
         base = self._parameters.base_frame
         named = frame_named(reference.frame_id, (base, self._values.get("base_frame", base)))
@@ -365,7 +365,7 @@ class _Search:
         if motion is None:
             return None
         self._readings = Readings(motion, position)
-        is_known = placed is not None and bool(placed.source) and self._known_reference_position(reference) is not None
+        is_known = _is_located(placed) and self._known_reference_position(reference) is not None
         return frames.choose(self._readings, reference, None if known is None else known.T, is_known)
 
     def _take(
@@ -491,7 +491,7 @@ class _Search:
     def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
         given_mounting = self._gives("mounting_rpy")
         said = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]
-        if not self._gives("lever_arm"):
+        if placed.is_located and not self._gives("lever_arm"):
             position = placed.position
             if reference is not None:
                 position = position - self._reference_position(reference)
@@ -500,3 +500,8 @@ class _Search:
                 said.append(f"lever arm {in_metres(position)} m")
         if said:
             self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
+
+
+def _is_located(placed: Placed | None) -> bool:
+    """Return whether transforms say where a frame sits in the body."""
+    return placed is not None and bool(placed.source) and placed.is_located

@@ -23,13 +23,17 @@ LONGEST_CHAIN = 100
 
 
 class Placed(NamedTuple):
-    """A frame in another. rotation: (3, 3) ``rotation_base_from_frame``. position: (3,) m, in the base."""
+    """A frame in another. rotation: (3, 3) ``rotation_base_from_frame``. position: (3,) m, in the base.
+
+    is_located: whether the position is known as well; it is not of a joint in a URDF whose origin has rpy alone.
+    """
 
     base: str
     frame: str
     rotation: Array
     position: Array
     source: str
+    is_located: bool = True
 
 
 @dataclass
@@ -59,13 +63,15 @@ class FrameTree:
 
     def _add_urdf(self, text: str) -> None:
         try:
-            joints = parse_urdf(Path("/robot_description"), text.encode()).joints
+            urdf = parse_urdf(Path("/robot_description"), text.encode())
         except InputError as error:
             self.problems.append(finding("URDF_NOT_READ", reason=error))
             return
-        for joint in joints:
+        for joint in urdf.joints:
             if joint.kind == "fixed":
                 rotation, position = rotation_from_rpy(joint.rpy), np.array(joint.xyz)
+                if joint.origin is not None and b"xyz" not in urdf.content[slice(*joint.origin)]:
+                    position = np.full(3, np.nan)
                 self._parents[_plain(joint.child)] = (_plain(joint.parent), rotation, position, "/robot_description")
 
     @property
@@ -111,7 +117,9 @@ class FrameTree:
             name, above, offset, source = self._parents[name]
             rotation, position = above @ rotation, above @ position + offset
             sources.append(source)
-        return Placed(base, frame, rotation, position, " and ".join(dict.fromkeys(sources)))
+        is_located = bool(np.isfinite(position).all())
+        source = " and ".join(dict.fromkeys(sources))
+        return Placed(base, frame, rotation, position if is_located else np.zeros(3), source, is_located)
 
     def likely(self, words: Iterable[str]) -> str | None:
         """The one frame whose name holds one of these words, for a frame_id that the tree does not have."""
@@ -169,7 +177,7 @@ def placement(tree: FrameTree, frames: Frames, parameters: Parameters, given: Co
         is_drivers = frames.points_down and placed.rotation[2, 2] < 0.0 and not parameters.is_z_down
         if is_drivers and parameters.dvl_axes == FROM_MESSAGE:
             values["dvl_axes"] = FLU  # the transform is of the driver's own axes, which the data are in
-    if "lever_arm" not in given:
+    if "lever_arm" not in given and placed.is_located:
         reference = tree.placed(frames.reference, parameters.base_frame) if frames.reference else None
         at = np.zeros(3) if reference is None else reference.position
         position = placed.position - at

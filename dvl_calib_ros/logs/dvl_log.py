@@ -42,6 +42,7 @@ class DvlLog(NamedTuple):
     """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason.
 
     references, attitudes, waters: what else the log holds. notes: in sentences, what to know of it.
+    nominal_yaw: rad, of the DVL in the body (forward-left-up), as configured in the instrument.
     """
 
     samples: list[DvlSample]
@@ -50,3 +51,4 @@ class DvlLog(NamedTuple):
     attitudes: Sequence[ImuSample] = ()
     notes: tuple[str, ...] = ()
     waters: Sequence[WaterReading] = ()
+    nominal_yaw: float = 0.0

@@ -5,9 +5,10 @@ attitude of one vehicle, in `ardupilot_logs`.
 
 Water Linked: docs.waterlinked.com/dvl/dvl-json-protocol, reports of type velocity, axes forward-right-down, stamped by
 time_of_validity (µs since 1970). RDI: "WorkHorse Commands and Output Data Format" and Pathfinder guide, bottom track of
-PD0 (x starboard, y forward, z up), which is the bottom's motion past the DVL: its sign is turned. Instrument axes are
-taken for ship's, as with beam 3 forward; a replay finds a DVL that is mounted otherwise. Beams are resolved, and what
-the instrument turned into earth axes is turned back. The attitude, where there is no other, is that of its own sensors.
+PD0 (x starboard, y forward, z up), which is the bottom's motion past the DVL: its sign is turned. Velocities are those
+in instrument axes (y along beam 3): beams are resolved, and ship or earth axes are turned back. The attitude, where
+there is no other, is that of its own sensors. EA is how far clockwise of the ship's centre line beam 3 is, and headings
+are the ship's ("WorkHorse Commands and Output Data Format", EA): it is the nominal yaw.
 """
 
 from __future__ import annotations
@@ -182,6 +183,7 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
     left_out: Counter[str] = Counter()
     nmea = Nmea()
     waters: list[WaterReading] = []
+    alignments: Counter[float] = Counter()
     for each in _ensembles(content):
         data = dict(each)
         try:
@@ -190,6 +192,7 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
                 if identity == GENERAL_NMEA:
                     nmea.take(stamp_ns, message)
             sample = _pd0_sample(path, stamp_ns, data, left_out)
+            alignments[_pd0_alignment(data)] += 1
         except (struct.error, IndexError, KeyError, ValueError, ZeroDivisionError):
             left_out["damaged"] += 1
             continue
@@ -200,8 +203,17 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
             samples.append(sample)
         if (water := _pd0_water(stamp_ns, data)) is not None:
             waters.append(water)
+    alignment = max(alignments, key=alignments.__getitem__, default=0.0)
     stamps, rpy, notes = _pd0_attitudes(path, attitudes, nmea)
-    return DvlLog(samples, left_out + nmea.left_out, nmea.references(), imu_samples(stamps, rpy), notes, waters)
+    if alignment:
+        rpy = _ship_attitudes(rpy, alignment) if len(rpy) else rpy
+        degrees = math.degrees(alignment)
+        notes += (
+            f"{path}: EA (heading alignment) is {degrees:+.2f}°: beam 3 is so far clockwise of the ship's centre line, "
+            f"and {-degrees:+.2f}° is the nominal yaw of the DVL",
+        )
+    imu = imu_samples(stamps, rpy)
+    return DvlLog(samples, left_out + nmea.left_out, nmea.references(), imu, notes, waters, -alignment)
 
 
 def _pd0_attitudes(
@@ -235,6 +247,21 @@ def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float] | None:
     roll = math.radians(0.01 * tilt_2)
     pitch = math.atan(math.tan(math.radians(0.01 * tilt_1)) * math.cos(roll))
     return roll, pitch, math.radians(0.01 * heading)
+
+
+def _pd0_alignment(data: dict[int, bytes]) -> float:
+    """Return EA, rad: how far clockwise of the ship's centre line beam 3 is."""
+    (hundredths,) = struct.unpack_from("<h", data[_FIXED_LEADER], 26)
+    return math.radians(0.01 * hundredths)
+
+
+def _ship_attitudes(rpy: Array, alignment: float) -> Array:
+    """Return the ship's roll, pitch and heading (N, 3), rad, by its own heading and the tilts of the instrument."""
+    from scipy.spatial.transform import Rotation
+
+    instrument = Rotation.from_euler("ZYX", rpy[:, ::-1] + [alignment, 0.0, 0.0])
+    ship: Array = (instrument * Rotation.from_euler("Z", -alignment)).as_euler("ZYX")
+    return ship[:, ::-1]
 
 
 def _pd0_water(stamp_ns: int, data: dict[int, bytes]) -> WaterReading | None:
@@ -276,14 +303,16 @@ def _pd0_sample(path: Path, stamp_ns: int, data: dict[int, bytes], left_out: Cou
     measured = np.array(millimetres, dtype=float)
     if axes == "beam":
         instrument = _instrument_from_beams(data[_FIXED_LEADER]) @ measured
-    elif axes == "earth":
-        attitude = _pd0_attitude(data)
+    elif axes == "instrument":
+        instrument = measured[:3]
+    else:
+        attitude = _pd0_attitude(data) if axes == "earth" else (0.0, 0.0, 0.0)
         if attitude is None:
             left_out["in earth axes without a heading"] += 1
             return None
-        instrument = _earth_from_ship(*attitude, data[_FIXED_LEADER]).T @ measured[:3]
-    else:
-        instrument = measured[:3]
+        roll, pitch, heading = attitude
+        turned = _turned_by(roll, pitch, heading + _pd0_alignment(data), data[_FIXED_LEADER])
+        instrument = turned.T @ measured[:3]
     x, y, z = (-0.001 * _FLU_FROM_RDI @ instrument + 0.0).tolist()
     return DvlSample(stamp_ns, (x, y, z), None)
 
@@ -296,9 +325,9 @@ def _instrument_from_beams(fixed: bytes) -> Array:
     return np.array([[a, -a, 0.0, 0.0], [0.0, 0.0, -a, a], [b, b, b, b]])
 
 
-def _earth_from_ship(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
-    """(3, 3), as the instrument turned its velocities by its heading, and by its tilts where it was set to (the same,
-    eq. 18), which its transpose undoes whatever the heading is worth."""
+def _turned_by(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
+    """Return the rotation (3, 3) by which the instrument turned its velocities: by beam 3's heading, and by its tilts
+    where it was set to (the same, eq. 18). Its transpose undoes that whatever the heading is worth."""
     if not fixed[25] & 4:
         roll = pitch = 0.0
     sh, ch, sp, cp, sr, cr = (

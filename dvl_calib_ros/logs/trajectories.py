@@ -222,6 +222,8 @@ def import_recording(
         attitudes = _attitudes(attitude, start_ns, notes)
     with BagWriter(output, options.storage, options.compression) as bag:
         writer = SampleWriter(bag)
+        if log.nominal_yaw:
+            writer.nominal_yaw(log.samples[0].stamp_ns, log.nominal_yaw)
         writer.recording(attitudes, references, fixes, log.samples)
         waters = writer.water(log.waters)
     written = {"dvl/twist": len(log.samples), "gnss/twist": len(references), "imu/data": len(attitudes)}

@@ -14,6 +14,7 @@ from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from .drivers import IMU_TYPE, TWIST_TYPE
 
 FIX_TYPE = "sensor_msgs/msg/NavSatFix"
+STRING_TYPE = "std_msgs/msg/String"
 TEMPERATURE_TYPE, NUMBER_TYPE = "sensor_msgs/msg/Temperature", "std_msgs/msg/Float64"
 
 FRAME_IDS = {VelocityFrame.ENU: "map", VelocityFrame.NED: "ned", VelocityFrame.BODY: "base_link"}
@@ -37,6 +38,11 @@ class WaterReading(NamedTuple):
     salinity: float
 
 
+# A joint whose origin has no xyz says how the DVL is turned, and not where it sits.
+_TURNED = (
+    '<robot name="dvl"><link name="base_link"/><link name="dvl_link"/><joint name="dvl_joint" type="fixed">'
+    '<parent link="base_link"/><child link="dvl_link"/><origin rpy="0 0 {yaw:.6f}"/></joint></robot>'
+)
 # What is written of each second is enough of what changes slowly
 _WATER_EVERY_NS = 1_000_000_000
 
@@ -98,6 +104,11 @@ class SampleWriter:
             linear_acceleration_covariance=self._unknown,
         )
         self._bag.message(topic, IMU_TYPE, sample.stamp_ns, message)
+
+    def nominal_yaw(self, stamp_ns: int, yaw: float) -> None:
+        """Write the DVL's nominal yaw (rad) in base_link as a robot_description."""
+        message = self._types[STRING_TYPE](_TURNED.format(yaw=yaw))
+        self._bag.message("robot_description", STRING_TYPE, stamp_ns, message)
 
     def water(self, readings: Iterable[WaterReading]) -> int:
         """Write what a DVL says of its water, at most one reading a second; how many were written."""

@@ -15,6 +15,8 @@ from log_fixtures import nortek
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.logs.dvl_logs import is_dvl_log, read_dvl_log
 
 START_US = 1_638_191_471_563_017
@@ -49,11 +51,13 @@ def ensemble(
     flags: int = 0,
     attitude: tuple[int, int, int] = (0, 0, 0),
     length: int = 65,
+    alignment: int = 0,
 ) -> bytes:
     """A PD0 ensemble with fixed leader, variable leader and bottom track, by the format's table of bytes."""
     fixed, variable, bottom = bytearray(59), bytearray(65), bytearray(81)
     fixed[4:6] = bytes(configuration)
     fixed[25] = axes << 3 | flags
+    struct.pack_into("<h", fixed, 26, alignment)
     struct.pack_into("<H", variable, 0, 0x0080)
     variable[4:11] = bytes([25, 11, 21, 10, 30, 15, hundredths])
     struct.pack_into("<H2h", variable, 18, *attitude)
@@ -136,6 +140,48 @@ def test_pd0_in_earth_axes_is_turned_back_as_the_instrument_turned_it(tmp_path, 
     (tmp_path / "dive.pd0").write_bytes(ensemble((*earth, 0), 25, axes=3, flags=tilts_used, attitude=attitude))
     (sample,) = read_dvl_log(tmp_path / "dive.pd0").samples
     np.testing.assert_allclose(sample.velocity, (1.5, 0.2, -0.03), atol=2e-3)
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3])
+@pytest.mark.parametrize("alignment", [47.0, -120.0, 180.0])
+def test_pd0_with_an_aligned_heading_is_in_instrument_axes_and_tells_its_yaw(tmp_path, alignment, axes):
+    """EA is how far clockwise of the ship's centre line beam 3 is; the ensemble's heading is the ship's."""
+    heading, tilt, roll = 123.45, 8.0, -5.0
+    pitch = np.degrees(np.arctan(np.tan(np.radians(tilt)) * np.cos(np.radians(roll))))
+    in_earth = Rotation.from_euler("ZXY", [-heading - alignment, pitch, roll], degrees=True)
+    in_ship = Rotation.from_euler("Z", -alignment, degrees=True)
+    turn = {1: Rotation.identity(), 2: in_ship, 3: in_earth}[axes]
+    given = (*np.round(turn.apply([200.0, -1500.0, 30.0])).astype(int), 0)
+    attitude = (round(100 * heading), round(100 * tilt), round(100 * roll))
+    (tmp_path / "dive.pd0").write_bytes(
+        b"".join(
+            ensemble(
+                given, at, axes, flags=4, attitude=(attitude[0] + at, *attitude[1:]), alignment=round(100 * alignment)
+            )
+            for at in (0, 1)
+        )
+    )
+    log = read_dvl_log(tmp_path / "dive.pd0")
+    np.testing.assert_allclose(log.samples[0].velocity, (1.5, 0.2, -0.03), atol=2e-3)
+    assert np.degrees(log.nominal_yaw) == pytest.approx(-alignment)
+    assert f"EA (heading alignment) is {alignment:+.2f}°" in log.notes[-1]
+    # of the ship, forward-left-up in east-north-up: the instrument's, turned back about its vertical
+    rdi_from_flu = Rotation.from_euler("Z", 90.0, degrees=True)
+    instrument_from_ship = Rotation.from_euler("Z", alignment, degrees=True)
+    expected = in_earth * rdi_from_flu * instrument_from_ship
+    found = Rotation.from_quat(log.attitudes[0].orientation)
+    assert np.degrees((expected.inv() * found).magnitude()) < 0.01
+
+
+def test_an_import_hands_on_the_nominal_yaw_and_no_place(tmp_path, capsys):
+    log = tmp_path / "dive.pd0"
+    log.write_bytes(b"".join(ensemble((0, -1500, 0), i, 1, alignment=4700) for i in range(20)))
+    _, err = succeed(capsys, "import", log, "-o", tmp_path / "bag")
+    assert "EA (heading alignment) is +47.00°" in " ".join(err.split())
+    found = discover([tmp_path / "bag"], Parameters())
+    np.testing.assert_allclose(found.values["mounting_rpy"], (0.0, 0.0, np.radians(-47.0)), atol=1e-6)
+    assert "lever_arm" not in found.values and "dvl_position" not in found.values
+    assert any("mounting 0° 0° -47°: dvl_link in base_link, from /robot_description" in each for each in found.found)
 
 
 def test_an_ensemble_that_ends_before_its_heading_is_a_velocity_and_no_damage(tmp_path):
