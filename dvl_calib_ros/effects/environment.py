@@ -19,8 +19,8 @@ class WaterLock(Effect):
     name = "water_lock"
     summary = "the DVL tracks water: an earth-fixed velocity (the negative of the current) is added from from_s to to_s"
     remedy = (
-        "a part of the run is on the water's layer: have the driver hand on bottom track only; of a whole run "
-        "--apply takes it out"
+        "a part of the run is on the water's layer: have the driver hand on bottom track only; in a whole run the bed "
+        "may move as well: --apply takes it out"
     )
     manoeuvre = "straight legs on four headings or more, over ground known to be in range"
     parameters = (

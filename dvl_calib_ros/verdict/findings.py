@@ -362,6 +362,14 @@ FINDINGS = (
         "take the bias off in the driver, or have the DVL serviced",
     ),
     Kind(
+        "BED_MOVES",
+        "moving bed: over ground the reference is {millimetres:.0f} mm/s faster than the DVL towards {course:.0f}°, "
+        "on every heading",
+        "The bottom track follows sediment that moves, or the water's layer; a reference is hardly ever so far off. "
+        "Dead reckoning drifts by as much there.",
+        "calibrate where the bed is still; to estimate that velocity as well: -p reference_offset_std:={std:g}",
+    ),
+    Kind(
         "VELOCITY_SMOOTHED",
         "the {name} is smoothed over {seconds:.1f} s",
         "A filter that follows late cuts corners: in turns its velocity is that of another motion, of which the "

@@ -22,6 +22,7 @@ from ..checks.lever_arm_check import lever_arm_warnings
 from ..checks.residual_tests import (
     ResidualTrend,
     is_insignificant,
+    moving_bed,
     reference_lag_s,
     residual_trend,
     residual_warnings,
@@ -352,9 +353,12 @@ def doubts(
         found += [each.weighed(Severity.MARGINAL) for each in lever_arm_warnings(finders, parameters)]
     if navigation is None:
         return found
-    if navigation.deviation is not None:
+    bed = moving_bed(navigation.followed, estimate)
+    if bed is not None:  # which looks like a heading error, and like one of the reference
+        found.append(bed)
+    elif navigation.deviation is not None:
         found.append(heading_warnings(navigation.deviation).weighed(severity_of(navigation.deviation, estimate)))
-    if in_earth:
+    if in_earth and bed is None:
         found += one_heading_warnings(estimate, parameters, navigation.speed)
     return found + residual_warnings(
         navigation.followed,

@@ -23,6 +23,7 @@ import numpy as np
 
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
+from ..filters.day_to_day_covariance import OFFSETS
 from ..models import MODELS
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import alike_of, of_few
@@ -52,6 +53,11 @@ QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 # Tilt (rad, rms) from which on a velocity has something to follow, and the share of it that it has to leave; the first
 # of how it bends, m/s².
 LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
+# Prior σ (m/s) of a bed's velocity: sediment in a flood, or a layer of water. From `MOVES_FROM_MPS` on no reference is
+# the cause: GNSS Doppler is good to 0.05 m/s (95 %, datasheets), and an inertial navigation at sea was off by 0.054.
+BED_STD_MPS, MOVES_FROM_MPS = 1.0, 0.08
+# Rows of the reference's error, east and north, in `KNOWN`.
+OVER_GROUND = slice(9, 11)
 # Share of the whole bend that means of `MEAN_S` have to leave, for smoothing to be told by them.
 LEAST_OF_BEND = 0.3
 # Known to no better than this (σ), it may as well be all of it.
@@ -96,7 +102,8 @@ class ResidualTrend(NamedTuple):
     levelled one, 2 or -2 where a sign is wrong. bias, bias_std: (3,) m/s of the DVL, body. smoothed, smoothed_std: s²,
     half the square of the reference's time constant; below 0 the DVL's. lean: (2,) mean roll and pitch, rad. speed:
     m/s, rms. circular, circular_std: share of the DVL's noise that is still there with the next sample, and circular_s
-    what it is forgotten over, s: the surest of `FORGOTTEN_S`.
+    what it is forgotten over, s: the surest of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s that the reference
+    is faster than the DVL, east and north, on every heading; 0 where the residual itself holds less than half of it.
     """
 
     tilt: Array
@@ -110,6 +117,8 @@ class ResidualTrend(NamedTuple):
     circular: float
     circular_std: float
     circular_s: float
+    over_ground: Array
+    over_ground_std: Array
 
 
 class _Fit(NamedTuple):
@@ -179,9 +188,18 @@ def residual_trend(
     beside = _known(_beside(time, moving, starts), rates, slope, body_from_enu)
     by_heading = beside[:, :, -1, None] * around[:, None]
     means = [_means(each, starts) for each in (time, np.concatenate([beside, by_heading, constant], axis=2), error)]
-    slow = _fitted(means[0], means[1], means[2], np.concatenate([KNOWN, BY_HEADING, CONSTANT]))
-    if fast is None or slow is None:
+    likely = np.concatenate([KNOWN, BY_HEADING, CONSTANT])
+    slow = _fitted(means[0], means[1], means[2], likely)
+    likely[OVER_GROUND] = BED_STD_MPS
+    over_bed = _fitted(means[0], means[1], means[2], likely)
+    if fast is None or slow is None or over_bed is None:
         return None
+    over_ground = over_bed.x[OVER_GROUND]
+    # with few headings a yaw and a bias can make up for any such velocity, and the residual is small
+    if float(over_ground @ median(_turned(rotation_enu_from_body, error)[:, :2])) < 0.5 * float(
+        over_ground @ over_ground
+    ):
+        over_ground = np.zeros(2)
     tilt, std = fast.x[-3:-1], fast.std[-3:-1]
     std[[each.std() < LEAST_TILT for each in changing]] = math.inf
     lean = np.array([roll.mean(), pitch.mean()])
@@ -194,7 +212,7 @@ def residual_trend(
     smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
     return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_circular(time, velocity - error, error, both, fast),
+        *_circular(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
     )  # fmt: skip
 
 
@@ -248,6 +266,23 @@ def std_along(estimate: Estimate, parameters: Parameters) -> Array:
     ahead = dvl_from_body[:, 0] ** 2
     turned = np.diag(dvl_from_body.T @ p[:3, :3] @ dvl_from_body)
     return np.sqrt([float(ahead @ p[3:, 3:] @ ahead), turned[2], turned[1]])
+
+
+def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None:
+    """Return the reason against a calibration over a bed that moves; None where it is not seen to.
+
+    A calibration whose own constant error of the reference holds most of that velocity is only marginal.
+    """
+    if found is None:
+        return None
+    size = float(np.linalg.norm(found.over_ground))
+    if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < SURELY * found.over_ground_std).all():
+        return None
+    own = [estimate.state_of(name) if name in estimate.state_names else 0.0 for name in OFFSETS]
+    is_held = float(np.linalg.norm(found.over_ground - own)) < 0.5 * size
+    course = math.degrees(math.atan2(*found.over_ground)) % 360.0
+    moves = finding("BED_MOVES", millimetres=1000.0 * size, course=course, std=float(f"{size:.1g}"))
+    return moves.weighed(Severity.MARGINAL if is_held else Severity.REJECT)
 
 
 def residual_warnings(
