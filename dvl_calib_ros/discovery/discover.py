@@ -30,6 +30,7 @@ from ..calibration.streams.screening import NOT_MEASURED_VARIANCE
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named, turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
+from ..recordings.pose_orientation import ORIENTATION
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topic_preview import Look, Survey
 from ..recordings.topics import Topics
@@ -152,12 +153,17 @@ class _Search:
         else:
             gnss = topic_choice.NONE
         if given.imu_topic is None:
-            imu = topic_choice.choose_imu(self._seen, default.imu) or default.imu
+            imu = topic_choice.choose_imu(self._seen, default.imu, gnss) or default.imu
         else:
             imu = (
                 topic_choice.NONE
                 if given.imu_topic == topic_choice.NONE
                 else self._named("imu", given.imu_topic) or imu
+            )
+        if imu.endswith(ORIENTATION) and imu in self._seen.topics:
+            self._found.append(
+                f"no IMU gives an attitude; it is the orientation of {imu.removesuffix(ORIENTATION)}, and turn rates "
+                "are its derivative"
             )
         return Topics(dvl, gnss, imu)
 

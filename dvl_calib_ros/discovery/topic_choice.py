@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, POSE_TYPES, REFERENCE_TYPES, TWIST_TYPE
+from ..recordings.pose_orientation import ORIENTATION
 from ..recordings.topics import spelled
 from ..verdict.reasons import Reason, finding
 
@@ -172,10 +173,11 @@ def _rank(look: Look) -> float:
     return 0.0 if look.msgtype == TWIST_TYPE else 1.0
 
 
-def choose_imu(survey: Survey, default: str) -> str | None:
-    """The IMU's topic, or None."""
+def choose_imu(survey: Survey, default: str, reference: str = "") -> str | None:
+    """The IMU's topic, or None. reference: that topic, whose poses may hold orientations."""
     standard = spelled(default, survey.topics)
-    if standard is not None and survey.topics[standard] == IMU_TYPE:
+    of_poses = reference + ORIENTATION
+    if standard is not None and survey.topics[standard] == IMU_TYPE and of_poses not in survey.topics:
         return standard
     looks = [look for look in survey.looks.values() if look.msgtype == IMU_TYPE]
     if not looks:
@@ -183,7 +185,8 @@ def choose_imu(survey: Survey, default: str) -> str | None:
 
     def order(look: Look) -> tuple[object, ...]:
         name = look.topic.lower()
-        return (not look.has_orientation, _has(look, DVL_WORDS), "raw" in name, "filtered" in name, -look.count, name)
+        last = ("raw" in name, "filtered" in name, -look.count, name)
+        return (not look.has_orientation, look.topic != of_poses, _has(look, DVL_WORDS), *last)
 
     return min(looks, key=order).topic
 

@@ -31,6 +31,7 @@ from ..messages.type_recognition import recognised
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from .columns import Collector, TopicColumns, is_kept
 from .far_stamps import without_far
+from .pose_orientation import hold_orientations, orientations_of
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, recorded
 from .topic_preview import Survey, look_of
@@ -337,10 +338,16 @@ def _read(
         columns[topic] = columns[topic].restamped()
     kept, file_spans_ns, aside = without_far(columns, bag.file_spans_ns)
     counts.subtract({topic: len(columns[topic]) - len(own) for topic, own in kept.items()})
+    held = {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types}
+    imus = [own for own in kept.values() if own.msgtype == IMU_TYPE]
+    if not any(len(own.singles) or hold_orientations(own.laid.values) for own in imus):
+        for own in filter(None, map(orientations_of, list(kept.values()))):
+            kept[own.topic], counts[own.topic] = own, len(own)
+            types, held[own.topic] = {**types, own.topic: IMU_TYPE}, Held(frozenset({IMU_TYPE}), False)
     return Recording(
         (path,),
         types,
-        {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types},
+        held,
         counts,
         file_spans_ns,
         (*bag.notes, *map(str, aside)),
