@@ -1,7 +1,7 @@
 """Watch a calibration node that runs somewhere on the ROS domain: mounting, what it is worth, what to drive next.
 
-Ctrl-C or q ends the view, not the node; s saves, r twice forgets all. ``dvl-calib run --watch`` starts a node and
-watches it; there they end both.
+Ctrl-C or q ends the view, not the node; s saves, r twice forgets all, w shows all warnings. ``dvl-calib run --watch``
+starts a node and watches it; there they end both.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import IO, TYPE_CHECKING
+from dataclasses import dataclass
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 from ..errors import printable
 from ..node.main import ENDS_WITH_STDIN
@@ -24,7 +25,8 @@ from ..standard_streams import say
 from . import common
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import Console, ConsoleOptions, RenderResult
+    from rich.text import Text
 
     from ..node.listener import Listener
     from ..node.shutdown import Ending
@@ -144,51 +146,124 @@ MOUNTING = (
 )
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 HEIGHTS = " ▁▂▃▄▅▆▇█"
-GOALS = (("worth", "dead reckoning"), ("side", "  by yaw"), ("ahead", "  by scale"))
-KEYS = "s save   r r forget all   q quit"
+GOALS = (("worth", "drift"), ("side", " yaw"), ("ahead", " scale"))
+KEYS = "s save  r r forget  w warnings  q quit"
+# Columns from which on three quantities of the mounting are in a row, and what is next is in one line.
+WIDE = 76
 
 
-def rendered(status: Status | None, now_s: float, log: Sequence[str] = (), said: str = "") -> RenderableType:
-    """The view. now_s: monotonic time. log: last lines that the node has written. said: in answer to a key."""
-    from rich.console import Group
-    from rich.text import Text
+class Row(NamedTuple):
+    """A row of the view, which is folded to the terminal's width: at least and at most so many lines."""
 
-    def text(line: str, style: str = "") -> Text:
-        return Text(printable(line), style=style, overflow="ellipsis", no_wrap=True)
+    text: str
+    style: str = ""
+    most: int = 3
+    least: int = 1
 
-    tail = [text(line, "dim") for line in log[-LOG_LINES:]]
-    if status is None:
-        return Group(text("waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)", "yellow"), *tail)
-    colour = COLOURS.get(status.level, "red")
-    lines: list[RenderableType] = [text(_head(status), "bold")]
-    silent = now_s - status.received_s
-    if silent > SILENCE_S:
-        lines.insert(0, text(f"nothing heard of the node for {silent:.0f} s", "bold red"))
-    if status.level:
-        lines.append(Text(printable(status.message), style=colour))
-    lines += [text("   ".join(_stream(status, *each) for each in STREAMS)), text("")]
-    is_usable, code = status.get("usable") != "no", status.get("next code")
-    unusable = "see above" if code == "NEXT_REJECTED" else "the data do not show it yet"
-    lines.append(text("mounting now") if is_usable else text(f"mounting: not to be used, {unusable}", colour))
-    lines += [text("  ".join(_quantity(status, *each) for each in row), "" if is_usable else "dim") for row in MOUNTING]
+    def lines(self, console: Console, width: int) -> list[Text]:
+        """Return its lines; what does not fit ends in an ellipsis."""
+        from rich.text import Text
+
+        lines = list(Text(printable(self.text), self.style).wrap(console, width, overflow="fold"))
+        if len(lines) > self.most:
+            lines = lines[: self.most]
+            lines[-1].truncate(width - 1)
+            lines[-1].append("…")
+        return lines + [Text()] * (self.least - len(lines))
+
+
+@dataclass(frozen=True)
+class View:
+    """What is drawn, as it fits the terminal: rows at fixed places first, and at the bottom what may be left out.
+
+    now_s: monotonic time. log: lines that the node has written. event: what happened last. page: how often all
+    warnings were asked for.
+    """
+
+    status: Status | None
+    now_s: float
+    log: Sequence[str] = ()
+    event: str = ""
+    page: int = 0
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield its lines, no more than the terminal has."""
+        width, height = options.max_width, options.size.height
+        tail = [Row(line, "dim", most=1) for line in self.log[-LOG_LINES:]]
+        fixed, body, warnings = (
+            [Row("waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)", "yellow")],
+            tail,
+            [],
+        )
+        if self.status is not None:
+            fixed, warnings = self._fixed(self.status, width), _warnings(self.status)
+            body = [*_body(self.status, warnings, width), *tail]
+
+        def folded(rows: Iterable[Row]) -> list[Text]:
+            return [line for row in rows for line in row.lines(console, width)]
+
+        lines = folded(fixed)
+        room = max(height - len(lines) - 1, 1)
+        told = folded(Row(f"{number}. {each}", most=height) for number, each in enumerate(warnings, start=1))
+        pages = [told[at : at + room] for at in range(0, len(told), room)]
+        page = self.page % (len(pages) + 1)
+        if page:
+            lines += [*pages[page - 1], *folded([Row(f"page {page} of {len(pages)} (w goes on)", "dim", most=1)])]
+        else:
+            lines += folded(body)
+        yield from lines[:height]
+
+    def _fixed(self, status: Status, width: int) -> list[Row]:
+        silent, code = self.now_s - status.received_s, status.get("next code")
+        state = Row(f"model {status.get('model')}   {_duration(status.get('elapsed [s]'))}", "bold", most=1)
+        if silent > SILENCE_S:
+            state = Row(f"nothing heard of the node for {silent:.0f} s", "bold red", most=1)
+        following = ""
+        if _is_usable(status) or not ("REJECTED" in code or "GOOD" in code):
+            seconds = status.get("seconds")
+            about = "" if seconds == "-" else f", about {_duration(seconds)} until good enough"
+            following = f"next: {status.get('next')}{about}"
+        lines = 1 if width >= WIDE else 2
+        return [
+            state,
+            _goal(status, *GOALS[0], width),
+            Row(following, "bold green" if "GOOD" in code else "bold", most=lines, least=lines),
+            Row(KEYS, "dim", most=lines),
+            Row(self.event, "cyan"),
+        ]
+
+
+def _is_usable(status: Status) -> bool:
+    return status.get("usable") != "no"
+
+
+def _warnings(status: Status) -> list[str]:
+    found = [each for n in range(1, 100) if (each := status.values.get(f"finding {n}"))]
+    taken_back = status.values.get("taken back", "") if _is_usable(status) else ""
+    return [*filter(None, [taken_back]), *(found or [status.message] * bool(status.level))]
+
+
+def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
+    """Yield the mounting, the first warning, and what may be left out."""
+    is_usable, colour = _is_usable(status), COLOURS.get(status.level, "red")
+    why = "see below" if status.get("next code") == "NEXT_REJECTED" else "the data do not show it yet"
+    between = [Row("")] if width >= WIDE else []
+    yield from between
+    yield Row("mounting now") if is_usable else Row(f"mounting: not to be used, {why}", colour, most=2)
+    for each in MOUNTING:
+        found = [_quantity(status, *quantity) for quantity in each]
+        for text in ["  ".join(found)] if width >= WIDE else found:
+            yield Row(text, "" if is_usable else "dim")
     if is_usable and (sound := status.values.get("speed of sound", "")):
-        lines.append(text(f"speed of sound  {sound}"))
-    lines.append(text(""))
-    lines += [_goal(status, *each) for each in GOALS if f"goal {each[0]} [%]" in status.values]
-    lines.append(text(_rose(status)))
-    if is_usable or not ("REJECTED" in code or "GOOD" in code):
-        if taken_back := status.values.get("taken back", ""):
-            lines.append(text(taken_back, "yellow"))
-        seconds = status.get("seconds")
-        about = "" if seconds == "-" else f", about {_duration(seconds)} until good enough"
-        style = "bold green" if "GOOD" in code else "bold"
-        lines.append(text(f"next: {status.get('next')}{about}", style))
-    lines += [text(""), text(f"{KEYS}   {said}".rstrip(), "dim")]
-    return Group(*lines, *tail)
-
-
-def _head(status: Status) -> str:
-    return f"model {status.get('model')}   {_duration(status.get('elapsed [s]'))}"
+        yield Row(f"speed of sound  {sound}", most=2)
+    if warnings:
+        yield Row(warnings[0], colour if status.level else "yellow", most=2)
+    if len(warnings) > 1:
+        yield Row(f"+{len(warnings) - 1} more (w)", colour)
+    yield from between
+    yield Row("   ".join(_stream(status, *each) for each in STREAMS))
+    yield from (_goal(status, *each, width) for each in GOALS[1:] if f"goal {each[0]} [%]" in status.values)
+    yield Row(_rose(status))
 
 
 def _duration(text: str) -> str:
@@ -221,28 +296,21 @@ def _quantity(status: Status, name: str, unit: str, shown: str) -> str:
     return f"{name:5} {value:>7}" + (f" ±{std}{shown}" if std[:1].isdigit() else f"{shown}, as set").ljust(11)
 
 
-def _goal(status: Status, key: str, shown: str) -> RenderableType:
-    from rich.text import Text
-
+def _goal(status: Status, key: str, shown: str, width: int) -> Row:
     percent = min(_number(status.get(f"goal {key} [%]")), 100.0)
-    full = round(BAR * percent / 100.0)
     names = {"worth": "worth", "side": "worth to the side", "ahead": "worth ahead"}
     goal = f", goal {status.get('target')}" if key == "worth" else ""
-    return Text.assemble(
-        f"{shown:15} ",
-        ("█" * full, "green" if percent >= 100.0 else "yellow"),
-        ("░" * (BAR - full), "dim"),
-        printable(f" {percent:3.0f} %  {status.get(names[key])} m per km{goal}"),
-        overflow="ellipsis",
-        no_wrap=True,
-    )
+    bar = max(0, min(BAR, width - 32))
+    full = round(bar * percent / 100.0)
+    text = f"{shown:7}{'█' * full}{'░' * (bar - full)} {percent:3.0f} %  {status.get(names[key])} m/km{goal}"
+    return Row(text, "green" if percent >= 100.0 else "yellow")
 
 
 def _rose(status: Status) -> str:
     driven = [_number(status.get(f"driven {sector} [s]")) for sector in SECTORS]
     most = max(max(driven), 1.0)
     heights = (HEIGHTS[round((len(HEIGHTS) - 1) * seconds / most)] for seconds in driven)
-    return "headings        " + "  ".join(f"{sector}{height}" for sector, height in zip(SECTORS, heights, strict=True))
+    return "headings  " + "  ".join(f"{sector}{height}" for sector, height in zip(SECTORS, heights, strict=True))
 
 
 def line(status: Status) -> str:
@@ -254,12 +322,13 @@ def line(status: Status) -> str:
 
 
 class Keys:
-    """What single keys ask of a node; what came of it is in `said`."""
+    """What single keys ask of a node; what came of it is in `said`. page: how often all warnings were asked for."""
 
     def __init__(self, listener: Listener) -> None:
         self._listener = listener
         self._asked_s = -SURE_S
         self._own = ""
+        self.page = 0
 
     @property
     def said(self) -> str:
@@ -271,6 +340,7 @@ class Keys:
         is_sure = key == "r" and now_s - self._asked_s < SURE_S
         self._asked_s = now_s if key == "r" and not is_sure else -SURE_S
         self._own = "press r again to forget all that was learnt" if key == "r" and not is_sure else ""
+        self.page += key == "w"
         if key == "s":
             self._listener.call("save")
         elif is_sure:
@@ -312,14 +382,17 @@ def show(
         return
     from rich.live import Live
 
-    keys = Keys(listener)
-    with _single_keys() as pressed, Live(rendered(None, 0.0, log), console=console, auto_refresh=False) as live:
+    keys, event, before = Keys(listener), "", ("", "")
+    with _single_keys() as pressed, Live(View(None, 0.0, log), console=console, auto_refresh=False) as live:
         while is_running():
             status, now_s = listener.latest(REDRAW_S), time.monotonic()
             while key := pressed():
                 if not keys.press(key, now_s):
                     return
-            live.update(rendered(status, now_s, log, keys.said), refresh=True)
+            news = (log[-1] if log else "", keys.said)
+            event = next((new for new, old in zip(news, before, strict=True) if new != old), event)
+            before = news
+            live.update(View(status, now_s, log, event, keys.page), refresh=True)
 
 
 def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:

@@ -68,7 +68,8 @@ class Listener:
 
     def _on_answer(self, future: Any) -> None:
         error = future.exception()
-        self.answer = future.result().message if error is None else printable(str(error))
+        said = future.result().message if error is None else printable(str(error))
+        self.answer = f"{time.strftime('%H:%M:%S')} {said}"  # the same answer twice is seen to be another
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -116,7 +116,7 @@ def watch(folder: Path) -> None:
     from dvl_calib_ros.bags.reader import BagReader
     from dvl_calib_ros.calibration.calibrator import Calibrator
     from dvl_calib_ros.calibration.models.parameters import Parameters
-    from dvl_calib_ros.cli.watch import rendered
+    from dvl_calib_ros.cli.watch import View
     from dvl_calib_ros.messages.live_feed import MessageFeed
     from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
     from dvl_calib_ros.node.operator_card import Card
@@ -137,7 +137,7 @@ def watch(folder: Path) -> None:
             if now_s == 250.0:
                 break
     values = {item.key: item.value for item in found.values}
-    shown = rendered(Status(ord(found.level), found.message, values, 0.0), 0.0)
+    shown = View(Status(ord(found.level), found.message, values, 0.0), 0.0)
     terminal(shown, folder, "watch", "dvl-calib run --watch", 100)
 
 
