@@ -76,7 +76,7 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
         try:
             assert process.stdout is not None  # a pipe
             log = _Log(process.stdout)
-            show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log.lines)
+            show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log.lines, True)
             said = len(log.lines) if process.poll() is None else 0  # lines that are on the screen already
         finally:
             code = _ended(process)
@@ -147,6 +147,7 @@ MOUNTING = (
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 HEIGHTS = " ▁▂▃▄▅▆▇█"
 GOALS = (("worth", "drift"), ("side", " yaw"), ("ahead", " scale"))
+WORSE = "[RESULT_WORSE]"
 KEYS = "s save  r r forget  w warnings  q quit"
 # Columns from which on three quantities of the mounting are in a row, and what is next is in one line.
 WIDE = 76
@@ -229,7 +230,7 @@ class View:
             _goal(status, *GOALS[0], width),
             Row(following, "bold green" if "GOOD" in code else "bold", most=lines, least=lines),
             Row(KEYS, "dim", most=lines),
-            Row(self.event, "cyan"),
+            Row(self.event, "cyan", most=4),
         ]
 
 
@@ -322,12 +323,17 @@ def line(status: Status) -> str:
 
 
 class Keys:
-    """What single keys ask of a node; what came of it is in `said`. page: how often all warnings were asked for."""
+    """What single keys ask of a node; what came of it is in `said`. page: how often all warnings were asked for.
 
-    def __init__(self, listener: Listener) -> None:
+    ends_node: whether the node ends with the view. Then q saves first, and asks before a better result is replaced.
+    """
+
+    def __init__(self, listener: Listener, ends_node: bool = False) -> None:
         self._listener = listener
+        self._ends_node = ends_node
         self._asked_s = -SURE_S
         self._own = ""
+        self._is_leaving = False
         self.page = 0
 
     @property
@@ -339,13 +345,28 @@ class Keys:
         """Do what it asks for; False to leave the view."""
         is_sure = key == "r" and now_s - self._asked_s < SURE_S
         self._asked_s = now_s if key == "r" and not is_sure else -SURE_S
-        self._own = "press r again to forget all that was learnt" if key == "r" and not is_sure else ""
         self.page += key == "w"
-        if key == "s":
+        if self._is_leaving:
+            if key == "y" and self._own:
+                self._own = ""
+                self._listener.call("save_anyway")
+            return key not in ("n", "q")
+        self._own = "press r again to forget all that was learnt" if key == "r" and not is_sure else ""
+        if key == "s" or (key == "q" and self._ends_node):
             self._listener.call("save")
         elif is_sure:
             self._listener.call("reset")
-        return key != "q"
+        self._is_leaving = key == "q"
+        return key != "q" or self._ends_node
+
+    def has_left(self) -> bool:
+        """Whether q was pressed, and nothing is to be waited for or asked any more."""
+        if not self._is_leaving or self._listener.is_waiting or self._own:
+            return False
+        if WORSE not in self._listener.answer:
+            return True
+        self._own = f"replace the better result? (y/n)  {self._listener.answer}"
+        return False
 
 
 @contextmanager
@@ -371,8 +392,11 @@ def show(
     listener: Listener,
     is_running: Callable[[], bool] = lambda: True,
     log: Sequence[str] = (),
+    ends_node: bool = False,
 ) -> None:
     """Draw while it is running, or until q. listener: whose latest status is drawn, and who is told of keys.
+
+    ends_node: whether the node ends with the view.
 
     On a terminal the view is drawn in place; elsewhere a line is written when something has changed, or now and then.
     """
@@ -382,13 +406,15 @@ def show(
         return
     from rich.live import Live
 
-    keys, event, before = Keys(listener), "", ("", "")
+    keys, event, before = Keys(listener, ends_node), "", ("", "")
     with _single_keys() as pressed, Live(View(None, 0.0, log), console=console, auto_refresh=False) as live:
         while is_running():
             status, now_s = listener.latest(REDRAW_S), time.monotonic()
             while key := pressed():
                 if not keys.press(key, now_s):
                     return
+            if keys.has_left():
+                return
             news = (log[-1] if log else "", keys.said)
             event = next((new for new, old in zip(news, before, strict=True) if new != old), event)
             before = news

@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from ..calibration.checks.speed_of_sound import Water, water_document
+from ..calibration.comparison.mounting_change import MOVED
 from ..calibration.filters.cross_validation import with_states_of
 from ..calibration.filters.filter_setup import prior
 from ..calibration.filters.observability import Convergence
@@ -27,13 +28,17 @@ from ..calibration.numerics.frames import (
     quaternion_from_rotation,
     rotation_from_rpy,
     rpy_from_rotation,
+    turn_between,
 )
 from ..calibration.numerics.kalman import GaussianState
+from ..calibration.numerics.tests import chi2_sf
 from ..calibration.results.held_out_verification import verification_document
 from ..calibration.results.results import Estimate, Result, mounting_pose, position_in_body, scale_and_delay
 from ..disk.atomic import own_stream, save_bytes
 from ..disk.yaml_files import load_yaml
 from ..errors import InputError, printable
+from ..verdict.kinds import Severity
+from ..verdict.reasons import finding
 from ..version import __version__
 
 _ANY_FORMAT = "dvl_calib_ros result"
@@ -189,7 +194,7 @@ def save_result(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> 
 
     Raises
     ------
-    NothingUsedError: If no sample was used, and the file there is not known to be as empty.
+    KeptError: If no sample was used, and the file there is not known to be as empty.
     InputError: If it cannot be written.
 
     """
@@ -198,12 +203,77 @@ def save_result(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> 
         before = _Worth.of_file(path)
         if before is None or before.used:
             holds = "is no result file" if before is None else f"holds a result of {before.used} samples"
-            raise NothingUsedError(f"no sample was used, so there is nothing to save: {path}, which {holds}, is kept")
+            raise KeptError(f"no sample was used, so there is nothing to save: {path}, which {holds}, is kept")
     save_bytes(path, result_text(document).encode(), partial(_worth_keeping, _Worth.of(document), n_backups))
 
 
-class NothingUsedError(InputError):
-    """A result without a sample would replace something."""
+class KeptError(InputError):
+    """The result of before is kept: the newer is of no sample, or worse."""
+
+
+def save_unless_worse(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> None:
+    """Write a result as `save_result` does, but next to a better one of the same mounting. Raises KeptError then."""
+    better = _better(path, document) if document["used"] and own_stream(path) is None else None
+    if better is None:
+        return save_result(path, document, n_backups)
+    beside = path.with_name(f"{path.stem}.newer{path.suffix}")
+    save_result(beside, document, n_backups)
+    before, now = _quality_in_words(better), _quality_in_words(document)
+    raise KeptError(str(finding("RESULT_WORSE", path=path, beside=beside, before=before, now=now)))
+
+
+def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the result in a file if it is of the same mounting and better; None otherwise.
+
+    Better is a better verdict. Of equal verdicts that of another run with the smaller σ, if the angles agree: of a DVL
+    that has moved the older σ says nothing.
+    """
+    try:
+        before: Any = load_yaml(path, "result file")
+        ranks = [_QUALITIES.index(_quality(each)) for each in (before, document)]
+        old, new = (each["mounting"] for each in (before, document))
+        p_old, p_new = (_covariance_of_angles(each) for each in (old, new))
+        rotations = [rotation_from_rpy(each["corrected_rpy"]) for each in (old, new)]
+        same = all(old[name] == new[name] for name in ("nominal_rpy", "frame_id", "child_frame_id"))
+        continued = _Worth.of(before).continued_by(_Worth.of(document))
+        both = np.flatnonzero((np.diag(p_old) > 0.0) & (np.diag(p_new) > 0.0))
+        turn, p = turn_between(*rotations)[both], (p_old + p_new)[np.ix_(both, both)]
+        moved = bool(len(both)) and chi2_sf(float(turn @ np.linalg.solve(p, turn)), len(both)) < MOVED
+    except (InputError, OSError, LookupError, TypeError, ValueError, OverflowError):
+        return None  # no result file, or a damaged one
+    if not same or ranks[0] < ranks[1] or not before["used"]:
+        return None
+    if ranks[0] > ranks[1]:
+        return before
+    return before if not continued and not moved and _spread(p_new) > _spread(p_old) else None
+
+
+def _covariance_of_angles(mounting: Mapping[str, Any]) -> Array:
+    return np.array(mounting["pose_covariance"], dtype=float)[3:, 3:]
+
+
+def _spread(covariance: Array) -> tuple[int, float]:
+    """Return how many angles are not estimated, and the sum of the variances (rad²) of the others."""
+    variances = np.diag(covariance)
+    return int((variances <= 0.0).sum()), float(variances[variances > 0.0].sum())
+
+
+# From the one that says least
+_QUALITIES = ("collecting", "reject", "not verified", "marginal", "accept")
+
+
+def _quality(document: Mapping[str, Any]) -> str:
+    """Return the verdict that a result is worth: data that show no angle, and doubts that reject, go before its own."""
+    if document["convergence"] == Convergence.COLLECTING.value:
+        return "collecting"
+    if any(each["severity"] == Severity.REJECT.value for each in document.get("doubts", ())):
+        return Severity.REJECT.value
+    return str(document["verification"]["verdict"]) if "verification" in document else "not verified"
+
+
+def _quality_in_words(document: Mapping[str, Any]) -> str:
+    sigma = math.degrees(math.sqrt(_spread(_covariance_of_angles(document["mounting"]))[1]))
+    return f"{_quality(document)}, ±{sigma:.2f}° of {document['used']} samples"
 
 
 @dataclass(frozen=True)

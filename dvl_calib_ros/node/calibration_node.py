@@ -41,12 +41,13 @@ from ..errors import InputError, printable
 from ..files.output_paths import check_outputs
 from ..files.parameter_files import NODE_NAME
 from ..files.result_file import (
-    NothingUsedError,
+    KeptError,
     check_in_folder,
     load_initial_calibration,
     result_document,
     result_text,
     save_result,
+    save_unless_worse,
 )
 from ..messages.decode import RESTAMP_ALL, frame_name, heading_variance
 from ..messages.live_feed import MessageFeed
@@ -147,7 +148,8 @@ class CalibrationNode(AnsweringNode):
         self._water: Water | None = None
         self._newest_dvl: Any = None
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/save", self._on_save)
+        self.create_service(Trigger, "~/save", partial(self._on_save, save_unless_worse))
+        self.create_service(Trigger, "~/save_anyway", partial(self._on_save, save_result))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         # steady: diagnostics go on while simulated time stands still or jumps
@@ -484,14 +486,16 @@ class CalibrationNode(AnsweringNode):
         response.success, response.message = True, "all samples forgotten"
         return response
 
-    def _on_save(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_save(
+        self, save: Callable[..., None], request: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
         path = self._calibrator.parameters.result_file
         if not path:
             response.message = "parameter result_file is not set: ros2 param set /dvl_calibration result_file FILE"
             return response
         try:
-            self._save(Path(path))
-        except NothingUsedError as error:
+            self._save(Path(path), save)
+        except KeptError as error:
             response.message = str(error)
         except InputError as error:
             response.message = str(error)
@@ -500,11 +504,11 @@ class CalibrationNode(AnsweringNode):
             response.success, response.message = True, f"saved to {path}"
         return response
 
-    def _save(self, path: Path) -> None:
+    def _save(self, path: Path, save: Callable[..., None] = save_unless_worse) -> None:
         self._save_problem = None
         try:
-            save_result(path, self._result_document(), round(self._calibrator.parameters.result_backups))
-        except NothingUsedError:
+            save(path, self._result_document(), round(self._calibrator.parameters.result_backups))
+        except KeptError:
             raise
         except InputError as error:
             self._save_problem = finding("RESULT_NOT_SAVED", reason=error)
@@ -557,7 +561,7 @@ class CalibrationNode(AnsweringNode):
         try:
             self._save(Path(path))
             say(f"calibration_node: saved to {path}")
-        except NothingUsedError as error:
+        except KeptError as error:
             say(f"calibration_node: {error}")
         except InputError as error:
             result = result_text(self._result_document())

@@ -16,7 +16,7 @@ from .services import AnsweringNode
 from .status import Status, status_name
 
 # What a node can be asked for.
-SERVICES = ("save", "reset")
+SERVICES = ("save", "save_anyway", "reset")
 
 
 class Listener:
@@ -30,6 +30,8 @@ class Listener:
         self._full_name = f"/{node.strip('/')}"
         self.answer = ""
         """What the last call came to."""
+        self.is_waiting = False
+        """Whether the answer to the last call is still to come."""
 
     def __enter__(self) -> Listener:
         self._context = rclpy.Context()
@@ -61,14 +63,15 @@ class Listener:
         """Ask the node for one of `SERVICES`; what comes of it is in `answer`, once `latest` has heard it."""
         client = self._clients[service]
         if not client.service_is_ready():
-            self.answer = f"{service}: the node does not answer"
+            self.answer, self.is_waiting = f"{service}: the node does not answer", False
             return
-        self.answer = f"{service} ..."
+        self.answer, self.is_waiting = f"{service} ...", True
         client.call_async(Trigger.Request()).add_done_callback(self._on_answer)
 
     def _on_answer(self, future: Any) -> None:
         error = future.exception()
         said = future.result().message if error is None else printable(str(error))
+        self.is_waiting = False
         self.answer = f"{time.strftime('%H:%M:%S')} {said}"  # the same answer twice is seen to be another
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:

@@ -450,6 +450,12 @@ FINDINGS = (
         "inspect the mounting; if it is right, save this result and start from that",
     ),
     Kind(
+        "RESULT_WORSE",
+        "{path} is kept, which is better ({before}); the newer result ({now}) is {beside}",
+        "A worse verdict, or a larger σ of another run, of the same mounting replaces nothing unasked.",
+        "to use the newer all the same, rename it, or call ~/save_anyway",
+    ),
+    Kind(
         "RESULT_NOT_SAVED",
         "the result was not saved: {reason}",
         "Full disk, a folder that is gone, or no permission. The file before is untouched.",

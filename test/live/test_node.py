@@ -116,6 +116,21 @@ def test_the_result_is_saved_whichever_way_the_node_is_stopped(stop, world, tmp_
     assert load_yaml(saved, "result file")["model"] == "F1"
 
 
+def test_a_node_that_a_signal_ends_early_keeps_the_better_result_and_puts_its_own_next_to_it(world, tmp_path, bag):
+    saved, beside = tmp_path / "live.yaml", tmp_path / "live.newer.yaml"
+    save_result(saved, result_document(replay([bag], Parameters()).result), 3)
+    better = saved.read_bytes()
+    with world.calibration_node(f"result_file:={saved}") as process:
+        told = world.received(DiagnosticArray, "/diagnostics")
+        Publisher(world).send(*(twist(1000 + 0.2 * i) for i in range(10)))
+        until(
+            lambda: told and {each.key: each.value for each in told[-1].status[0].values}["dvl received"] == "10", "all"
+        )
+    last = process.output.splitlines()[-1]
+    assert process.returncode == 0 and f"{saved} is kept, which is better" in last and str(beside) in last
+    assert saved.read_bytes() == better and load_yaml(beside, "result file")["used"] == 10
+
+
 def test_a_node_that_gets_no_data_leaves_the_result_before_and_its_backup_as_they_are(world, tmp_path, bag):
     saved = tmp_path / "live.yaml"
     good = replay([bag], Parameters()).result

@@ -25,6 +25,7 @@ from dvl_calib_ros.calibration.filters.observability import observability
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli.watch import LINE_S, SILENCE_S, SURE_S, Keys, View, line, show
+from dvl_calib_ros.files.result_file import result_document, save_result
 from dvl_calib_ros.node.status import Status
 from dvl_calib_ros.verdict.reasons import finding
 
@@ -97,6 +98,7 @@ class Asked:
     """A listener that remembers what was asked for."""
 
     answer = "saved to x.yaml"
+    is_waiting = False
 
     def __init__(self) -> None:
         self.calls: list[str] = []
@@ -115,6 +117,29 @@ def test_keys_save_and_leave_and_forget_only_when_pressed_twice():
     keys.press("r", 9.0), keys.press("s", 9.1), keys.press("r", 9.2)
     assert listener.calls == ["save", "reset", "save"]
     assert not keys.press("q", 10.0)
+
+
+def test_q_asks_before_a_worse_result_replaces_a_better_one():
+    """Where the node ends with the view; a view of a node elsewhere just leaves."""
+    for answer, key, calls in (
+        ("saved to x.yaml", "", ["save"]),
+        ("parameter result_file is not set", "", ["save"]),
+        ("x.yaml is kept [RESULT_WORSE]", "n", ["save"]),
+        ("x.yaml is kept [RESULT_WORSE]", "y", ["save", "save_anyway"]),
+    ):
+        listener = Asked()
+        keys = Keys(listener, ends_node=True)
+        listener.answer, listener.is_waiting = "save ...", True
+        assert keys.press("q", 1.0) and not keys.has_left() and listener.calls == ["save"]
+        listener.answer, listener.is_waiting = answer, False
+        assert keys.has_left() == (not key)
+        if key:
+            assert keys.said.startswith("replace the better result? (y/n)  x.yaml is kept") and not keys.has_left()
+            assert keys.press("x", 2.0), "another key answers nothing"
+            went_on = keys.press(key, 3.0)
+            listener.answer = "saved to x.yaml"
+            assert keys.has_left() if went_on else key == "n"
+        assert listener.calls == calls
 
 
 MOUNTED = {
@@ -355,6 +380,33 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
     assert saved.exists()
     assert f"saved to {saved}" in text and "Traceback" not in text
     assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")  # the cursor is back
+
+
+@pytest.mark.parametrize(("key", "kept"), [(b"n", True), (b"y", False)])
+def test_q_does_not_replace_a_good_result_by_a_few_samples_without_asking(world, tmp_path, key, kept):
+    from geometry_msgs.msg import TwistWithCovarianceStamped
+    from ros import until
+
+    saved = tmp_path / "result.yaml"
+    calibrated = result_document(calibrate(make_samples(MatchedRun(dvl_std=0.01, gnss_std=0.01))).result())
+    save_result(saved, calibrated | {"verification": {"verdict": "accept", "reasons": ["so"]}})
+    good = saved.read_bytes()
+    with terminal(world, "run", "--watch", "-p", f"result_file:={saved}") as screen:
+        publisher = world.node.create_publisher(TwistWithCovarianceStamped, "dvl/twist", 100)
+        until(lambda: publisher.get_subscription_count() == 1, "the node's subscription")
+        message = TwistWithCovarianceStamped()
+        message.header.stamp.sec, message.header.frame_id, message.twist.twist.linear.x = 1000, "dvl_link", 1.5
+        publisher.publish(message)
+        screen.until("mounting")
+        screen.until("DVL ")
+        screen.key(b"q")
+        screen.until("replace the better result? (y/n)")
+        assert saved.read_bytes() == good
+        screen.key(key)
+        last = screen.rest().rstrip().splitlines()[-1]
+        assert screen.process.wait(30) == 0
+    assert (saved.read_bytes() == good) == kept
+    assert (tmp_path / "result.newer.yaml").exists() and ("is kept, which is better" in last) == kept
 
 
 def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_running(world):

@@ -28,12 +28,13 @@ from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.mounting import load_extrinsics
 from dvl_calib_ros.files.result_file import (
-    NothingUsedError,
+    KeptError,
     load_initial_calibration,
     load_result,
     result_document,
     result_text,
     save_result,
+    save_unless_worse,
 )
 
 MOUNTING = (0.1, -0.2, 0.7)
@@ -172,11 +173,11 @@ def test_a_result_of_no_sample_replaces_nothing_that_holds_something(tmp_path, s
     before = saved.read_bytes()
     empty = {**result_document(result), "used": 0}
     for _ in range(3):
-        with pytest.raises(NothingUsedError, match=rf"no sample was used.*of {result.estimate.used} samples, is kept"):
+        with pytest.raises(KeptError, match=rf"no sample was used.*of {result.estimate.used} samples, is kept"):
             save_result(saved, empty, 3)
     notes = tmp_path / "notes.yaml"
     notes.write_text("not a result")
-    with pytest.raises(NothingUsedError, match="is no result file, is kept"):
+    with pytest.raises(KeptError, match="is no result file, is kept"):
         save_result(notes, empty, 3)
     assert saved.read_bytes() == before and notes.read_text() == "not a result"
     assert sorted(os.listdir(tmp_path)) == ["notes.yaml", "result.yaml"]
@@ -187,6 +188,76 @@ def test_where_the_disk_has_gone_the_error_is_one_that_the_node_knows_and_prints
     """A name too long stands in for it: the system's answer to every question is an error."""
     with pytest.raises(InputError, match="could not be written"):
         save_result(tmp_path / ("x" * 300 + ".yaml"), document(used, "collecting"))
+
+
+def judged(
+    result, verdict: str, wider: float = 1.0, turned_deg: float = 0.0, first_ns: int = 5, without=(), **also
+) -> dict:
+    """A document with this verdict, σ so many times as large, and a yaw that differs by so much."""
+    whole = result_document(result)
+    mounting = dict(whole["mounting"])
+    roll, pitch, yaw = mounting["corrected_rpy"]
+    mounting["pose_covariance"] = (wider**2 * np.array(mounting["pose_covariance"])).tolist()
+    mounting["corrected_rpy"] = [roll, pitch, yaw + math.radians(turned_deg)]
+    for axis in without:  # as of a model that does not estimate it
+        mounting["pose_covariance"][3 + axis] = [0.0] * 6
+        mounting["pose_covariance"][3 + axis][3 + axis] = -1.0
+    head = {
+        "convergence": "coarse",
+        "verification": {"verdict": verdict, "reasons": ["so"]},
+        "time_span": {"first_ns": first_ns, "last_ns": 9},
+    }
+    return {**whole, **head, "mounting": mounting, **also}
+
+
+WORSE = {
+    "rejected": {"verdict": "reject", "wider": 0.5},
+    "rejected, of another angle": {"verdict": "reject", "turned_deg": 60.0},
+    "doubted": {"verdict": "accept", "wider": 0.5, "doubts": [{"severity": "reject", "says": "no"}]},
+    "without any angle": {"verdict": "accept", "wider": 0.5, "convergence": "collecting"},
+    "marginal": {"verdict": "marginal"},
+    "less sure": {"verdict": "accept", "wider": 2.0},
+    "of a model without roll": {"verdict": "accept", "wider": 0.5, "without": (0,)},
+    "of a model without any angle": {"verdict": "accept", "wider": 0.5, "without": (0, 1, 2)},
+    "marginal, of the same run later on": {"verdict": "marginal", "first_ns": 1},
+}
+AS_GOOD = {
+    "surer": {"verdict": "accept", "wider": 0.5},
+    "less sure, of the same run later on": {"verdict": "accept", "wider": 1.1, "first_ns": 1},
+    "of a DVL that has moved": {"verdict": "accept", "wider": 1.1, "turned_deg": 60.0},
+}
+
+
+@pytest.mark.parametrize("worse", WORSE)
+def test_a_worse_result_does_not_replace_a_better_one_of_the_same_mounting(tmp_path, result, worse):
+    path = tmp_path / "r.yaml"
+    save_unless_worse(path, judged(result, "accept", first_ns=1))
+    better = path.read_bytes()
+    with pytest.raises(KeptError, match=r"r.yaml is kept.*\(accept, ±.*samples\).*r.newer.yaml.*RESULT_WORSE"):
+        save_unless_worse(path, judged(result, **WORSE[worse]))
+    assert path.read_bytes() == better
+    assert parsed((tmp_path / "r.newer.yaml").read_text())["verification"]["verdict"] == WORSE[worse]["verdict"]
+
+
+@pytest.mark.parametrize("as_good", AS_GOOD)
+def test_a_result_that_is_as_good_replaces_the_one_before(tmp_path, result, as_good):
+    path = tmp_path / "r.yaml"
+    for verdict in ("reject", "marginal", "accept"):
+        save_unless_worse(path, judged(result, verdict, wider=1.0 if verdict == "accept" else 0.1, first_ns=1))
+    save_unless_worse(path, judged(result, **AS_GOOD[as_good]))
+    assert sorted(os.listdir(tmp_path)) == ["r.yaml", "r.yaml.bak"]
+    kept, expected = parsed(path.read_text()), judged(result, **AS_GOOD[as_good])
+    assert all(kept[name] == expected[name] for name in ("mounting", "time_span", "verification"))
+
+
+def test_a_result_of_another_configured_mounting_or_over_no_result_is_saved(tmp_path, result):
+    path = tmp_path / "r.yaml"
+    path.write_text("damaged: [")
+    save_unless_worse(path, judged(result, "accept"))
+    turned = judged(result, "reject", first_ns=7)
+    turned["mounting"] = {**turned["mounting"], "nominal_rpy": [0.0, 0.0, 1.0]}
+    save_unless_worse(path, turned)
+    assert parsed(path.read_text())["verification"]["verdict"] == "reject"
 
 
 def test_an_empty_result_is_written_where_nothing_is_and_makes_room_without_a_trace(tmp_path):
@@ -229,7 +300,7 @@ def test_whatever_runs_follow_each_other_the_last_fine_one_is_kept(tmp_path_fact
     folder = tmp_path_factory.mktemp("runs")
     last_fine = None
     for number, (used, convergence) in enumerate(runs):
-        with suppress(NothingUsedError):
+        with suppress(KeptError):
             save_result(folder / "r.yaml", document(used, convergence, first_ns=number), n_backups)
             last_fine = used if used and convergence == "fine" else last_fine
         assert last_fine is None or last_fine in uses(folder)
