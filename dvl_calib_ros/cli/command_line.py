@@ -97,12 +97,17 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 
 def _run(argv: Sequence[str]) -> int:
-    arguments = build_parser(argv).parse_args(argv)
+    parser = build_parser(argv)
+    arguments = parser.parse_args(argv)
     from ..calibration.models.parameter_spec import ParameterError
     from ..errors import InputError
 
     recordings = recordings_now(arguments)
     try:
+        if hasattr(arguments, "profile"):
+            from .profile import with_profile
+
+            arguments = parser.parse_args(with_profile(argv, arguments))
         if "" in argv and any(str(path) == "." for path in paths_in(arguments)):  # pathlib takes one for the other
             raise InputError("the name of a file or folder is empty; is a variable of the shell not set?")
         code = int(arguments.run(arguments) or 0)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from ..standard_streams import give_up
+from . import profile
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
-    """--params and -p, as ROS 2 users know them."""
+    """--params and -p, as ROS 2 users know them, and --profile, which stores them."""
+    profile.add_option(parser)
     parser.add_argument("--params", type=Path, metavar="FILE", help="ROS 2 parameter file (YAML), as for the node")
     override = parser.add_argument(
         "-p", dest="overrides", action="append", default=[], metavar="NAME:=VALUE", help="set one parameter; repeatable"

@@ -1,0 +1,77 @@
+"""A vehicle's topics and parameters, stored in a file and used by every command that takes them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..standard_streams import say
+
+IN_FOLDER = Path(".dvl-calib.yaml")
+# Options that a profile may hold, next to `parameters`: none that names what is written.
+OPTIONS = ("dvl-topic", "gnss-topic", "imu-topic", "params")
+
+
+def add_option(parser: argparse.ArgumentParser) -> None:
+    """--profile."""
+    parser.add_argument(
+        "--profile", metavar="NAME",
+        help=f"stored topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file; default: {IN_FOLDER} of this "
+        "folder; none: without",
+    )  # fmt: skip
+
+
+def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str]:
+    """Return a command line with the options of the profile that applies in front of its own, which win.
+
+    Says on standard error which profile, and what it sets. Raises InputError.
+    """
+    path = _path(arguments.profile)
+    if path is None:
+        return [*argv]
+    words = _words(path)
+    say(f"profile {path}: {shlex.join(words)}")
+    after = list(argv).index(arguments.command) + 1
+    return [*argv[:after], *words, *argv[after:]]
+
+
+def _path(name: str | None) -> Path | None:
+    from ..errors import InputError
+
+    if name is None:
+        return IN_FOLDER if IN_FOLDER.exists() else None
+    if name == "none":
+        return None
+    if "/" in name or name.endswith(".yaml"):
+        return Path(name)
+    folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "dvl-calib"
+    path = folder / f"{name}.yaml"
+    if not path.exists():
+        there = ", ".join(sorted(each.stem for each in folder.glob("*.yaml"))) or "none"
+        raise InputError(f"--profile: {path} does not exist; profiles there: {there}")
+    return path
+
+
+def _words(path: Path) -> list[str]:
+    from ..disk.yaml_files import load_yaml
+    from ..errors import InputError
+    from ..files.parameter_files import as_yaml
+
+    content = load_yaml(path, "profile")
+    allowed = (*OPTIONS, "parameters")
+    if not isinstance(content, dict) or not content.keys() <= set(allowed):
+        other = ", ".join(map(repr, content.keys() - set(allowed))) if isinstance(content, dict) else "no names"
+        raise InputError(f"{path}: no profile ({other}); it holds {', '.join(allowed)}")
+    parameters = content.pop("parameters", {})
+    if not isinstance(parameters, dict):
+        raise InputError(f"{path}: parameters is not a list of name: value")
+    for name, value in content.items():
+        if not isinstance(value, str):
+            raise InputError(f"{path}: {name} is no text")
+    if "params" in content:  # as seen from the profile
+        content["params"] = path.parent / content["params"]
+    words = [f"--{name}={value}" for name, value in content.items()]
+    return words + [word for name, value in parameters.items() for word in ("-p", f"{name}:={as_yaml(value)}")]
