@@ -20,6 +20,7 @@ from ..calibration.checks.data_warnings import (
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale
 from ..calibration.filters.observability import Convergence
 from ..calibration.models import MODELS
+from ..calibration.models.base import Needs
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
@@ -40,7 +41,14 @@ _PIECES = 6
 Counts = Mapping[str, Mapping[str, int]]
 _NOT_TAKEN = {"invalid", "duplicate", "out_of_order", "stray", "held", "before_restart"}
 _NAMED = {Stream.DVL: "DVL", Stream.REFERENCE: "GNSS", Stream.IMU: "IMU"}
-_SILENT = {"dvl": ("DVL_SILENT", "dvl/twist"), "imu": ("IMU_SILENT", "imu/data")}  # and the topic if not remapped
+# Finding and topic, if that is not remapped, of a stream that has gone silent
+_SILENT = {
+    "dvl": ("DVL_SILENT", "dvl/twist"),
+    "reference": ("GNSS_OUTAGE", "gnss/twist"),
+    "imu": ("IMU_SILENT", "imu/data"),
+}
+# A reference is out after so many of its mean intervals: positions may come every ten seconds.
+OUTAGE_INTERVALS = 5.0
 
 
 class RecentCounts:
@@ -65,10 +73,17 @@ class RecentCounts:
 
 
 class _Taken(NamedTuple):
-    """How many samples of a stream have been taken, and since when it is that many (s)."""
+    """How many samples of a stream have been taken, since when it is that many (s), and when the first came."""
 
     taken: int
     since_s: float
+    first_s: float
+
+    @property
+    def outage_from_s(self) -> float:
+        """How long nothing may come of a reference until that is an outage: one sample tells no interval."""
+        mean_s = (self.since_s - self.first_s) / (self.taken - 1) if self.taken > 1 else self.taken * RECENT_S
+        return max(SILENCE_S, OUTAGE_INTERVALS * mean_s)
 
 
 class Silence:
@@ -89,8 +104,9 @@ class Silence:
         for stream in newest_ns:
             lost = _NOT_TAKEN | calibrator.refused_as[stream]
             taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
-            if stream not in self._seen or self._seen[stream].taken != taken:
-                self._seen[stream] = _Taken(taken, now_s)
+            before = self._seen.get(stream)
+            if before is None or before.taken != taken:
+                self._seen[stream] = _Taken(taken, now_s, before.first_s if before and before.taken else now_s)
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
         faults = {}
         for stream, (code, own_topic) in _SILENT.items():
@@ -98,8 +114,11 @@ class Silence:
             if not counts[stream]["received"]:
                 if stream == "dvl" and now_s - self._started_s > SILENCE_S:
                     faults[stream] = finding("DVL_NO_MESSAGE", topic=topic)
-            elif silent_s[stream] > SILENCE_S:
-                faults[stream] = finding(code, seconds=silent_s[stream], topic=topic)
+            elif silent_s[stream] > (self._seen[stream].outage_from_s if stream == "reference" else SILENCE_S):
+                model = MODELS[calibrator.selected]
+                if stream == "reference" and model.needs is not Needs.REFERENCE:
+                    code = "GNSS_OUTAGE_WITHOUT"
+                faults[stream] = finding(code, seconds=silent_s[stream], topic=topic, model=model.name)
         coming = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
         return faults | _other_times(newest_ns, coming, calibrator.parameters)
 

@@ -258,6 +258,18 @@ FINDINGS = (
     ),
     # GNSS
     Kind(
+        "GNSS_OUTAGE",
+        "no GNSS for {seconds:.0f} s: correcting goes on with what {model} has learnt, learning does not",
+        "References came and have stopped, or every one of them is refused. The selected model needs them.",
+        "surface, check the receiver and the topic {topic}, or select a model without GNSS (gnss_free_model)",
+    ),
+    Kind(
+        "GNSS_OUTAGE_WITHOUT",
+        "no GNSS for {seconds:.0f} s: {model} goes on without it, what needs GNSS, as the scale, learns nothing",
+        "References came and have stopped, or every one of them is refused. Models that need them keep what they know.",
+        "surface, or check the receiver and the topic {topic}",
+    ),
+    Kind(
         "GNSS_LOSSES",
         "GNSS was lost {count} times",
         "Antenna under water or shaded.",

@@ -184,6 +184,40 @@ def test_what_is_usable_follows_the_verdict(turned):
     assert said == (["no"] * 4 if turned else ["no", "yes", "yes", "yes"])
 
 
+@pytest.mark.parametrize(
+    ("model", "goes_on"),
+    [
+        ("auto", "F1 goes on without it, what needs GNSS, as the scale, learns nothing"),
+        ("M3", "correcting goes on with what M3 has learnt, learning does not"),
+    ],
+)
+def test_an_outage_of_gnss_is_said_in_these_words_first_with_what_goes_on(model, goes_on):
+    calibrator, silence, recent = Calibrator(Parameters(model=model), worker=AtOnce()), Silence(0.0, {}), RecentCounts()
+    take = {DvlSample: calibrator.feed_dvl, ReferenceSample: calibrator.feed_reference, ImuSample: calibrator.feed_imu}
+    said, dvl = {}, 0
+    for sample in run(90.0):
+        at_s = dvl / 5.0
+        if not (isinstance(sample, ReferenceSample) and 40.0 < at_s < 60.0):
+            take[type(sample)](sample)
+        dvl += isinstance(sample, DvlSample)
+        if isinstance(sample, DvlSample) and not dvl % 5:
+            status = diagnose(calibrator, VELOCITY_TYPES[TWIST], [], silence, recent, at_s)
+            said[round(at_s)] = status.message
+    outage = [at_s for at_s, message in said.items() if "no GNSS for" in message]
+    assert 44 <= outage[0] <= 47 and 59 <= outage[-1] <= 62
+    assert said[55].startswith(("no GNSS for 14 s", "no GNSS for 15 s")) and goes_on in said[55]
+
+
+def test_positions_that_come_every_ten_seconds_are_out_only_after_several_that_are_missing():
+    calibrator, silence, out = Calibrator(Parameters()), Silence(0.0, {}), []
+    for second in range(130):
+        calibrator.feed_dvl(DvlSample(second * 10**9, (1.5, 0.0, 0.0)))
+        if second < 60 and second % 10 == 0:
+            calibrator.feed_reference(ReferenceSample(second * 10**9, (1.5, 0.0, 0.0)))
+        out += ["reference" in silence.faults(calibrator, calibrator.counts, float(second))]
+    assert out.index(True) == 101 and all(out[101:])
+
+
 def test_a_package_or_class_that_is_not_there_is_named_with_the_remedy():
     assert message_class("dvl_type", TWIST) is TwistWithCovarianceStamped
     with pytest.raises(
