@@ -38,6 +38,11 @@ COMMANDS = (
         "dvl-calib watch --node /port/dvl_calibration",
     ),
     Command(
+        "param",
+        "list, read and set parameters of a running node, also where ros2 param is not installed",
+        "dvl-calib param set model M4",
+    ),
+    Command(
         "play",
         "play recorded bags over ROS 2, also where ros2 bag is not installed",
         "dvl-calib play my_bag --rate 5 --remap /a50/velocity:=/dvl/twist --clock",

@@ -491,7 +491,7 @@ class CalibrationNode(AnsweringNode):
     ) -> Trigger.Response:
         path = self._calibrator.parameters.result_file
         if not path:
-            response.message = "parameter result_file is not set: ros2 param set /dvl_calibration result_file FILE"
+            response.message = "parameter result_file is not set: dvl-calib param set result_file FILE"
             return response
         try:
             self._save(Path(path), save)
