@@ -1,14 +1,16 @@
 """Play recorded bags over ROS 2, as `ros2 bag play` does, also where that is not installed, and damaged ones as well.
 
 All topics whose message packages are installed are published, with the bytes that were recorded. Stamps stay as they
-are. Needs ROS 2 Jazzy (or pip install 'dvl_calib_ros[ros]').
+are. Without tf2_msgs, which pip does not have, /tf_static is published as joints of /robot_description, where the
+calibration node takes its mounting from as well. Needs ROS 2 Jazzy (or pip install 'dvl_calib_ros[ros]').
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 # Two processes that are both there find each other sooner.
 SAID_AFTER_S = 2.0
 RATES = (0.01, 1000.0)
+DESCRIPTION = "/robot_description"
+TF_MISSING = "tf2_msgs is not installed, and pip does not have it; for TF itself: apt install ros-jazzy-tf2-msgs"
 CLOCKS_HZ = (0.1, 1000.0)
 
 
@@ -61,7 +65,8 @@ def run(arguments: argparse.Namespace) -> None:
         from ..demo.player import BagPlayer, wait_until
 
         with BagReader(arguments.bags) as bag:
-            targets = _targets(bag, arguments.topics, arguments.remap)
+            targets, static = _targets(bag, arguments.topics, arguments.remap)
+            description = _description(bag, static, targets) if static else ""
             seconds = 1e-9 * (bag.span_ns[1] - bag.span_ns[0])
         if start >= seconds:
             raise InputError(f"--start-offset {start:g}: the recording has {seconds:.1f} s")
@@ -69,7 +74,12 @@ def run(arguments: argparse.Namespace) -> None:
         def has_ended() -> bool:
             return ending.requested
 
+        # the recorded one would replace it
+        recorded = [name for name in targets if description and name.strip("/") == DESCRIPTION.strip("/")]
+        topic = next(map(targets.pop, recorded), DESCRIPTION)
         player = BagPlayer(node, arguments.bags, targets, clock_hz=arguments.clock)
+        if description:
+            player.describe(description, topic)
         if arguments.wait:
             _wait_for_subscribers(player, has_ended)
         wait_until(time.monotonic() + arguments.delay, has_ended)
@@ -111,10 +121,29 @@ def _check(arguments: argparse.Namespace) -> None:
             raise InputError(f"--{name.replace('_', '-')}: give a number of seconds, 0 or more")
 
 
-def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str]) -> dict[str, str]:
-    """Topic of the bags -> what to publish it as. Raises InputError."""
+def _description(bag: BagReader, static: Sequence[str], played: Mapping[str, str]) -> str:
+    """Return the recorded description, if it is played, with the transforms of these topics as further joints."""
+    from ..discovery.transforms import FrameTree
+    from ..recordings.recording import MOST_STATIC
+
+    topics = [*static, *(name for name in played if name.strip("/") == DESCRIPTION.strip("/"))]
+    transforms, text = [], ""
+    for topic, _, message, _ in islice(bag.messages(topics), MOST_STATIC):
+        if message is not None and topic in static:
+            transforms += message.transforms
+        elif message is not None:
+            text = message.data
+    return FrameTree.of(transforms, []).as_urdf(text)
+
+
+def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str]) -> tuple[dict[str, str], list[str]]:
+    """Topic of the bags -> what to publish it as; and the topics of static transforms that cannot be published.
+
+    Raises InputError.
+    """
     from ..errors import InputError
     from ..node.message_types import message_class
+    from ..recordings.recording import is_static
     from ..recordings.topics import spelled
 
     def found(name: str, option: str) -> str:
@@ -129,16 +158,21 @@ def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str])
         if not (separator and old and new):
             raise InputError(f"--remap: {each!r} is not OLD:=NEW")
         renamed[found(old, "--remap")] = new
-    targets = {}
+    targets: dict[str, str] = {}
+    static = []
     for name in bag.topics if topics is None else [found(topic, "--topics") for topic in topics]:
         try:
             message_class(f"{name} of the bag holds", bag.topics[name])
         except InputError as error:
+            if is_static(name, bag.topics[name]):
+                static.append(name)
+                common.print_warnings([f"{name} is published as joints of {DESCRIPTION}: {TF_MISSING}"])
+                continue
             if topics is not None:
                 raise
             common.print_warnings([f"{error}; not played"])
             continue
         targets[name] = renamed.get(name, name)
-    if not targets:
+    if not targets and not static:
         raise InputError("no topic whose message package is installed; nothing can be played")
-    return targets
+    return targets, static

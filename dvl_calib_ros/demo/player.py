@@ -11,6 +11,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from std_msgs.msg import String
 
 from ..bags.reader import BagReader
 from ..errors import InputError
@@ -56,6 +57,8 @@ class BagPlayer:
         self._paths = paths
         self._reliable = reliability == ReliabilityPolicy.RELIABLE
         self._publishers: dict[str, Any] = {}
+        self._node = node
+        self._description: list[Any] = []
         with BagReader(paths) as bag:
             for name, target in (sensors_of(bag) if targets is None else targets).items():
                 kind = message_class(f"{name} of the bag holds", bag.topics[name])
@@ -70,10 +73,17 @@ class BagPlayer:
         self._clock = node.create_publisher(Clock, "/clock", 10) if clock_hz else None
         self._tick_s = 1.0 / clock_hz if clock_hz else float("inf")
 
+    def describe(self, text: str, topic: str) -> None:
+        """Publish a description of the robot (URDF) once, for those who come later as well. Raises InputError."""
+        profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._description.append(self._node.create_publisher(String, topic, profile))
+        self._description[-1].publish(String(data=text))
+
     @property
     def unheard(self) -> list[str]:
         """Topics, as they are published, that nobody subscribes to."""
-        return [each.topic_name for each in self._publishers.values() if each.get_subscription_count() < 1]
+        publishers = (*self._publishers.values(), *self._description)
+        return [each.topic_name for each in publishers if each.get_subscription_count() < 1]
 
     def wait_for_subscribers(self, timeout_s: float = 30.0) -> None:
         """Wait until every publisher has a subscriber. Raises InputError if one has none in time."""

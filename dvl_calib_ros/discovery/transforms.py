@@ -74,6 +74,20 @@ class FrameTree:
                     position = np.full(3, np.nan)
                 self._parents[_plain(joint.child)] = (_plain(joint.parent), rotation, position, "/robot_description")
 
+    def as_urdf(self, description: str = "") -> str:
+        """Return a description (URDF) with the transforms of /tf_static as further fixed joints."""
+        from html import escape
+
+        joints = [
+            f'<link name="{escape(child)}"/><joint name="{escape(child)}_fixed" type="fixed">'
+            f'<parent link="{escape(parent)}"/><child link="{escape(child)}"/>'
+            f'<origin xyz="{_exactly(position)}" rpy="{_exactly(rpy_from_rotation(rotation))}"/></joint>'
+            for child, (parent, rotation, position, source) in self._parents.items()
+            if source == "/tf_static" and f"{child}{parent}".isprintable()
+        ]
+        head, end, tail = (description or '<robot name="recorded"></robot>').rpartition("</robot>")
+        return "".join([head, *joints, end, tail])
+
     @property
     def frames(self) -> set[str]:
         """All frames that have a parent."""
@@ -125,6 +139,10 @@ class FrameTree:
         """The one frame whose name holds one of these words, for a frame_id that the tree does not have."""
         found = [frame for frame in sorted(self._parents) if any(word in frame.lower() for word in words)]
         return found[0] if len(found) == 1 else None
+
+
+def _exactly(values: Array) -> str:
+    return " ".join(map(repr, values.tolist()))
 
 
 def _plain(frame_id: str) -> str:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
+import sys
 import threading
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -13,13 +16,22 @@ pytest.importorskip("rclpy", reason="playing needs ROS 2: pip install '.[ros]'")
 
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from io_fixtures import mcap_bytes, raw, run, write_bag
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from ros import World, until
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Imu
+from stacks import TWIST, Told
+from std_msgs.msg import String
+from test_node import node_here, received
 
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli import play
 from dvl_calib_ros.cli.main import main
+from dvl_calib_ros.discovery.discover import discover
+from dvl_calib_ros.files.urdf import parse_urdf
+
+PLAYED = ["dvl/twist", "gnss/twist", "imu/data", "/tf_static", "/robot_description"]
 
 
 @pytest.fixture(scope="module")
@@ -100,6 +112,51 @@ def test_a_topic_of_a_package_that_is_not_installed_is_said_and_the_others_are_p
     said = capsys.readouterr()
     assert "unheard_msgs is not installed" in said.err and "not played" in said.err
     assert main(["play", str(path), "--topics", "sonar"]) == 2
+
+
+@pytest.fixture(scope="module")
+def mounted(tmp_path_factory):
+    """A bag whose DVL sits at 90 degrees and off the middle, as /tf_static alone says; a description has the IMU."""
+    told = Told()
+    told.dvl("dvl/twist", TWIST, "dvl & co", (0.0, 0.0, math.pi / 2))
+    told.reference("gnss/twist", TWIST, "map", "enu")
+    told.imu("imu/data", "imu_link")
+    told.robot_description(
+        '<robot name="auv"><link name="base_link"/><link name="imu_link"/><joint name="imu" type="fixed">'
+        '<parent link="base_link"/><child link="imu_link"/></joint></robot>'
+    )
+    told.tf_static(told.transform("base_link", "dvl & co", (0.0, 0.0, math.pi / 2), (-0.6, 0.1, -0.2)))
+    return told.write(tmp_path_factory.mktemp("mounted") / "bag")
+
+
+def test_the_node_takes_the_mounting_of_a_played_tf_static_as_replay_does(world, mounted, capsys, monkeypatch):
+    """Also where tf2_msgs is not installed, which pip does not have."""
+    monkeypatch.setitem(sys.modules, "tf2_msgs", None)
+    replayed = discover([mounted], Parameters()).parameters
+    with node_here(world) as node:
+        assert main(["play", str(mounted), "--rate", "50", "--wait", "--topics", *PLAYED]) == 0
+        until(lambda: received(node) > 100, "the DVL's messages")
+        live = node._calibrator.parameters
+    assert live.mounting_rpy == pytest.approx(replayed.mounting_rpy, abs=1e-12)
+    assert live.lever_arm == pytest.approx(replayed.lever_arm, abs=1e-12)
+    assert live.mounting_rpy[2] == pytest.approx(math.pi / 2) and live.lever_arm == pytest.approx((-0.6, 0.1, -0.2))
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith(
+        "warning: /tf_static is published as joints of /robot_description: tf2_msgs is not installed"
+    )
+    assert "apt install ros-jazzy-tf2-msgs" in said
+
+
+def test_who_comes_late_hears_the_recorded_description_with_the_transforms_as_joints(world, mounted, monkeypatch):
+    monkeypatch.setitem(sys.modules, "tf2_msgs", None)
+    heard: list = []
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    late = threading.Timer(2.0, world.node.create_subscription, (String, "/robot_description", heard.append, latched))
+    late.start()
+    assert main(["play", str(mounted), "--playback-duration", "6", "--topics", *PLAYED]) == 0
+    (description,) = heard
+    joints = parse_urdf(Path("description"), description.data.encode()).joints
+    assert {(each.parent, each.child) for each in joints} == {("base_link", "imu_link"), ("base_link", "dvl & co")}
 
 
 @pytest.mark.parametrize(
