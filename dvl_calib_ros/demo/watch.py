@@ -12,10 +12,9 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import TwistWithCovarianceStamped
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rich.console import Group
 from rich.table import Table
@@ -53,7 +52,7 @@ class Watcher:
         )
         self._node.create_subscription(TwistWithCovarianceStamped, f"{NODE_NAME}/estimate", self._on_estimate, latched)
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
-        self._parameters = self._node.create_client(SetParameters, f"{NODE_NAME}/set_parameters")
+        self._parameters = AsyncParameterClient(self._node, NODE_NAME)
         self._player = BagPlayer(self._node, paths)
         self._time = 0.0
         self._estimate: TwistWithCovarianceStamped | None = None
@@ -98,10 +97,8 @@ class Watcher:
             time.sleep(0.02)
 
     def _switch(self, model: str) -> None:
-        value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=model)
-        request = SetParameters.Request(parameters=[ParameterMessage(name="model", value=value)])
         self._events.append(f"{self._time:6.1f} s  ros2 param set /{NODE_NAME} model {model}")
-        self._parameters.call_async(request)
+        self._parameters.set_parameters([Parameter("model", value=model)])
 
     def _on_estimate(self, message: TwistWithCovarianceStamped) -> None:
         self._estimate = message
