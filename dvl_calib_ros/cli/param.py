@@ -11,7 +11,7 @@ from typing import Any
 from ..standard_streams import show
 from . import common
 
-# How long the node may take to be found, and then to answer, s; an answer that the middleware loses is asked for again.
+# Time to find the node, and for each answer, s. The middleware may lose an answer, so a request is repeated.
 FOUND_WITHIN_S, ANSWERED_WITHIN_S, TRIES = 10.0, 3.0, 5
 
 
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
     if (name is None, value is None) != (what == "list", what != "set"):
         raise InputError("give: list, get NAME, or set NAME VALUE")
     if name is not None and name not in SCHEMA:
-        load_parameters(None, [f"{name}:=0"])  # says which name is like it
+        load_parameters(None, [f"{name}:=0"])  # raises InputError with the nearest name
     new = load_parameters(None, [f"{name}:={value}"]).as_dict()[name] if what == "set" else None
     with common.ros_node("param", "dvl_calib_param") as (node, _):
         from rclpy.parameter import Parameter, parameter_value_to_python

@@ -11,7 +11,7 @@ from pathlib import Path
 from ..standard_streams import say
 
 IN_FOLDER = Path(".dvl-calib.yaml")
-# Options that a profile may hold, next to `parameters`: none that names what is written.
+# Options that a profile may hold next to `parameters`. None names an output file.
 OPTIONS = ("dvl-topic", "gnss-topic", "imu-topic", "params")
 
 
@@ -25,9 +25,9 @@ def add_option(parser: argparse.ArgumentParser) -> None:
 
 
 def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str]:
-    """Return a command line with the options of the profile that applies in front of its own, which win.
+    """Return a command line with the profile's options in front of its own, which override them.
 
-    Says on standard error which profile, and what it sets. Raises InputError.
+    Prints the profile and its options on standard error. Raises InputError.
     """
     path = _path(arguments.profile)
     if path is None:

@@ -149,12 +149,12 @@ HEIGHTS = " ▁▂▃▄▅▆▇█"
 GOALS = (("worth", "drift"), ("side", " yaw"), ("ahead", " scale"))
 WORSE = "[RESULT_WORSE]"
 KEYS = "s save  r r forget  w warnings  q quit"
-# Columns from which on three quantities of the mounting are in a row, and what is next is in one line.
+# Width in columns from which a row has three quantities of the mounting, and the next manoeuvre needs one line.
 WIDE = 76
 
 
 class Row(NamedTuple):
-    """A row of the view, which is folded to the terminal's width: at least and at most so many lines."""
+    """A row of the view, folded to the terminal's width. most, least: number of its lines."""
 
     text: str
     style: str = ""
@@ -175,10 +175,9 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class View:
-    """What is drawn, as it fits the terminal: rows at fixed places first, and at the bottom what may be left out.
+    """The live view, fitted to the terminal: first the rows with fixed places, last those that may be left out.
 
-    now_s: monotonic time. log: lines that the node has written. event: what happened last. page: how often all
-    warnings were asked for.
+    now_s: monotonic time. log: lines of the node's log. event: the last answer or log line. page: presses of w.
     """
 
     status: Status | None
@@ -245,7 +244,7 @@ def _warnings(status: Status) -> list[str]:
 
 
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
-    """Yield the mounting, the first warning, and what may be left out."""
+    """Yield the mounting, the first warning, streams, drift by axis and headings."""
     is_usable, colour = _is_usable(status), COLOURS.get(status.level, "red")
     why = "see below" if status.get("next code") == "NEXT_REJECTED" else "the data do not show it yet"
     between = [Row("")] if width >= WIDE else []
@@ -323,7 +322,7 @@ def line(status: Status) -> str:
 
 
 class Keys:
-    """What single keys ask of a node; what came of it is in `said`. page: how often all warnings were asked for.
+    """Single keys that ask a node for something; `said` is the answer. page: presses of w.
 
     ends_node: whether the node ends with the view. Then q saves first, and asks before a better result is replaced.
     """
@@ -360,7 +359,7 @@ class Keys:
         return key != "q" or self._ends_node
 
     def has_left(self) -> bool:
-        """Whether q was pressed, and nothing is to be waited for or asked any more."""
+        """Return whether q was pressed and its save is answered, with no question left."""
         if not self._is_leaving or self._listener.is_waiting or self._own:
             return False
         if WORSE not in self._listener.answer:
