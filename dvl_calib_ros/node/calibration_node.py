@@ -148,8 +148,8 @@ class CalibrationNode(AnsweringNode):
         self._water: Water | None = None
         self._newest_dvl: Any = None
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/save", partial(self._on_save, save_unless_worse))
-        self.create_service(Trigger, "~/save_anyway", partial(self._on_save, save_result))
+        self.create_service(Trigger, "~/save", self._on_save)
+        self.create_service(Trigger, "~/save_anyway", partial(self._on_save, save=save_result))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
         # steady: diagnostics go on while simulated time stands still or jumps
@@ -487,7 +487,7 @@ class CalibrationNode(AnsweringNode):
         return response
 
     def _on_save(
-        self, save: Callable[..., None], request: Trigger.Request, response: Trigger.Response
+        self, request: Trigger.Request, response: Trigger.Response, save: Callable[..., None] = save_unless_worse
     ) -> Trigger.Response:
         path = self._calibrator.parameters.result_file
         if not path:
