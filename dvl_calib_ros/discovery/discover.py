@@ -30,10 +30,9 @@ from ..calibration.streams.screening import NOT_MEASURED_VARIANCE
 from ..errors import InputError
 from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, frame_named, turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
-from ..recordings.pose_orientation import ORIENTATION
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topic_preview import Look, Survey
-from ..recordings.topics import Topics
+from ..recordings.topics import ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
 from .clock_offsets import compared_motion, difference_of, in_time

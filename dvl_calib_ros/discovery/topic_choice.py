@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from ..messages.drivers import DVL_TYPES, IMU_TYPE, POSE_TYPES, REFERENCE_TYPES, TWIST_TYPE
-from ..recordings.pose_orientation import ORIENTATION
-from ..recordings.topics import spelled
+from ..recordings.topics import ORIENTATION, spelled
 from ..verdict.reasons import Reason, finding
 
 if TYPE_CHECKING:

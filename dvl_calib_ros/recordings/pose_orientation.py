@@ -11,9 +11,8 @@ from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import Mask, Stamps
 from ..messages.drivers import IMU_TYPE, POSE_TYPES
 from .columns import Laid, TopicColumns
+from .topics import ORIENTATION
 
-# What follows the name of a topic of poses in that of its orientations.
-ORIENTATION = "/orientation"
 # Turn rates are means over this time (s): noise of 0.1° from pose to pose then is less than 1 °/s.
 RATE_WINDOW_S = 0.2
 # Orientations whose components differ by no more than this are a constant that was filled in.

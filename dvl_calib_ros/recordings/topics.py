@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
+# What follows the name of a topic of poses in that of its orientations (pose_orientation.py).
+ORIENTATION = "/orientation"
+
 
 @dataclass(frozen=True)
 class Topics:
