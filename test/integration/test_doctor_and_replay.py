@@ -19,8 +19,9 @@ from validation.stacks import shared_folder
 CASES = shared_folder() / "cases"
 SCRIPTS = [*CASES.glob("stacks.py"), *sorted(CASES.glob("axes/*.py")), *sorted(CASES.glob("public/*.py"))]
 TRAPS = sorted(each for each in CASES.glob("traps/*.py") if each.stem not in ("helpers", "judge", "phys"))
-# All 434 traps take half an hour: of each file the first and the 16th are asked for.
-TRAPS_ASKED = 1, 16
+# All 434 traps take half an hour: of each file the first is asked for, and of 16 stacks every fifth.
+TRAPS_ASKED = (1,)
+EVERY = {"stacks": 5}
 BAGS = ".mcap", ".db3", ".bag"
 REFUSED = "refused"
 pytestmark = [
@@ -53,7 +54,7 @@ def test_on_a_shared_case(script, tmp_path):
     if not bags:
         (log,) = made.iterdir()
         bags = [*dc.import_files(log, output=tmp_path / "imported")]
-    assert [said for bag in bags for said in contradiction(bag.name, bag)] == []
+    assert [said for bag in bags[:: EVERY.get(script.stem, 1)] for said in contradiction(bag.name, bag)] == []
 
 
 class EnoughError(Exception):
