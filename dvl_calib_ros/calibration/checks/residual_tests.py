@@ -53,8 +53,8 @@ QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 # Tilt (rad, rms) from which on a velocity has something to follow, and the share of it that it has to leave; the first
 # of how it bends, m/s².
 LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
-# Prior σ (m/s) of a bed's velocity: sediment in a flood, or a layer of water. From `MOVES_FROM_MPS` on no reference is
-# the cause: GNSS Doppler is good to 0.05 m/s (95 %, datasheets), and an inertial navigation at sea was off by 0.054.
+# Prior σ (m/s) of a bed's velocity: sediment in a flood, or a layer of water. From `MOVES_FROM_MPS` on the reference is
+# not the cause: an inertial navigation at sea (recording T09) was off by 0.054.
 BED_STD_MPS, MOVES_FROM_MPS = 1.0, 0.08
 # Rows of the reference's error, east and north, in `KNOWN`.
 OVER_GROUND = slice(9, 11)
@@ -278,7 +278,7 @@ def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None
     size = float(np.linalg.norm(found.over_ground))
     if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < SURELY * found.over_ground_std).all():
         return None
-    own = [estimate.state_of(name) if name in estimate.state_names else 0.0 for name in OFFSETS]
+    own = [estimate.state_of(name) for name in OFFSETS]
     is_held = float(np.linalg.norm(found.over_ground - own)) < 0.5 * size
     course = math.degrees(math.atan2(*found.over_ground)) % 360.0
     moves = finding("BED_MOVES", millimetres=1000.0 * size, course=course, std=float(f"{size:.1g}"))

@@ -168,7 +168,7 @@ def _wrong_axes(
     fitted = fit(0.0, near.dvl_late, nominal, (REFERENCE,))
     if fitted is None or fitted.level > most:
         return None
-    factors, std, _ = fit.axis_factors(fitted, nominal)
+    factors, std = fit.axis_factors(fitted, nominal)
     is_shown, is_turned = factors > SIGNIFICANT * std, signs < 0.0
     if (is_shown & is_turned).any():
         if is_turned.sum() == 1 and (is_shown & ~is_turned)[1:].any():

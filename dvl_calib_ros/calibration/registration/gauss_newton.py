@@ -135,11 +135,10 @@ class Fitted(NamedTuple):
 
 
 class AxisFactors(NamedTuple):
-    """factors, std: (3,) of the DVL's axes; 1 is right, with the scale of the fit. left: m/s per axis, with them."""
+    """factors, std: (3,) of the DVL's axes; 1 is right, with the scale of the fit."""
 
     factors: Array
     std: Array
-    left: float
 
 
 class _Rows(NamedTuple):
@@ -243,7 +242,7 @@ class MotionFit:
         """
         rows, rotation = self._rows(fitted.x, fitted.rotation_body_from_dvl, None), fitted.rotation_body_from_dvl
         if rows is None:
-            return AxisFactors(np.ones(3), np.full(3, np.inf), math.inf)
+            return AxisFactors(np.ones(3), np.full(3, np.inf))
         axes = rows.residual.shape[1]
         weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_AT**2 * axes * fitted.level**2))
         own = self._axes_of_dvl(fitted, rows, rotation)
@@ -255,13 +254,12 @@ class MotionFit:
         prior = np.concatenate([np.full(3, WIDEST_FACTOR**-2.0), LIKELY[kept] ** -2.0])
         information = (h * w[:, None]).T @ h + np.diag(prior)
         vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), away[kept]])
-        left = rows.residual.ravel() + h @ np.linalg.solve(information, vector)
+        found = np.linalg.solve(information, vector)
+        left = rows.residual.ravel() + h @ found
         # what the factors explain is no noise
         share = float((w * left**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
         std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
-        return AxisFactors(
-            1.0 + np.linalg.solve(information, vector)[:3], std, fitted.level * math.sqrt(min(share, 1.0))
-        )
+        return AxisFactors(1.0 + found[:3], std)
 
     def _axes_of_dvl(self, fitted: Fitted, rows: _Rows, rotation: Array) -> Array:
         """What each axis of the DVL adds to the residuals, (J, A, 3) m/s."""
