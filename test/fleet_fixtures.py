@@ -32,8 +32,8 @@ def write_dive(path: Path, day: int, yaw: float = 0.02, seed: int = 0, storage: 
 
 
 def write_fleet(place: Path) -> Path:
-    """auv1 on three days, moved by 2° before the third; auv2 on one; a file that is cut and one that is no bag."""
-    for day, yaw in enumerate((0.02, 0.02, 0.055)):
+    """auv1 on three days, moved by 3° before the third; auv2 on one; a file that is cut and one that is no bag."""
+    for day, yaw in enumerate((0.02, 0.02, 0.075)):
         write_dive(place / "auv1" / f"dive{day}", day, yaw, seed=day)
     write_dive(place / "auv2" / "late" / "dive", 1, 0.01, seed=3, storage="sqlite3")
     (place / "auv2" / "no.mcap").write_text("no bag\n")

@@ -218,7 +218,7 @@ def comparison(name: str, apart_s: int = 86_400) -> Comparison:
     return compare(
         [
             Extrinsics(
-                name=each, model="G2", first_ns=day * apart_s * 1_000_000_000,
+                name=each, model="full", first_ns=day * apart_s * 1_000_000_000,
                 last_ns=(day * apart_s + 600) * 1_000_000_000,
                 rotation_body_from_dvl=rotation_of((0.0, 0.0, yaw)), lever_arm=np.zeros(3), scale=0.0, time_offset=0.0,
                 covariance=np.diag(std**2), shown=np.ones(8, dtype=bool), used=100, remarks=("as it is",),

@@ -229,7 +229,7 @@ SITUATIONS = {
         told_by(stamps_an_hour_ahead), "CLOCKS_APART", "--restamp log", {"restamp": RESTAMP_ALL}
     ),
     "alignment of an RDI": Situation(lambda path, _: ensembles(path, -45.0), yaw_deg=-45.0, verdicts=NOISY),
-    "moving bed": Situation(lambda path, _: ensembles(path, bed_mps=np.array(BED_MPS)), verdicts=NOISY),
+    "moving bed": Situation(lambda path, _: ensembles(path, bed_mps=np.array(BED_MPS)), verdicts=(*NOISY, "reject")),
     "text of a DVL": Situation(lambda path, _: lines(path), verdicts=NOISY),
     "antenna on a mast": Situation(
         told_by(antenna_on_a_mast, long_motion), unseen="needs an estimator of positions with the antenna's swing"

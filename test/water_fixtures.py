@@ -12,13 +12,13 @@ from dvl_calib_ros.simulation.scenario import Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
 
 TEMPERATURE, SALINITY = 12.1, 35.0
-USED = 1.0062 * speed_of_sound(TEMPERATURE, SALINITY)
+USED = 1.0124 * speed_of_sound(TEMPERATURE, SALINITY)
 
 
-def dive(scale: float = 0.0062, day: int = 0):
+def dive(scale: float = 0.0124, day: int = 0):
     errors = DvlErrors((0.01, -0.01, 0.02), (scale,) * 3, beam_std=0.003)
     made = simulate(
-        Scenario(seconds=240.0, seed=1, errors=errors, gnss_std=0.02, gnss_frame=VelocityFrame.BODY, imu_rate=10.0)
+        Scenario("figure8", 480.0, seed=1, errors=errors, gnss_std=0.02, gnss_frame=VelocityFrame.BODY, imu_rate=10.0)
     )
     late_ns = day * 86_400_000_000_000
     return tuple(

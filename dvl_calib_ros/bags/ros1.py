@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_typestore
 from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
@@ -107,5 +107,5 @@ def _ros2_types(channel: Channel) -> tuple[Channel, Typestore]:
         store = typestore(definition_of("ros2msg", SEPARATOR.join(parts).rstrip() + "\n" + _TIMES), msgtype)
         text, _ = store.generate_msgdef(msgtype, ros_version=2)
         return Channel(channel.topic, msgtype, definition_of("ros2msg", text)), store
-    except DefinitionError:  # types that ROS brings are known all the same
+    except (DefinitionError, TypesysError):  # types that ROS brings are known all the same
         return Channel(channel.topic, msgtype), get_typestore(Stores.ROS2_JAZZY)

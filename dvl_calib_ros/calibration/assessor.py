@@ -17,7 +17,7 @@ from .filters.cross_validation import HeldOutError, Moments, calibration_error, 
 from .filters.day_to_day_covariance import day_covariance, offset_covariance
 from .filters.filter_setup import nis_bounds
 from .filters.observability import MEASURES_VERTICAL, convergence, observability
-from .models import EXTENDED_BY, MODELS, Model
+from .models import MODELS, Model
 from .models.parameters import Parameters
 from .numerics.error_model import correction_matrix
 from .numerics.frames import Array
@@ -173,12 +173,6 @@ class Assessor:
         return without_outliers(seen.error + np.matmul(seen.measured, change[..., None])[..., 0])
 
 
-# Of an angle too little is claimed, where it is known to so many times the variance with the lever arm as unknown.
-OPEN_FROM = 4.0
-# So many σ of the difference between the two are no chance, and as many of its own are too little claimed.
-NO_CHANCE = 3.0
-
-
 class Estimates:
     """The estimates of a calibrator's models.
 
@@ -210,7 +204,7 @@ class Estimates:
             covariance=covariance + self._day_covariance(name),
             recording_covariance=covariance,
             filter_covariance=estimator.filter_covariance,
-            left_open=estimator.left_open + self._by_clock(name),
+            left_open=estimator.left_open,
             of_bias=of_bias,
             used=used,
             gated=gated,
@@ -227,8 +221,7 @@ class Estimates:
         estimator = self.estimators[name]
         state, covariance = estimator.of_recording()
         worse = offset_covariance(MODELS[name], state, estimator.filter_covariance, self.parameters)
-        unknown = self._by_unknown_arm(name, state, covariance) + self._by_clock(name)
-        return GaussianState(state, covariance + worse + unknown)
+        return GaussianState(state, covariance + worse)
 
     def next_recording(self, name: str) -> GaussianState:
         """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it."""
@@ -239,34 +232,6 @@ class Estimates:
         if name not in self._day_covariances:
             self._day_covariances[name] = day_covariance(MODELS[name], self.parameters)
         return self._day_covariances[name]
-
-    def _by_clock(self, name: str) -> Array:
-        """(n, n) of a model that takes clocks as known: what one in a steady turn makes of the angles, with an arm that
-        was told."""
-        n, estimator = MODELS[name].n_state, self.estimators.get(EXTENDED_BY.get(name, ""))
-        found = np.zeros((n, n))
-        if estimator is not None and any(self.parameters.lever_arm):
-            found[:3, :3] = estimator.turn_open
-        return found
-
-    def _by_unknown_arm(self, name: str, state: Array, covariance: Array) -> Array:
-        """(n, n) that a model claims too little of angles, for it takes a lever arm that nobody told as known.
-
-        Its angles are off by what the model that finds the arm has otherwise, and by what that one is off.
-        """
-        found = np.zeros_like(covariance)
-        estimator = self.estimators.get(EXTENDED_BY.get(name, ""))
-        if estimator is None or not estimator.claims or any(self.parameters.lever_arm):
-            return found
-        other = estimator.of_recording()
-        # a bias of the DVL is there with an arm as without
-        own = np.diag(covariance - self.estimators[name].of_bias.covariance)[:3]
-        open_arm = np.diag(other.p - estimator.of_bias.covariance)[:3]
-        by_arm = open_arm - own
-        away = (state - other.x[: len(state)])[:3] ** 2
-        is_open = (open_arm > OPEN_FROM * own) | (away > NO_CHANCE**2 * np.minimum(own, np.maximum(by_arm, 0.0)))
-        np.fill_diagonal(found[:3, :3], np.where(is_open & (by_arm > 0.0), by_arm + away, 0.0))
-        return found
 
     @property
     def arm_finders(self) -> Iterator[Model]:

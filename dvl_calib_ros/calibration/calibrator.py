@@ -50,11 +50,11 @@ from .streams.aligner import Aligner, counted
 from .streams.position_velocities import are_positions, check_model
 from .streams.stream_order import parts_by_day
 
-# DVL rows that wait to be copied for G2: by the dozen that costs a tenth of one by one.
+# DVL rows that wait to be copied for the full model: by the dozen that costs a tenth of one by one.
 COPIED_AT_ONCE = 64
 # Rows, and blocks of samples, that may wait for who has no use for them yet: without an IMU some never have.
 ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
-# G2's blocks are gathered like samples: one of 10 s counts for so many of these.
+# the full model's blocks are gathered like samples: one of 10 s counts for so many of these.
 SAMPLES_OF_A_BLOCK = 128
 
 _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {

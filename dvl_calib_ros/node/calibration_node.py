@@ -571,7 +571,7 @@ class CalibrationNode(AnsweringNode):
         return True
 
     def destroy_node(self) -> None:
-        """Leave ROS, and end what solves G2's blocks."""
+        """Leave ROS, and end what solves the full model's blocks."""
         if self._discovering is not None:
             self._discovering.close()
         self._worker.shutdown(cancel_futures=True)

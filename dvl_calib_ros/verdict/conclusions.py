@@ -79,7 +79,7 @@ _COMPARISONS = (
         "MODELS_DIFFER",
         "the models differ ({models}): so may their errors",
         "An error that two models make alike cancels in a difference; one that one of them makes does not.",
-        "calibrate all with one model (-p model:=G2)",
+        "calibrate all with one model (-p model:=full)",
     ),
     Kind(
         "ARMS_DIFFER",

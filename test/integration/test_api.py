@@ -62,9 +62,9 @@ def test_replay_is_what_the_command_gives(calibration, bag, tmp_path, capsys):
 def test_the_mounting_has_its_figures_in_degrees_and_per_cent(calibration, bag):
     mounting = calibration.mounting
     assert mounting.nominal_rpy_deg == (0.0, 0.0, 0.0)
-    state = estimates(bag)["G1"]
+    state = estimates(bag)["full"]
     assert mounting.rpy_deg[2] == pytest.approx(-np.degrees(state[2]), abs=0.3)  # φ turns what is measured
-    assert 0.0 < mounting.std_deg[1] < 1.0 and mounting.scale_std_percent > 0.0
+    assert 0.0 < mounting.std_deg[1] < 2.0 and mounting.scale_std_percent > 0.0
 
 
 def test_a_corrected_velocity_is_in_the_body(calibration):
@@ -75,7 +75,7 @@ def test_a_corrected_velocity_is_in_the_body(calibration):
 def test_a_corrected_velocity_of_a_turning_vehicle_is_that_of_the_reference_point(tmp_path):
     bag = tmp_path / "ahead"
     assert main(["simulate", str(bag), "--duration", "240", "--effect", "lever_arm:x_m=0.8"]) == 0
-    run = dc.replay(bag, model="G2")
+    run = dc.replay(bag, model="full")
     assert run.mounting.xyz_m[0] == pytest.approx(0.8, abs=0.1)
     velocity = [[1.0, 0.0, 0.0], [0.5, 0.1, 0.0]]
     turning = run.correct(velocity, [[0.0, 0.0, 0.2], [0.0, 0.0, -0.1]]) - run.correct(velocity)
@@ -139,7 +139,7 @@ def test_results_print_as_their_answer_and_in_a_notebook_with_tables(bag, calibr
 
 def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(tmp_path):
     made = dc.simulate(tmp_path / "ahead", seconds=240.0, effects={"lever_arm": {"x_m": 0.5}})
-    assert dc.replay(made, model="G2", history=False).mounting.xyz_m[0] == pytest.approx(0.5, abs=0.1)
+    assert dc.replay(made, model="full", history=False).mounting.xyz_m[0] == pytest.approx(0.5, abs=0.1)
     for wrong, message in (
         ({"lever_rm": {"x_m": 0.5}}, "did you mean 'lever_arm'"),
         ({"lever_arm": {"xm": 0.5}}, "did you mean 'x_m'"),

@@ -20,7 +20,7 @@ from yaml_text import parsed, written
 import dvl_calib_ros as dc
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models.own import BEYOND
+from dvl_calib_ros.calibration.models.own import DELAY, LEVER_ARM
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import printable
@@ -166,7 +166,7 @@ def test_a_urdf_whose_dvl_is_elsewhere_than_was_told_is_refused(tmp_path, result
     urdf = robot(tmp_path / "robot.urdf")
     before = urdf.read_bytes()
     assert "has the DVL at 0.622423073 -0.0147556543 0.238813905" in (said := refused(capsys, path, "--urdf", urdf))
-    assert "began with 0.9 0 0.2; --keep-position" in said and urdf.read_bytes() == before
+    assert "began with 0.9 0 0.2 and found 0.9 0 0.2; --keep-position" in said and urdf.read_bytes() == before
     assert apply(path, "--urdf", urdf, "--keep-position") == 0
 
 
@@ -197,8 +197,8 @@ def test_a_calibration_that_starts_from_the_applied_urdf_finds_nothing_more(tmp_
     parameters.write_text(capsys.readouterr().out)
     assert load_parameters(parameters).base_frame == "base_link"
     again = replayed(bag, mounting_rpy=load_parameters(parameters).mounting_rpy).result
-    assert np.linalg.norm(found.estimates["G1"].misalignment) > 0.05
-    assert np.linalg.norm(again.estimates["G1"].misalignment) < 0.003
+    assert np.linalg.norm(found.estimate.misalignment) > 0.05
+    assert np.linalg.norm(again.estimate.misalignment) < 0.003
     text = parameters.read_text().replace("# lever_arm", "lever_arm")
     parameters.write_text(text)
     frame = Rotation.from_euler("xyz", CHAIN).apply([0.0, 0.2, 0.3])
@@ -494,7 +494,7 @@ def displaced(tmp_path_factory):
 def test_what_a_bare_bag_shows_is_applied_as_parameters_and_nothing_is_left(tmp_path, displaced, capsys):
     bag, found = displaced
     saved, parameters = change(tmp_path / "result.yaml", found), tmp_path / "vehicle.yaml"
-    assert found.selected == "G2"
+    assert found.selected == "full"
     parameters.write_text("/**:\n  ros__parameters:\n    # by hand\n    mounting_rpy: [0.0, 0.0, 0.0]\n")
     before = parameters.read_bytes()
     assert apply(saved, "--params", parameters) == 0
@@ -505,13 +505,14 @@ def test_what_a_bare_bag_shows_is_applied_as_parameters_and_nothing_is_left(tmp_
     assert written.lever_arm == pytest.approx(mounting["lever_arm"], abs=1e-8)
     assert "# by hand" in parameters.read_text()
     again = replayed(bag, **{name: getattr(written, name) for name in ("mounting_rpy", "lever_arm", "dvl_time_offset")})
-    assert again.result.selected == "G1"
-    rest = again.result.estimates["G2"]
+    assert again.result.selected == "full"
+    rest = again.result.estimates["full"]
     assert (
         np.linalg.norm(found.estimate.lever_arm((0.0, 0.0, 0.0))[:2]) > 1.0
         and abs(found.estimate.dvl_time_offset(0.0)) > 0.5
     )
-    assert np.all(np.abs(rest.state[BEYOND]) < np.minimum(2.0 * rest.std[BEYOND], [0.03, 0.03, 0.1, 0.03]))
+    beyond = [*range(*LEVER_ARM.indices(len(rest.state))), DELAY]
+    assert np.all(np.abs(rest.state[beyond]) < np.minimum(2.0 * rest.std[beyond], [0.03, 0.03, 0.1, 0.03]))
     assert np.linalg.norm(again.result.estimate.misalignment[1:]) < 0.003
     # once more changes nothing, and the way back leads to what was there
     assert apply(saved, "--params", parameters) == 0

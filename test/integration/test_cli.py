@@ -218,8 +218,8 @@ def test_replay_json_has_the_documented_structure(document, bag):
 
 def test_the_selected_segments_follow_each_other_from_the_first_sample_to_the_last(document):
     segments = document["selected"]
-    assert [segment["model"] for segment in segments] == ["F1", "G1"]
-    assert segments[0]["from_s"] == 0.0
+    assert [segment["model"] for segment in segments] == ["F1", "G1", "full"]
+    assert segments[0]["from_s"] == 0.0 and segments[1]["to_s"] == segments[2]["from_s"]
     assert segments[0]["to_s"] == segments[1]["from_s"] == pytest.approx(3.0, abs=0.5)
     assert segments[-1]["to_s"] == pytest.approx(40.0, abs=0.5)
 
@@ -245,13 +245,13 @@ def test_a_model_that_is_none_is_named_with_those_there_are(capsys, bag, models,
 
 def test_replay_shows_estimates_and_counts_and_keeps_warnings_apart(capsys, bag):
     out, errors = succeed(capsys, "replay", bag, bag, "-v", "-p", "prior_source:=initial_window")
-    assert "200 duplicate" in out and "Model: G1" in out
+    assert "200 duplicate" in out and "Model: full" in out
     assert errors.startswith("warning: prior_source initial_window")
 
 
 def test_replay_saves_a_result_file_that_replay_starts_from(capsys, bag, tmp_path):
     succeed(capsys, "replay", bag, "--save", tmp_path / "r.yaml")
-    assert parsed((tmp_path / "r.yaml").read_text())["model"] == "G1"
+    assert parsed((tmp_path / "r.yaml").read_text())["model"] == "full"
     saved = f"initial_calibration:={tmp_path / 'r.yaml'}"
     succeed(capsys, "replay", bag, "-p", saved, "--json", tmp_path / "o.json")
     again = json.loads((tmp_path / "o.json").read_text())["models"]["M3"]
@@ -290,7 +290,7 @@ def test_names_in_a_bag_cannot_break_or_style_the_output(capsys, tmp_path):
 
 def test_a_terminal_that_cannot_show_greek_gets_the_numbers_all_the_same(bag):
     done = shell("replay", bag, PYTHONIOENCODING="ascii", PYTHONUTF8="0", LC_ALL="C")
-    assert done.returncode == 0 and b"model G1" in done.stdout and not done.stderr
+    assert done.returncode == 0 and b"model full" in done.stdout and not done.stderr
 
 
 def test_a_reader_that_closes_the_pipe_early_is_no_error(bag):

@@ -30,12 +30,12 @@ def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_de
 ):
     drawn(monkeypatch)  # they are counted, not looked at
     page, out = tmp_path / "x.html", tmp_path / "x.json"
-    said, _ = succeed(capsys, "evaluate", *bags, "--models", "G1,G2", "--jobs", "1", "--report", page, "--json", out)
+    said, _ = succeed(capsys, "evaluate", *bags, "--models", "G1,full", "--jobs", "1", "--report", page, "--json", out)
     document = json.loads(out.read_text())
     monday, tuesday = map(str, bags)
     by_monday = document["corrected"][monday]
-    assert by_monday["G2"][tuesday] < 0.06 and by_monday["G2"][tuesday] < 0.6 * by_monday["G1"][tuesday]
-    assert document["selected"][monday] == "G2"
+    assert by_monday["full"][tuesday] < 0.06 and by_monday["full"][tuesday] < 0.6 * by_monday["G1"][tuesday]
+    assert document["selected"][monday] == "full"
     navigation = document["navigation"][monday][tuesday]
     assert navigation["drift_m_per_km"]["after"] < navigation["drift_m_per_km"]["before"]
     assert "Dead reckoning on bags that were not calibrated on" in said

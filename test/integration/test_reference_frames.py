@@ -51,7 +51,7 @@ def test_an_odometry_forward_right_down_gives_the_lever_arm_with_its_sign(tmp_pa
     found = discover([bag], Parameters())
     assert found.parameters.gnss_frame == "frd" or child.endswith("_frd")
     result = replay([bag], found.parameters, found.topics).result
-    np.testing.assert_allclose(result.estimates["G2"].lever_arm((0.0, 0.0, 0.0)), LEVER_ARM, atol=0.1)
+    np.testing.assert_allclose(result.estimates["full"].lever_arm((0.0, 0.0, 0.0)), LEVER_ARM, atol=0.1)
 
 
 PX4 = "px4_msgs/msg/VehicleOdometry"
@@ -103,7 +103,7 @@ def test_a_px4_odometry_is_a_reference_in_the_frame_of_its_own_fields(tmp_path, 
     assert found.topics.gnss == "/fmu/out/vehicle_odometry" and found.reference_frame is taken
     replayed = replay([bag], found.parameters, found.topics)
     assert replayed.result.counts["pairing"]["paired"] > 700
-    np.testing.assert_allclose(replayed.result.estimates["G2"].lever_arm((0.0, 0.0, 0.0)), LEVER_ARM, atol=0.1)
+    np.testing.assert_allclose(replayed.result.estimates["full"].lever_arm((0.0, 0.0, 0.0)), LEVER_ARM, atol=0.1)
 
 
 def test_a_px4_odometry_says_what_it_does_not_know_and_its_boot_time_is_no_stamp():

@@ -26,6 +26,8 @@ from dvl_calib_ros.recordings.recording import open_recording
 from dvl_calib_ros.recordings.topics import Topics
 
 SCHEMA = json.loads((ROOT / "docs" / "json_schema.json").read_text())["$defs"]["replay"]
+# At one speed a bias is in the scale's σ.
+UNBIASED = ("-p", "dvl_bias_std:=0.0")
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +36,7 @@ def bag(tmp_path_factory) -> Path:
 
 
 def test_a_replay_says_the_scale_in_its_cause_and_what_to_set(bag, tmp_path, capsys):
-    said, _ = succeed(capsys, "replay", bag, "--json", tmp_path / "out.json")
+    said, _ = succeed(capsys, "replay", bag, *UNBIASED, "--json", tmp_path / "out.json")
     told = " ".join(said.split())
     assert (
         f"the DVL used a speed of sound of {USED:.1f} m/s; water of 12.1 °C (dvl/temperature) and 35.0 PSU has 149"
@@ -48,7 +50,7 @@ def test_a_replay_says_the_scale_in_its_cause_and_what_to_set(bag, tmp_path, cap
 
 def test_an_unknown_salinity_is_said_as_a_range(tmp_path, capsys):
     bag = with_water(tmp_path / "bag", salinity=float("nan"))
-    said, _ = succeed(capsys, "replay", bag)
+    said, _ = succeed(capsys, "replay", bag, *UNBIASED)
     told = " ".join(said.split())
     assert "and unknown salinity (0 to 40 PSU)" in told and "if the salinity is" in told
 
@@ -63,7 +65,7 @@ def test_a_recording_without_water_says_nothing(tmp_path):
 @pytest.fixture(scope="module")
 def saved(bag, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("saved") / "result.yaml"
-    dc.replay(bag, history=False).save(path)
+    dc.replay(bag, history=False, dvl_bias_std=0.0).save(path)
     return path
 
 
@@ -74,15 +76,15 @@ def applied(capsys, saved: Path, *options: str) -> str:
 
 def test_apply_takes_the_speed_of_sound_that_the_recording_says_was_used(saved, capsys):
     said = applied(capsys, saved, "waterlinked", "--now", "mounting_rotation_offset=0")
-    new = re.search(rf"speed_of_sound: {USED:.1f}\d* \(as recorded\) -> ([\d.]+) m/s", said)
+    new = re.search(rf"speed_of_sound: {int(USED)}[.\d]* \(as recorded\) -> ([\d.]+) m/s", said)
     assert abs(float(new[1]) - speed_of_sound(TEMPERATURE, SALINITY)) < 5.0
-    assert "note: Scale +0.6" in said and "That explains the scale: set the speed of sound to 149" in said
+    assert "note: Scale +1." in said and "That explains the scale: set the speed of sound to 149" in said
     assert "not both" not in said
     said = applied(capsys, saved, "cerulean")
-    assert "SET-VELOCITY-ADJUSTMENT 0.99" in said and "That explains the scale" in said
+    assert "SET-VELOCITY-ADJUSTMENT 0.98" in said and "That explains the scale" in said
     assert "velocity_adjustment takes the scale out: set it or the speed of sound, not both" in said
     shown, _ = succeed(capsys, "apply", saved, "--force")
-    assert "water: Scale +0.6" in " ".join(shown.split())
+    assert "water: Scale +1." in " ".join(shown.split())
     told = fail(capsys, "apply", saved, "--force", "--instrument", "waterlinked", "--now", "speed_of_sound=1450")
     assert f"the recording says that the DVL used {USED:.1f} m/s" in told
 

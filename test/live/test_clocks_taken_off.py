@@ -56,13 +56,13 @@ def test_a_late_reference_is_taken_off_and_calibrated_with(world, bag, tmp_path)
     assert "CLOCK_TAKEN_OFF" in said and "the reference's stamps are 2.5" in said
     assert "CONFIGURATION_WRONG" not in said and "suggestion" not in saved
     assert saved["parameters"]["reference_time_offset"] == pytest.approx(LATE, abs=0.1)
-    at = MODELS["G2"].state_names.index("lever_arm_x")
-    assert saved["models"]["G2"]["state"][at] == pytest.approx(ARM, abs=0.2)
+    at = MODELS["full"].state_names.index("lever_arm_x")
+    assert saved["models"]["full"]["state"][at] == pytest.approx(ARM, abs=0.2)
     # what came before it was taken off has been fed again
     taken = Parameters(max_latency=20.0, reference_time_offset=saved["parameters"]["reference_time_offset"])
     replayed = replay([bag], taken).result
     assert saved["counts"]["dvl"] == dict(replayed.counts["dvl"])
-    np.testing.assert_allclose(saved["models"]["G2"]["state"], replayed.estimates["G2"].state, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(saved["models"]["full"]["state"], replayed.estimates["full"].state, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -47,7 +47,7 @@ def test_the_mounting_of_a_played_bag_is_that_of_the_result_file_for_who_comes_l
         "max_latency:=40.0",
         f"mounting_rpy:={list(MOUNTING)}",
         f"result_file:={saved}",
-        "model:=G2",
+        "model:=full",
         "publish_tf:=true",
         "dvl_position:=from_reference",
     ) as process:
@@ -66,7 +66,7 @@ def test_the_mounting_of_a_played_bag_is_that_of_the_result_file_for_who_comes_l
         assert "publish_tf is set, but tf2_ros is not installed" in process.output
     result = load_yaml(saved, "result file")
     mounting, pose = result["mounting"], poses[-1].pose
-    assert result["model"] == "G2"
+    assert result["model"] == "full"
     assert poses[-1].header.frame_id == "base_link"
     at, turn = pose.pose.position, pose.pose.orientation
     np.testing.assert_allclose([at.x, at.y, at.z], mounting["position"], atol=1e-12)

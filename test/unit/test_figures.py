@@ -25,7 +25,7 @@ DEFINITIONS = {
     ),
     "models.md": (
         "the paper's own, 0.0323", "`reference_offset_std` (5 mm/s", "within the 68 / 95 % interval",
-        "(1.9988, -0.0698, 0)", "yaw +2°. Driving ahead",
+        "(1.9988, -0.0698, 0)", "memory 55 s (2.8)", "σ 0.05 m with", "yaw +2°. Driving ahead",
     ),
     "operate.md": ("NIS near 3 of 3", "±1σ", "0.5 % are 7.5 m/s of speed of sound"),
     "quality.md": ("memory within 1 MB/h",),
@@ -65,7 +65,7 @@ def test_figures_that_look_measured_stand_in_blocks():
 )
 def test_a_figure_that_was_measured_is_seen(line):
     assert [each.text for each in unmarked(f"{line}\n")] == [line]
-    assert unmarked(f"<!-- {{recordings[T01.G2]:.3f}} -->{line}<!-- end -->\n") == []
+    assert unmarked(f"<!-- {{recordings[T01.full]:.3f}} -->{line}<!-- end -->\n") == []
 
 
 @pytest.mark.parametrize(

@@ -100,13 +100,13 @@ def recordings(folder: Path) -> Found:
         found[f"{name}.uncorrected"] = held_out["uncorrected_mps"]
         found[f"{name}.corrected"] = held_out["corrected_mps"]
         found[f"{name}.iac"] = published["verification"][found[f"{name}.iac_model"]]["held_out"]["corrected_mps"]
-        for model in ("G1", "G2"):
+        for model in ("G1", "full"):
             found[f"{name}.{model}"] = replayed["verification"][model]["held_out"]["corrected_mps"]
         navigation = replayed["navigation"]
         found[f"{name}.drift_before"] = navigation["drift_m_per_km"]["before"]
         found[f"{name}.drift_after"] = navigation["drift_m_per_km"]["after"]
         found[f"{name}.noise_m_per_km"] = navigation["noise_m_per_km"]
-        estimates[name] = each = _estimate(replayed["models"]["G2"])
+        estimates[name] = each = _estimate(replayed["models"]["full"])
         g1 = _estimate(replayed["models"]["G1"])
         found[f"{name}.g1_yaw_deg"], found[f"{name}.std_g1_yaw"] = (
             -np.degrees(g1["phi_z"][0]),
@@ -171,7 +171,7 @@ def together(folder: Path) -> Found:
 
 @measurement(
     cost=CHEAP,
-    command="dvl-calib evaluate bags/T01 bags/T03 bags/T05 bags/T13 --models G2",
+    command="dvl-calib evaluate bags/T01 bags/T03 bags/T05 bags/T13 --models full",
     tolerances={"*": 0.001},
 )
 def crossed(folder: Path) -> Found:
@@ -179,11 +179,11 @@ def crossed(folder: Path) -> Found:
     names = ("T01", "T03", "T05", "T13")
     dvl_calib("import", snapir_ins(), "-o", folder / "bags", *IMPORT)
     bags = [folder / "bags" / name for name in names]
-    dvl_calib("evaluate", *bags, "--models", "G2", "--json", folder / "crossed.json")
+    dvl_calib("evaluate", *bags, "--models", "full", "--json", folder / "crossed.json")
     document = _json(folder / "crossed.json")
     found = {f"as_mounted.{Path(bag).name}": value for bag, value in document["uncorrected"].items()}
     for one, by_model in document["corrected"].items():
-        for other, value in by_model["G2"].items():
+        for other, value in by_model["full"].items():
             found[f"{Path(one).name}.{Path(other).name}"] = value
     return found
 

@@ -301,7 +301,7 @@ def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Rea
             return []
         return [finding("DRIFT_NO_BETTER", after=after, before=before)]
     worse = finding("DRIFT_WORSE", after=after, before=before)
-    is_open = after**2 - before**2 < known_to**2
+    is_open = after**2 - before**2 < (2.0 * known_to) ** 2
     return [worse.weighed(Severity.MARGINAL) if navigation.fits_better or is_open else worse]
 
 

@@ -69,12 +69,14 @@ class GnssAvailability:
 
 class Evidence(NamedTuple):
     """For the model that extends another: chi-square of what only it has, or the share of a variance that only it knows
-    of; and what of the other model that says: the code of a reason, and its numbers beside the model.
+    of; and what of the other model that says: the code of a reason, and its numbers beside the model. pairs_elsewhere:
+    it finds references that pairing, at the stamps as they are, does not.
     """
 
     chi_square: float
     code: str = "NO_EVIDENCE"
     numbers: Mapping[str, Any] = {}
+    pairs_elsewhere: bool = False
 
 
 NO_EVIDENCE = Evidence(0.0)
@@ -154,7 +156,7 @@ class Selection:
 
     def _update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
-        if self._extended:  # which finds references that pairing, at the stamps as they are, does not
+        if self._extended and self._evidence.pairs_elsewhere and parameters.model == AUTO:
             paired = paired | (stamps_ns < self._referenced_until_ns)
         if self.segments and self.gnss.stays_with(stamps_ns, paired):
             return

@@ -21,7 +21,7 @@ ENOUGH_SAMPLES = 20
 SUSPICIOUS_REPEATED = 0.05
 # A constant error of the reference is said if it is larger than this, m/s, and than so many σ.
 OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
-# It is not shown from this share of its prior σ on.
+# It is not told apart from the mounting where yaw takes this share of it.
 NOT_SHOWN = 0.6
 # Of a lever arm (m) and a delay (s) that a clock leaves open, what is worth a word.
 SAID_FROM_M, SAID_FROM_S = 0.05, 0.05
@@ -112,8 +112,10 @@ def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: floa
     own, assumed = estimate.state_names, parameters.reference_offset_std
     if OFFSETS[0] not in own or not estimate.used or speed <= 0.0:
         return []
-    std = estimate.filter_std[[own.index(name) for name in OFFSETS]]
-    if float(std.min()) < NOT_SHOWN * assumed:
+    at = [own.index(name) for name in OFFSETS]
+    turn, p = parameters.rotation_dvl_from_body[:, 2], estimate.filter_covariance
+    yaw_by_offset = np.linalg.solve(p[np.ix_(at, at)], p[at, :3] @ turn)
+    if float(np.linalg.norm(yaw_by_offset)) * speed < NOT_SHOWN:
         return []
     off = OFTEN_OFF * assumed
     share = off / speed

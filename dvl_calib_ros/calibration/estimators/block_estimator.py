@@ -1,6 +1,6 @@
-"""G2 beside the other models: fed from the aligner, in blocks of time that stamps decide.
+"""`full` beside the other models: fed from the aligner, in blocks of time that stamps decide.
 
-A hypothesis of 3 s of delay needs what comes 3 s later, so G2's samples are used when the others' have long been. What
+A delay of 3 s needs what comes 3 s later, so its samples are used when the others' have long been. What
 the aligner holds of a block is copied as soon as all that may belong to it has come or is overdue, and solved: at once,
 or by a worker while the node goes on receiving. Either way the outcome takes effect when the stamps have gone on by
 SOLVED_WITHIN_NS, so that a live run and a replay of its recording agree whatever the machine was doing.
@@ -20,23 +20,23 @@ from ...verdict.reasons import Reason, finding
 from ..assessment.model_selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
 from ..filters.cross_validation import HeldOutError, Moments
 from ..filters.filter_bank import ModelCounts
-from ..filters.filter_setup import gate_of, prior
+from ..filters.filter_setup import prior
 from ..filters.heading_bias import BiasCovariance
 from ..filters.state_history import Counts, Numbers, StateTrace
-from ..models.own import BEYOND, DELAY, LEVER_ARM, N_G1, N_STATE
+from ..models.own import BIAS, DELAY, LEVER_ARM, N_STATE, PHI, REFERENCE_ERROR
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
 from ..numerics.tables import RowTable
 from ..registration.registration import Registration
 from ..results.results import Day
-from ..results.thinned_recording import Terms, ThinnedBlock, ThinnedRecording, held_out_error
+from ..results.thinned_recording import Terms, ThinnedBlock, ThinnedRecording
 from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
 from .block_preprocessing import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .block_solver import BlockSolver, Outcome
 from .estimator import AtOnce, Estimator, EstimatorSetup, Rest, Solved
-from .posterior_types import DayState, Posterior
+from .full_forward_model import deviation_of
 
 BLOCK_NS = 10_000_000_000
 # How fast the DVL is shows after so long; room for so many times as many of its samples is taken then.
@@ -45,12 +45,12 @@ LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
 # From a block's last data until its outcome takes effect, in stamps. A worker needs a hundredth of it; the stamps of a
 # recording that is played fast come sooner, and then the node waits for the worker.
 SOLVED_WITHIN_NS = 1_000_000_000
-_BEYOND = np.isin(np.arange(N_STATE), np.arange(N_STATE)[BEYOND])
-# What a clock leaves open: angles, lever arm, delay.
-_OPEN = np.r_[0:3, BEYOND]
-AXES = ("x", "y", "z")
-# What is less than so many σ from nothing is not worth a word.
-NAMED_FROM = 4.0
+# A DVL that is late by more may find no reference at the stamps as they are, s.
+PAIRED_WITHIN_S = 0.3
+# A state is shown by the data once these have halved its prior σ.
+SHOWN_SHARE = 0.5
+# What the reference's clock leaves open, in the order of `Registration.left_open`.
+_OPEN: Index = np.r_[PHI, LEVER_ARM, DELAY]
 
 
 class _PendingDvl(RowTable):
@@ -67,20 +67,21 @@ class _PendingDvl(RowTable):
     covariance: Array
 
 
-class DelayFilter(Estimator):
+class FullEstimator(Estimator):
     """Feeds a `BlockSolver` from an aligner; tells the aligner which past of its tracks is still wanted."""
 
     def __init__(self, given: EstimatorSetup) -> None:
-        """Start from the prior of G2's states."""
+        """Start from the prior of the states."""
         assert given.base is not None  # its entry says what it extends
         model, parameters, aligner = given.model, given.parameters, given.aligner
         self._base = given.base
         self._parameters = parameters
         self._aligner = aligner
         self._on_block = given.on_evidence
-        unknown, gate = prior(model, parameters), gate_of(model.n_measurement, parameters)
+        self._unknown = prior(model, parameters)
+        self._prior = given.initial or self._unknown
         self._solver = BlockSolver(
-            parameters, given.initial or unknown, unknown, gate, given.verified, live=given.worker is not None,
+            parameters, self._prior, self._unknown, given.verified, live=given.worker is not None,
             registration=given.registration,
         )  # fmt: skip
         self._worker = AtOnce() if given.worker is None else given.worker
@@ -101,10 +102,8 @@ class DelayFilter(Estimator):
         self._gathered_ns: list[int] = []  # the same of those that are not
         self._is_telling = self._is_settled = False
         self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # asked for by each model's verification
-        # asked for with each message
-        self._of_recording: tuple[Posterior, Registration | None, GaussianState] | None = None
         self._suggested: tuple[Outcome, Reason | None] | None = None
-        self._remembered: list[tuple[int, GaussianState | None, int, float]] = []
+        self._remembered: list[tuple[int, GaussianState, int, float]] = []
         for track in (aligner.reference, aligner.imu):
             track.needed_from[self] = LONG_AGO_NS  # until the first block is known
 
@@ -134,98 +133,52 @@ class DelayFilter(Estimator):
 
     @property
     def counts(self) -> ModelCounts:
-        """Samples used, spikes and those that no hypothesis explains, and the mean νᵀS⁻¹ν of the used ones."""
+        """Samples used, spikes and those far from all others, and their mean squared misfit; without data those of the
+        model that this extends."""
         return self._told.counts if self.claims else self._base.counts._replace(restarted=self._told.counts.restarted)
 
     @property
-    def posterior(self) -> Posterior | None:
-        """What is known after the blocks so far; None before the first."""
-        return self._told.posterior
-
-    @property
     def claims(self) -> bool:
-        """Whether the data show anything of lever arm or delay."""
-        return self.posterior is not None and bool(self.posterior.shown[BEYOND].any())
-
-    @property
-    def filter_covariance(self) -> Array:
-        """As `Estimator`, with what is not known of the heading; its own has been raised by blocks of time."""
-        posterior = self.posterior
-        if posterior is None or not self.claims:
-            return self.state().p
-        factor = np.where(_BEYOND & ~posterior.shown, 1.0, posterior.inflation)
-        lowered: Array = posterior.state.p / np.outer(factor, factor)
-        return lowered
+        """Whether there are any data."""
+        return bool(self._told.days)
 
     @property
     def heading_deviation(self) -> GaussianState | None:
         """As `Estimator`."""
-        posterior = self.posterior
-        return posterior.heading if posterior is not None and self.claims else self._base.heading_deviation
+        return deviation_of(self.state()) if self.claims else self._base.heading_deviation
 
     def state(self) -> GaussianState:
-        """The state; while nothing more is claimed that of the model that this extends."""
-        posterior, base = self.posterior, self._base.state()
-        return posterior.state if posterior is not None and self.claims else self.extended(base)
+        """The state by the blocks so far."""
+        days = self._told.days
+        return days[-1] if days else self._prior
 
     def of_recording(self) -> GaussianState:
-        """As `state`, with σ as blocks of time show it, by which its own has been raised, and as a bias makes it."""
-        posterior = self.posterior
-        if posterior is None or not self.claims:
-            return self.extended(self._base.of_recording())
-        registration = self._registration_told
-        known = self._of_recording
-        if known is None or known[0] is not posterior or known[1] is not registration:
-            x, p = posterior.state
-            of_all = posterior.of_bias.added_to(GaussianState(x, p + self.left_open))
-            known = self._of_recording = posterior, registration, of_all
-        return known[2]
+        """As `state`: σ holds all that is known of noise, and what the reference's clock leaves open."""
+        x, p = self.state()
+        return GaussianState(x, p + self.left_open)
 
     @property
-    def _registration_told(self) -> Registration | None:
-        """In a result by all data, else as clocks were looked at on the way."""
-        told = self._told
-        return self._solver.registration() if self._is_settled else told.looked.registration
+    def left_open(self) -> Array:
+        """As `Estimator`: attitudes of another time look like an arm at one speed, and like a yaw in a steady turn."""
+        found: Array = np.zeros((N_STATE, N_STATE))
+        settled = self._is_settled and self.claims
+        registration = self._solver.registration() if settled else self._told.looked.registration
+        if self.claims and registration is not None:
+            own = np.eye(len(_OPEN))
+            own[:3, :3] = -self._parameters.rotation_dvl_from_body  # a turn is a misalignment the other way round
+            if any(self._parameters.lever_arm):
+                own[3:6] = 0.0
+            found[np.ix_(_OPEN, _OPEN)] = own @ registration.left_open @ own.T
+        return found
 
     @property
     def of_bias(self) -> BiasCovariance:
         """As `Estimator`."""
-        posterior = self.posterior
-        if posterior is not None and self.claims:
-            return posterior.of_bias
-        found, base = BiasCovariance.none(N_STATE), self._base.of_bias
-        found.columns[:N_G1] = base.columns
-        return found
-
-    @property
-    def left_open(self) -> Array:
-        """(n, n) of what is shown of angles, lever arm and delay, what the reference's clock leaves open."""
-        found: Array = np.zeros((N_STATE, N_STATE))
-        posterior, registration = self.posterior, self._registration_told
-        if posterior is not None and self.claims and registration is not None:
-            own = np.eye(len(_OPEN))
-            own[:3, :3] = -self._parameters.rotation_dvl_from_body  # a turn is a misalignment the other way round
-            own *= posterior.shown[_OPEN, None]
-            found[np.ix_(_OPEN, _OPEN)] = own @ registration.left_open @ own.T
-            if any(self._parameters.lever_arm):
-                found[:3, :3] += self.turn_open
-        return found
-
-    @property
-    def turn_open(self) -> Array:
-        """As `Estimator`."""
-        registration = self._registration_told
-        if self.posterior is None or not self.claims or registration is None:
-            return np.zeros((3, 3))
-        about = self._parameters.rotation_dvl_from_body @ registration.turn_open
-        return np.outer(about, about)
-
-    def extended(self, base: GaussianState) -> GaussianState:
-        """The state of the model that this one extends, with the prior of what it does not have."""
-        n, prior = len(base.x), self._told.prior
-        p = prior.p.copy()
-        p[:n, :n] = base.p
-        return GaussianState(np.concatenate([base.x, prior.x[n:]]), p)
+        p = self.state().p
+        values, vectors = np.linalg.eigh(p[BIAS, BIAS])
+        root = np.sqrt(np.maximum(values, 1e-300))
+        columns = np.where(values > 0.0, p[:, BIAS] @ vectors / root, 0.0)
+        return BiasCovariance((1.0 - 1e-6) * columns)  # what is left of a bias itself is positive, rounding aside
 
     @property
     def suggestion(self) -> Reason | None:
@@ -272,26 +225,11 @@ class DelayFilter(Estimator):
 
     @property
     def evidence(self) -> Evidence:
-        """How much speaks for lever arm and delay."""
-        posterior = self.posterior
-        if posterior is None or not self.claims:
+        """As `Estimator`: with attitude and angular velocity there is nothing that it does not know better."""
+        if not self.claims:
             return NO_EVIDENCE
-        x, p = posterior.state
-        at = np.flatnonzero(posterior.shown & _BEYOND)
-        chi_square = float(x[at] @ np.linalg.solve(p[np.ix_(at, at)], x[at]))
-        std = np.sqrt(np.diag(p))
-        found = []
-        arm = [index for index in at.tolist() if index != DELAY]
-        if any(abs(x[index]) > NAMED_FROM * std[index] for index in arm):
-            axes = " ".join(f"{AXES[index - LEVER_ARM.start]} {x[index]:+.2f}" for index in arm)
-            found.append(finding("ARM_SHOWN", axes=axes))
-        if DELAY in at and abs(x[DELAY]) > NAMED_FROM * std[DELAY]:
-            found.append(finding("DELAY_SHOWN", seconds=abs(x[DELAY]), way="late" if x[DELAY] > 0.0 else "early"))
-        turns = float(posterior.by_lever_arm.max())
-        if turns > chi_square:
-            return Evidence(turns, "ARM_TAKEN_AS_KNOWN", {"turns": _arm_as_angle(posterior)})
-        shown = tuple(found) or finding("ARM_OR_DELAY_NOT_TOLD")
-        return Evidence(chi_square, "ARM_OR_DELAY_SHOWN", {"shown": shown})
+        is_late = abs(float(self.state().x[DELAY])) > PAIRED_WITHIN_S
+        return Evidence(2.0 * EXTENDED_FROM, "FULL_HAS_DATA", pairs_elsewhere=is_late)
 
     @property
     def doubt(self) -> Reason | None:
@@ -300,28 +238,28 @@ class DelayFilter(Estimator):
         On a circle at one speed a DVL that sits elsewhere looks like a turned one, and σ of a model that takes the
         lever arm as known is worth nothing.
         """
-        posterior = self.posterior
-        if posterior is None or posterior.by_lever_arm.max() < EXTENDED_FROM:
+        p = self.state().p
+        turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, PHI])  # (lever arm, misalignment)
+        by_arm = (p[PHI, LEVER_ARM] * turns.T).sum(axis=1)
+        rest = np.maximum(np.diag(p)[PHI] - by_arm, 1e-12)
+        if not self.claims or (by_arm / rest).max() < EXTENDED_FROM:
             return None
-        return _arm_as_angle(posterior)
+        index = int(np.argmax(by_arm / rest))
+        degrees = abs(0.1 * math.degrees(np.abs(turns[:, index]).max()))
+        return finding("ARM_LOOKS_LIKE_ANGLE", metres=0.1, degrees=degrees, angle=("roll", "pitch", "yaw")[index])
 
     def remember(self, from_ns: int) -> None:
-        """Keep the state as of now, for `remembered`."""
+        """Keep the state as of now, for `states_at`."""
         used, _, mean_nis, _, _ = self._told.counts
-        state = posterior.state if (posterior := self.posterior) is not None and self.claims else None
-        self._remembered.append((from_ns, state, used, used * mean_nis if used else 0.0))
+        self._remembered.append((from_ns, self.state(), used, used * mean_nis if used else 0.0))
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
-        """As `Estimator`; where nothing was claimed the states of the model that this extends, extended."""
-        base, used, nis_sum = self._base.states_at(trace, numbers, stamps_ns)
-        extended = [self.extended(GaussianState(*each)) for each in zip(*base, strict=True)]
-        used, nis_sum = used.copy(), nis_sum.copy()
-        at = np.searchsorted([row[0] for row in self._remembered], stamps_ns, side="right") - 1
-        for index, row in enumerate(at.tolist()):
-            if row >= 0 and (state := self._remembered[row][1]) is not None:
-                extended[index] = state
-                used[index], nis_sum[index] = self._remembered[row][2:]
-        return GaussianState(np.array([s.x for s in extended]), np.array([s.p for s in extended])), used, nis_sum
+        """As `Estimator`."""
+        rows = [(LONG_AGO_NS, self._prior, 0, 0.0), *self._remembered]
+        at = np.searchsorted([row[0] for row in rows], stamps_ns, side="right") - 1
+        told = [rows[index] for index in at.tolist()]
+        states = GaussianState(np.array([row[1].x for row in told]), np.array([row[1].p for row in told]))
+        return states, np.array([row[2] for row in told]), np.array([row[3] for row in told])
 
     @contextmanager
     def settled(self) -> Iterator[None]:
@@ -509,51 +447,32 @@ class DelayFilter(Estimator):
         """Which day (N,) stamps are of, from 0."""
         return np.searchsorted(np.array(self._day_starts_ns, dtype=np.int64), stamps_ns, side="right")
 
-    @property
-    def days(self) -> list[DayState]:
-        """What was found on each day, where there are more than one and lever arm or delay are claimed; else none."""
-        if not self._day_starts_ns or not self.claims or self.posterior is None:
-            return []
-        return [*self._idle_solver().bank.days(), DayState(self.posterior.state, self.posterior.shown)]
-
     def days_from(self, first_ns: Sequence[int]) -> tuple[Day, ...]:
-        """As `Estimator`, where it claims more than the model that it extends."""
-        names, nominal, days = self._state_names, self._parameters.dvl_time_offset, []
-        delay, *offset = (names.index(name) for name in ("time_offset", "reference_east", "reference_north"))
-        for begins_ns, (state, shown) in zip(first_ns, self.days, strict=False):
-            std = np.sqrt(np.diag(state.p))
-            (east, north), (east_std, north_std) = state.x[offset].tolist(), std[offset].tolist()
-            late, late_std = nominal + float(state.x[delay]), float(std[delay])
-            days.append(Day(begins_ns, late, late_std, bool(shown[delay]), (east, north), (east_std, north_std)))
+        """As `Estimator`."""
+        nominal, days = self._parameters.dvl_time_offset, []
+        known, offset = self._unknown.p[DELAY, DELAY], np.arange(N_STATE)[REFERENCE_ERROR][:2]
+        states = self._told.days if self._day_starts_ns else ()
+        for begins_ns, (x, p) in zip(first_ns, states, strict=False):
+            std = np.sqrt(np.diag(p))
+            (east, north), (east_std, north_std) = x[offset].tolist(), std[offset].tolist()
+            shown = bool(p[DELAY, DELAY] <= SHOWN_SHARE**2 * known)
+            late = nominal + float(x[DELAY])
+            days.append(Day(begins_ns, late, float(std[DELAY]), shown, (east, north), (east_std, north_std)))
         return tuple(days)
 
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
         """For every fold what it corrects on every day, had it not seen that fold."""
         if not self.claims:
             return self._base.held_out_terms(n_days)
-        return [[Terms.of_state(state.x) for state in states] for states in self._idle_solver().bank.without_folds()]
+        return [[Terms.of_state(state.x) for state in states] for states in self._idle_solver().fit.without_folds()]
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
         """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
-        if not self.claims:
-            return self._base.held_out_error(judge, rotation_dvl_from_body)
-        kept = self.recording
-        if kept is None:
-            return None
-        recording, epoch_ns = kept
-        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
         try:
-            without = self._idle_solver().bank.without_folds()
-        except np.linalg.LinAlgError:  # as in `posterior`
+            return self._idle_solver().fit.held_out_error()
+        except np.linalg.LinAlgError:
             return None
-        return held_out_error(recording, stamps_ns, self.day_of(stamps_ns), without, self._parameters)
 
     def _idle_solver(self) -> BlockSolver:
         self._newest()
         return self._solver
-
-
-def _arm_as_angle(posterior: Posterior) -> Reason:
-    index = int(np.argmax(posterior.by_lever_arm))
-    angle, degrees = ("roll", "pitch", "yaw")[index], abs(0.1 * math.degrees(posterior.turned[index]))
-    return finding("ARM_LOOKS_LIKE_ANGLE", metres=0.1, degrees=degrees, angle=angle)

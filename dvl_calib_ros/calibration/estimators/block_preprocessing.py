@@ -7,20 +7,18 @@ they fit much better, with whatever delay they are beside it; without one that i
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from ..models.parameters import Parameters
 from ..numerics.frames import ENU_FROM_NED, Array
-from ..numerics.robust import median, robust_std, steps
+from ..numerics.robust import median, steps
 from ..numerics.samples import FRAME_CODES, Codes, Index, Mask, Stamps, VelocityFrame
 from ..results.thinned_recording import NOT_MEASURED, thinned
 from ..streams.interpolation import MARGIN_S, DvlColumns, ImuColumns, ReferenceColumns, binned
-from ..streams.outliers import deviation_from_neighbours, neighbours, without_spikes
+from ..streams.outliers import without_spikes
 from ..streams.position_velocities import are_positions, of_moments
-from .observation_rows import DelayedRows
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 # No vehicle with a DVL turns faster, rad/s.
@@ -64,8 +62,8 @@ class Cleaned(NamedTuple):
         return len(self.dvl.times) >= 6 and len(self.imu.times) >= 2
 
 
-def cleaned(block: Block, parameters: Parameters, epoch_ns: int, contradicted: Stamps) -> Cleaned:
-    """A block's samples. epoch_ns: stamp of time 0. contradicted: stamps of DVL samples that are left out already."""
+def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
+    """A block's samples. epoch_ns: stamp of time 0."""
     block = block._replace(reference=_of_moments(block.reference, parameters))
     own = _own(block)
     raw = block.reference.part(own)
@@ -75,7 +73,7 @@ def cleaned(block: Block, parameters: Parameters, epoch_ns: int, contradicted: S
     imu = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
     are_compared = len(reference.times) > 0 and not block.silent
     if are_compared:
-        dvl, noise_dvl, dvl_ns, dvl_spikes = _dvl_columns(block, parameters, epoch_ns, contradicted)
+        dvl, noise_dvl, dvl_ns, dvl_spikes = _dvl_columns(block, parameters, epoch_ns)
         imu = _imu(block.imu, epoch_ns)
     from_s, to_s = seconds(np.array([block.from_ns, block.end_ns]), epoch_ns).tolist()
     return Cleaned(
@@ -99,15 +97,10 @@ def cleaned(block: Block, parameters: Parameters, epoch_ns: int, contradicted: S
     )
 
 
-def _dvl_columns(
-    block: Block, p: Parameters, epoch_ns: int, contradicted: Stamps
-) -> tuple[DvlColumns, Array, Stamps, int]:
+def _dvl_columns(block: Block, p: Parameters, epoch_ns: int) -> tuple[DvlColumns, Array, Stamps, int]:
     """A block's DVL samples that are no outliers (N), their mean covariance (3, 3), their stamps (N,), and how many
     outliers it has."""
     stamps_ns, velocity, covariance = block.dvl
-    if len(contradicted):
-        known = ~np.isin(stamps_ns, contradicted, assume_unique=True)
-        stamps_ns, velocity, covariance = stamps_ns[known], velocity[known], covariance[known]
     # one bends the curve that is read between samples for all references about it, and no gate would see that
     good = _good(stamps_ns, velocity)
     n_spikes = 0
@@ -237,78 +230,3 @@ class Block(NamedTuple):
     dvl: DvlSamples
     reference: ReferenceSamples
     imu: ImuSamples
-
-
-# Scatter about what neighbours tell, from which on a sample is suspicious; less than so much is noise, m/s.
-SUSPICIOUS, LEAST_NOISE_MPS = 6.0, 0.03
-# So many of them are looked at, those furthest off: a block of 10 s of a DVL that is wrong more often is lost anyway.
-MOST = 8
-# It is left out if by that the references' squared misfit falls below this share, and by more than noise can make it.
-SHARE_LEFT, LEAST_GAIN = 0.8, 50.0
-# Delays whose probability is smaller than that of the likeliest by more than this (logarithm) have no say.
-UNLIKELY = 10.0
-# A reference is beside a sample that is nearer than this, s: where the curve between samples is most of all that one.
-BESIDE_S = 0.25
-
-
-def without_contradicted(
-    dvl: DvlColumns,
-    reference_times: Array,
-    rows_of: Callable[[DvlColumns], DelayedRows],
-    misfits: Callable[[DelayedRows], tuple[Array, Array]],
-    delays_s: Array,
-) -> tuple[Mask, DelayedRows]:
-    """Which DVL samples (N,) are not contradicted, and the references' rows by these.
-
-    reference_times: (J,) s. rows_of: what references are beside some of the DVL's samples. misfits: as
-    `DelayBank.misfits`; delays_s: (K,) of its hypotheses.
-    """
-    kept = np.arange(len(dvl.times))
-    rows = rows_of(dvl)
-    while len(rows):
-        tried = []
-        for at in _suspicious(dvl.velocity[kept]).tolist():
-            without = np.delete(kept, at)
-            fewer = rows_of(DvlColumns(*(column[without] for column in dvl)))
-            share = _share_left(dvl.times[kept[at]], reference_times, rows, fewer, misfits, delays_s)
-            tried.append((share, without, fewer))
-        share, without, fewer = min(tried, key=lambda each: each[0], default=(1.0, kept, rows))
-        if share > SHARE_LEFT:
-            break
-        kept, rows = without, fewer
-    mask: Mask = np.zeros(len(dvl.times), dtype=bool)
-    mask[kept] = True
-    return mask, rows
-
-
-def _share_left(
-    sample_s: float,
-    reference_times: Array,
-    rows: DelayedRows,
-    fewer: DelayedRows,
-    misfits: Callable[[DelayedRows], tuple[Array, Array]],
-    delays_s: Array,
-) -> float:
-    """What is left of the misfit without a sample, by the delay to which that matters least; 1 if it gains too little.
-
-    A delay by which no reference is beside the sample cannot say that it is right.
-    """
-    both = rows.index[np.isin(rows.index, fewer.index)]
-    if not len(both):
-        return 1.0
-    before, _ = misfits(rows.part(np.isin(rows.index, both)))
-    after, log_share = misfits(fewer.part(np.isin(fewer.index, both)))
-    distance = np.abs(reference_times[both][:, None] + delays_s - sample_s).min(axis=0)
-    has_say = (log_share > log_share.max() - UNLIKELY) & (distance < BESIDE_S)
-    if not has_say.any():
-        return 1.0
-    share = np.where(before - after > LEAST_GAIN, after / np.maximum(before, 1e-300), 1.0)
-    return float(share[has_say].max())
-
-
-def _suspicious(velocity: Array) -> Index:
-    """Which samples of (N, 3) m/s are further from what neighbours tell than most, and than those beside them."""
-    off = deviation_from_neighbours(velocity)
-    far = (np.abs(off) / np.maximum(robust_std(off), LEAST_NOISE_MPS)).max(axis=1)
-    found = np.flatnonzero((far > SUSPICIOUS) & (far >= neighbours(far)))
-    return found[np.argsort(-far[found], kind="stable")[:MOST]]

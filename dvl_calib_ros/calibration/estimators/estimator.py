@@ -108,11 +108,6 @@ class Estimator(ABC):
         return False
 
     @property
-    def turn_open(self) -> Array:
-        """(3, 3) of misalignment, what the reference's clock leaves open of it where the lever arm is as told."""
-        return np.zeros((3, 3))
-
-    @property
     def left_open(self) -> Array:
         """(n, n) of `of_recording`'s covariance, what the clock of the reference leaves open."""
         n = len(self.state().x)

@@ -1,7 +1,7 @@
-"""Which clock is late: the DVL's, the reference's, or the IMU's. G2 takes it to be the DVL's, and is told otherwise.
+"""Which clock is late: the DVL's, the reference's, or the IMU's. `full` takes the DVL's, and is told otherwise.
 
 Where the reference is stamped late, attitude and angular velocity of the wrong time turn its velocity by ω ρ, which a
-lever arm of ρ u explains almost as well: so what G2 has kept of each day is registered.
+lever arm of ρ u explains almost as well: so what `full` has kept of each day is registered.
 """
 
 from __future__ import annotations
@@ -27,13 +27,12 @@ from ..results.thinned_recording import (
     Terms,
     ThinnedBlock,
     ThinnedRecording,
-    held_out_error,
     typical_error,
 )
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
-from .delay_hypotheses import DelayBank
 from .estimator import Rest
-from .posterior_types import Posterior
+from .full_fit import JointFit
+from .full_forward_model import deviation_of
 
 # Live, what was found stands until so much more is there.
 AGAIN_FROM = 1.5
@@ -149,10 +148,9 @@ class _Registered:
 
 
 class ToldSoFar(NamedTuple):
-    """What blocks have told so far: the bank, what it found, and the stamp (ns) of their time 0."""
+    """What blocks have told so far: the fit, and the stamp (ns) of its time 0."""
 
-    bank: DelayBank
-    posterior: Posterior
+    fit: JointFit
     epoch_ns: int
 
 
@@ -234,13 +232,13 @@ class KeptClocks:
         """Of all that is kept, corrected by what the blocks have told without each fold."""
         recording, p = self._seen.recording(), self._parameters
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + told.epoch_ns
-        without = [[states[-1]] for states in told.bank.without_folds()]
+        without = [[states[-1]] for states in told.fit.without_folds()]
+        state = told.fit.states[-1]
         terms = [Terms.of_state(state.x) for [state] in without]
-        held_out = held_out_error(recording, stamps_ns, np.zeros(len(stamps_ns), dtype=np.intp), without, p)
         return Rest(
-            held_out,
-            typical_error(recording, Terms.of_state(told.posterior.state.x), p),
+            told.fit.held_out_error(),
+            typical_error(recording, Terms.of_state(state.x), p),
             recording.judged(p),
-            dead_reckoned(recording, folds_of(stamps_ns, p), terms, p, told.epoch_ns, told.posterior.heading),
+            dead_reckoned(recording, folds_of(stamps_ns, p), terms, p, told.epoch_ns, deviation_of(state)),
             not recording.reference.in_body.any(),
         )

@@ -205,6 +205,8 @@ class HeldOutError:
     covariance of the estimate lead one to expect of corrected. Each holds the noise of the reference. calibration: the
     part of predicted that is the estimate's. interpolated: so much more of a white reference's noise corrected may hold
     than in uncorrected: between its samples it is quieter than at them, and a delay changes where it is asked.
+    independent: how many samples of noise without memory tell as much of its size; None: as many as there are.
+    claimed: noise of reference and DVL as their messages have it, where predicted has it as the data show it.
     """
 
     samples: int
@@ -213,6 +215,8 @@ class HeldOutError:
     predicted: float
     calibration: float
     interpolated: float = 0.0
+    independent: float | None = None
+    claimed: float = 0.0
 
 
 def held_out_error(

@@ -35,7 +35,7 @@ def offset_covariance(model: Model, state: Array, claimed: Array, parameters: Pa
 
     state: (n,). claimed: (n, n) what the filter alone claims.
     """
-    at = [model.state_names.index(name) for name in OFFSETS if name in model.state_names]
+    at = [model.state_names.index(name) for name in OFFSETS if name in model.state_names and not model.estimator]
     if not at:
         return np.zeros_like(claimed)
     variance = parameters.reference_offset_std**2

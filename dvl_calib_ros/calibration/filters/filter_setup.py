@@ -155,11 +155,15 @@ def _dropped_axes(model: Model, unmeasured: Unmeasured) -> Mask:
     return dropped
 
 
+# A prior σ of zero, as of an exact heading, is this: nothing is known with infinite information.
+LEAST_STD = 1e-7
+
+
 def prior(model: Model, parameters: Parameters) -> GaussianState:
     """Zero errors with the prior standard deviations of the parameters."""
     std = [parameters.initial_std_misalignment] * 3 + [parameters.initial_std_scale] * (model.n_errors - 3)
     std += [getattr(parameters, each.std) if isinstance(each.std, str) else each.std for each in model.nuisance]
-    return GaussianState(np.zeros(model.n_state), np.diag(np.square(std)))
+    return GaussianState(np.zeros(model.n_state), np.diag(np.square(np.maximum(std, LEAST_STD))))
 
 
 def gate_of(rows: float, parameters: Parameters) -> float:

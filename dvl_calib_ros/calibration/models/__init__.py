@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from .base import N_MEASUREMENT, Linearised, Model, Needs, Nuisance
-from .own import D1, G2, OWN
+from .own import D1, FULL, OWN
 from .plugins import plugged_models
 from .published import PUBLISHED
 
@@ -19,7 +19,7 @@ __all__ = [
 ]  # fmt: skip
 
 _G1, *_WITHOUT_REFERENCE = OWN
-_OWN = {model.name: model for model in (*PUBLISHED, _G1, G2, *_WITHOUT_REFERENCE, D1)}
+_OWN = {model.name: model for model in (*PUBLISHED, _G1, FULL, *_WITHOUT_REFERENCE, D1)}
 _PLUGGED, _PROBLEMS = plugged_models(_OWN)
 MODELS: Mapping[str, Model] = _OWN | _PLUGGED
 # What is wrong with models of other packages that cannot be used.

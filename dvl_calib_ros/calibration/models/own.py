@@ -1,4 +1,4 @@
-"""Models of our own: G1, F1, A1, and the entries of G2 and D1."""
+"""Models of our own: G1, F1, A1, and the entries of `full` and D1."""
 
 from __future__ import annotations
 
@@ -216,34 +216,74 @@ OWN = (
 )  # fmt: skip
 
 
-# What shows the states that G1 has not, by name.
-_SHOWN_TO_G2 = {
+# The states of `full`: misalignment, scale, lever arm, bias of the DVL, deviation of the heading (one and two cycles);
+# and of each day: delays of DVL and reference, constant error of the reference.
+PHI, SCALE, LEVER_ARM, BIAS, HEADING = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11), slice(11, 15)
+DELAY, REFERENCE_DELAY, REFERENCE_ERROR = 15, 16, slice(17, 20)
+N_STATE = 20
+
+
+def heading_cycles(rotation_enu_from_body: Array) -> Array:
+    """Return sine and cosine of the heading and of twice the heading (N, 4), of attitudes (N, 3, 3)."""
+    heading = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
+    return np.stack([np.sin(heading), np.cos(heading), np.sin(2.0 * heading), np.cos(2.0 * heading)], axis=1)
+
+
+def linearise_full(seen: Observations) -> Linearised:
+    """z = g - T'v and H (N, 3, 20) of `full` at zero errors, body frame: what a motion would tell it."""
+    assert seen.reference_body is not None
+    body_from_dvl = seen.rotation_dvl_from_body.T
+    h = np.zeros((len(seen.velocity_dvl), 3, N_STATE))
+    h[:, :, :5] = g1_errors(body_from_dvl, seen.velocity_dvl.T).transpose(2, 0, 1)
+    h[:, :, BIAS] = -body_from_dvl
+    if seen.angular_velocity is not None:
+        h[:, :, LEVER_ARM] = -skew(seen.angular_velocity)
+    if seen.earth_in_body is not None and seen.rotation_enu_from_body is not None:
+        h[:, :, REFERENCE_ERROR] = seen.rotation_enu_from_body.transpose(0, 2, 1)
+        up = seen.rotation_enu_from_body[:, 2]
+        across = np.cross(up, seen.velocity_in_body)
+        h[:, :, HEADING] = across[:, :, None] * heading_cycles(seen.rotation_enu_from_body)[:, None]
+    return seen.reference_body - seen.velocity_in_body, h
+
+
+# What shows the states that are more than nuisance, by name.
+_SHOWN_TO_FULL = {
     "lever_arm_x": "turns to both sides, or of different sharpness (needs angular velocity)",
     "lever_arm_y": "turns to both sides, or of different sharpness (needs angular velocity)",
     "lever_arm_z": "rolling and pitching: waves, or dives (needs angular velocity)",
     "time_offset": "speeding up and slowing down, entering and leaving turns (needs angular velocity)",
 }
+# What registration leaves open of the reference's clock, s.
+REFERENCE_DELAY_STD_S = 0.05
 
 
-G2 = Model(
-    "G2", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS | _SHOWN_TO_G2,
-    assumes="as G1, with a DVL anywhere on the vehicle whose stamps are off by up to 3 s; needs angular velocity",
+FULL = Model(
+    "full", Needs.REFERENCE, 3, linearise_full, SHOWN_WITH_GNSS | _SHOWN_TO_FULL,
+    assumes="attitude and angular velocity; a DVL anywhere on the vehicle whose stamps are off by up to 3 s",
     wrong_when="the delay changes along the run; a vehicle that bends",
     scale_axes=SCALE_PER_AXIS,
     nuisance=(
-        *G1_NUISANCE,
         Nuisance("lever_arm_x", "m", "initial_std_lever_arm"),
         Nuisance("lever_arm_y", "m", "initial_std_lever_arm"),
         Nuisance("lever_arm_z", "m", "initial_std_lever_arm"),
+        Nuisance("dvl_bias_x", "m/s", "dvl_bias_std"),
+        Nuisance("dvl_bias_y", "m/s", "dvl_bias_std"),
+        Nuisance("dvl_bias_z", "m/s", "dvl_bias_std"),
+        Nuisance("heading_sin", "rad", "heading_deviation_std"),
+        Nuisance("heading_cos", "rad", "heading_deviation_std"),
+        Nuisance("heading_sin2", "rad", "heading_deviation_std"),
+        Nuisance("heading_cos2", "rad", "heading_deviation_std"),
         Nuisance("time_offset", "s", "initial_std_time_offset", of_the_day=True),
+        Nuisance("reference_time_offset", "s", REFERENCE_DELAY_STD_S, of_the_day=True, handed_on=False),
+        Nuisance("reference_east", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
+        Nuisance("reference_north", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
+        Nuisance("reference_up", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
     ),
     noise=noise_in_body,
-    heave=g1_heave,
     vertical_from_reference=True,
     rows_in_body=True,
-    in_correction_parameters=True,
     extends="G1",
-    estimator="dvl_calib_ros.calibration.estimators.block_estimator:DelayFilter",
+    estimator="dvl_calib_ros.calibration.estimators.block_estimator:FullEstimator",
 )  # fmt: skip
 
 
@@ -271,8 +311,3 @@ D1 = Model(
     from_positions=True,
     estimator="dvl_calib_ros.calibration.estimators.displacement_estimator:Displacements",
 )  # fmt: skip
-
-
-N_ERRORS, N_G1, N_STATE = 5, 8, 12
-LEVER_ARM, DELAY = slice(8, 11), 11
-BEYOND = slice(N_G1, N_STATE)  # what G1 has not

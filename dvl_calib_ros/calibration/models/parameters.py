@@ -253,14 +253,15 @@ class Parameters:
     )
     initial_std_lever_arm: float = _parameter(
         2.0,
-        "Prior standard deviation of each component of the lever arm about lever_arm (G2).",
+        "Prior standard deviation of each component of the lever arm about lever_arm (full). One that is given counts "
+        "as measured to 0.05 m, or with a probability of 0.1 as wrong by this.",
         unit="m",
         low=1e-4,
         high=100.0,
     )
     initial_std_time_offset: float = _parameter(
         1.0,
-        "Prior standard deviation of the DVL's time offset about dvl_time_offset (G2, which looks within 3.2 s).",
+        "Prior standard deviation of the DVL's time offset about dvl_time_offset (full, which looks within 3.2 s).",
         unit="s",
         low=1e-4,
         high=10.0,
@@ -301,7 +302,7 @@ class Parameters:
     motion_std: float = _parameter(
         ASSUMPTIONS.motion_std,
         "Standard deviation of sway and heave about what is modelled, straight ahead: noise of A1 and F1; of the mean "
-        "heave of 20 s in G1 and G2, as long as the run has not shown its own.",
+        "heave of 20 s in G1 and the full model, as long as the run has not shown its own.",
         unit="m/s",
         low=1e-4,
         high=10.0,
@@ -323,7 +324,7 @@ class Parameters:
     reference_offset_std: float = _parameter(
         0.005,
         "Prior standard deviation, east and north, of a constant error of a reference velocity in an earth frame, as "
-        "of an inertial navigation (G1, G2). On one heading, σ of yaw and scale is at least four times this; several "
+        "of an inertial navigation (G1, full). On one heading, σ of yaw and scale is at least four times this; several "
         "headings find the error.",
         unit="m/s",
         low=1e-6,
@@ -332,15 +333,15 @@ class Parameters:
     heading_deviation_std: float = _parameter(
         math.radians(0.5),
         "Prior standard deviation of the heading's error: with the course (one and two cycles, as of a compass), and "
-        "over the run (as a gyro drifts) (G1, G2). On one heading the σ of yaw includes it; several headings show its "
-        "true size. 0: the heading is exact.",
+        "over the run (G1, as a gyro drifts). On one heading the σ of yaw includes it; several headings show "
+        "its true size. 0: the heading is exact.",
         unit="rad",
         low=0.0,
         high=0.5,
     )
     dvl_bias_std: float = _parameter(
         0.008,
-        "Prior standard deviation of a constant error of the DVL's velocity, along each of its axes (G1, G2). At one "
+        "Prior standard deviation of a constant error of the DVL's velocity, along each of its axes (G1, full). At one "
         "speed σ of roll, pitch, yaw and scale includes it; several speeds show its size. 0.008: as the beam biases "
         "of the paper's data make it; the worst that is known is under three times that. 0: the DVL has none.",
         unit="m/s",

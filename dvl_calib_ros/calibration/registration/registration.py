@@ -64,7 +64,7 @@ KNOWN_STD_S, KNOWN_SHARE, KNOWN_AT_MOST_S = 0.25, 0.12, 0.35
 
 
 OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
-# A DVL that is late by less is found by the calibration itself (G2), at whatever its stamps say, s.
+# A DVL that is late by less is found by the calibration itself (full), at whatever its stamps say, s.
 LEFT_TO_CALIBRATION_S = 2.5
 # Clocks that are found twice are one clock if they agree to this, s.
 ALIKE_S = 0.1
@@ -100,9 +100,8 @@ class Registration:
     speed; spread: the same, m/s per axis; speed: RMS, m/s.
     unsteady: a clock that drifts or leaps beside the others; all else is what holds with that taken off.
     open_late: σ (s) of the reference's clock by the data alone; open_by: (7,) by how much the DVL's turn (rad, body),
-    the lever arm (m) and the DVL's delay (s) are others for each second of it. turn_open: (3,) rad, body, what it
-    leaves open of the turn where the lever arm is as told. next_worse: by how much (chi-square) the next explanation is
-    worse than the one that is taken.
+    the lever arm (m) and the DVL's delay (s) are others for each second of it. next_worse: by how
+    much (chi-square) the next explanation is worse than the one that is taken.
     """
 
     dvl: Clock
@@ -122,7 +121,6 @@ class Registration:
     speed: float
     open_late: float
     open_by: Array
-    turn_open: Array
     next_worse: float
     unsteady: ClockChange | None = None
 
@@ -307,7 +305,7 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
 def _open(fit: MotionFit, free: Fitted, late: float, rotation: Array | None) -> dict[str, Any]:
     """open_late and open_by of a fit with all clocks free. late: s, where the reference's is said to be."""
     if not fit.is_turned:
-        return {"open_late": 0.0, "open_by": np.zeros(7), "turn_open": np.zeros(3)}
+        return {"open_late": 0.0, "open_by": np.zeros(7)}
     std, by, off = float(free.std[LATE]), free.by(LATE), abs(float(free.x[LATE]) - late)
     if off > FAR_OPEN * std and late == 0.0:
         std = off
@@ -315,23 +313,7 @@ def _open(fit: MotionFit, free: Fitted, late: float, rotation: Array | None) -> 
         # as good as in time, and so far away that it turns another arm there
         near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))
         std, by = max(std, off), by if near is None else near.by(LATE)
-    return {
-        "open_late": std,
-        "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[APART]]]),
-        "turn_open": turn_open(free, late),
-    }
-
-
-def turn_open(free: Fitted, late: float) -> Array:
-    """(3,) rad, body, of the turn with the lever arm as it was told; zeros for nothing to speak of."""
-    white = free.p / np.outer(free.raised, free.raised)
-    by_arm = np.linalg.solve(white[ARM, ARM], white[ARM])  # (3, 9)
-    held = white - white[:, ARM] @ by_arm
-    # where it is not said to be as the data have it, it may be all the same
-    off = abs(float(free.x[LATE] - by_arm[:, LATE] @ free.x[ARM]) - late)
-    std = max(math.sqrt(max(float(held[LATE, LATE]), 0.0)) * float(free.raised[LATE]), off)
-    turned = held[TURN, LATE] / max(float(held[LATE, LATE]), 1e-18) * _with_prior(std)
-    return np.asarray(turned if np.linalg.norm(turned) > OPEN_FROM_RAD else np.zeros(3))
+    return {"open_late": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[APART]]])}
 
 
 def _with_prior(std: float) -> float:

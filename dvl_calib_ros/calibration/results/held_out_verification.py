@@ -174,11 +174,11 @@ def _error_finding(
         return finding("HELD_OUT_WORSE", **said)
     if is_large:
         return finding("HELD_OUT_SEVERAL_TIMES", **said)
-    if reference_claims and corrected < IMPLAUSIBLE * predicted:
-        return finding("HELD_OUT_IMPLAUSIBLE", **said)
+    if reference_claims and corrected < IMPLAUSIBLE * (expected := max(predicted, held_out.claimed)):
+        return finding("HELD_OUT_IMPLAUSIBLE", **said | {"predicted": expected})
     if worse > WORSE_FROM * held_out.calibration**2:
         return finding("HELD_OUT_NO_BETTER", **said)
-    dof = 3 * held_out.samples
+    dof = 3.0 * (held_out.samples if held_out.independent is None else held_out.independent)
     by_chance = math.sqrt(chi2_isf(CHANCE, dof) / dof)
     if corrected > predicted * parameters.max_error_ratio * by_chance:
         return finding("HELD_OUT_NOISIER", **said)

@@ -1,4 +1,4 @@
-"""G2 verified: the velocity error on samples that an estimate has not seen, with its lever arm and delay."""
+"""`full` verified: the velocity error on samples that an estimate has not seen, with its lever arm and delay."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..filters.cross_validation import HeldOutError, folds_of, held_out_from_sums
-from ..models.own import DELAY, LEVER_ARM
+from ..models.own import DELAY, LEVER_ARM, REFERENCE_DELAY
 from ..models.parameters import Parameters
-from ..numerics.error_model import CORRECTION_JACOBIAN, correction_matrix
-from ..numerics.frames import Array, cross, skew
-from ..numerics.kalman import GaussianState
+from ..numerics.error_model import correction_matrix
+from ..numerics.frames import Array, cross
 from ..numerics.robust import median, steps
 from ..numerics.samples import Index, Mask, Stamps
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns, attitude_at
@@ -47,44 +45,10 @@ class ThinnedBlock(NamedTuple):
         # a sample of a fast stream is noisier than what the vehicle turns by until the next one that is kept
         reach = 0.5 * KEPT_EVERY_S
         first, last = np.searchsorted(imu.times, (from_s - 2.0 * reach, to_s + 2.0 * reach)).tolist()
-        rates = _mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[at], reach)
+        rates = mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[at], reach)
         turning = ImuColumns(imu.times[at], imu.orientation[at], rates)
         # what is a part of larger arrays would keep these
         return ThinnedBlock(own, noise_dvl, reference._replace(velocity=reference.velocity.copy()), turning)
-
-
-def held_out_error(
-    recording: ThinnedRecording,
-    stamps_ns: Stamps,
-    days: Index,
-    without_folds: Sequence[Sequence[GaussianState]],
-    p: Parameters,
-) -> HeldOutError | None:
-    """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by.
-
-    stamps_ns, days: (N,) of the DVL's samples. without_folds: for every fold the state of every day.
-
-    As the other models are judged, but with the DVL's samples where the state says that they were: at their stamp
-    less its delay, and the lever arm away from the reference point.
-    """
-    folds = folds_of(stamps_ns, p)
-    nominal = np.zeros(len(without_folds[0][0].x))
-    sums = np.zeros(5)
-    samples = 0
-    for fold, states in enumerate(without_folds):
-        for day, state in enumerate(states):
-            at = np.flatnonzero((folds == fold) & (days == day))
-            before = recording.errors(at, nominal, p)
-            after = recording.errors(at, state.x, p)
-            both = ~(np.isnan(before.error[:, 0]) | np.isnan(after.error[:, 0]))
-            jacobian = after.jacobian[both]
-            calibration = np.einsum("nij,jk,nik->", jacobian, state.p, jacobian)
-            noise = after.noise[both].sum()
-            squares = [(each.error[both] ** 2).sum() for each in (before, after)]
-            interpolated = (after.interpolated - before.interpolated)[both].sum()
-            sums += [*squares, noise + calibration, calibration, interpolated]
-            samples += int(np.count_nonzero(both))
-    return held_out_from_sums(samples, sums)
 
 
 def typical_error(recording: ThinnedRecording, terms: Terms, p: Parameters) -> float | None:
@@ -101,28 +65,18 @@ def without_outliers(error: Array) -> float | None:
     return math.sqrt(float(good.mean()))
 
 
-class _Errors(NamedTuple):
-    """Of N DVL samples: reference less what the DVL says it is (N, 3) m/s, nan where there is none; its derivative by
-    the state (N, 3, n); the variance that noise gives it (N,), summed over the axes; and what interpolating leaves of
-    the reference's if that is white (N,)."""
-
-    error: Array
-    jacobian: Array
-    noise: Array
-    interpolated: Array
-
-
 class Terms(NamedTuple):
-    """What is to be corrected, beyond what the parameters say: errors (6,) φ rad and δk, lever_arm (3,) m, delay s."""
+    """What is to be corrected, beyond what the parameters say: errors (6,) φ rad and δk, lever_arm (3,) m, delays s."""
 
     errors: Array
     lever_arm: Array
     time_offset: float
+    reference_time_offset: float = 0.0
 
     @staticmethod
     def of_state(state: Array) -> Terms:
-        """Of G2's states (n,)."""
-        return Terms(np.array([*state[:5], 0.0]), state[LEVER_ARM], float(state[DELAY]))
+        """Of the states (n,) of `full`."""
+        return Terms(np.array([*state[:5], 0.0]), state[LEVER_ARM], float(state[DELAY]), float(state[REFERENCE_DELAY]))
 
 
 NO_TERMS = Terms(np.zeros(6), np.zeros(3), 0.0)
@@ -170,19 +124,6 @@ class ThinnedRecording(NamedTuple):
             dvl, noise, ReferenceColumns(*map(np.concatenate, reference)), ImuColumns(*map(np.concatenate, imu))
         )
 
-    def errors(self, at: Index, state: Array, p: Parameters) -> _Errors:
-        """Errors of some DVL samples with a state (n,), interpolated as pairing does."""
-        n, v = len(at), self.dvl.velocity[at]
-        seen = self.compared(at, Terms.of_state(state), p)
-        t = p.rotation_dvl_from_body
-        jacobian = np.zeros((n, 3, len(state)))
-        jacobian[:, :, :5] = -(t.T @ (v @ CORRECTION_JACOBIAN).reshape(n, 3, 6))[:, :, :5]
-        jacobian[:, :, LEVER_ARM] = skew(seen.rates)
-        jacobian[:, :, DELAY] = -seen.acceleration
-        share = np.where(seen.claimed, np.trace(seen.measured, axis1=1, axis2=2) / 3.0, 0.0)
-        noise = seen.variance + self.noise_dvl[at] * share
-        return _Errors(seen.error, seen.measured @ jacobian, noise, seen.interpolated)
-
     def judged(self, p: Parameters) -> tuple[float, Array]:
         """The first two of the sums of `Moments` over all that can be compared."""
         seen = self.compared(np.arange(len(self.dvl.times)), NO_TERMS, p)
@@ -193,7 +134,7 @@ class ThinnedRecording(NamedTuple):
     def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
         """Some DVL samples beside the reference, corrected, interpolated as pairing does."""
         times, v = self.dvl.times[at] - terms.time_offset, self.dvl.velocity[at]
-        stamps = self.reference.times
+        stamps = self.reference.times - terms.reference_time_offset
         after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
         gap = stamps[after] - stamps[after - 1]
         part = ((times - stamps[after - 1]) / gap)[:, None]
@@ -236,7 +177,7 @@ def _thinned_seconds(times: Array) -> Index:
     return np.append(0, np.flatnonzero(steps(bins)) + 1)
 
 
-def _mean_around(times: Array, values: Array, at: Array, reach: float) -> Array:
+def mean_around(times: Array, values: Array, at: Array, reach: float) -> Array:
     """Means (M, c) of the finite values (N, c) within reach (s) of each time (M,) s; nan where there is none."""
     first, end = times.searchsorted(at - reach), times.searchsorted(at + reach, side="right")
     sums, finite = np.zeros((len(times) + 1, values.shape[1])), np.isfinite(values)

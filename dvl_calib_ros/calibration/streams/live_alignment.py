@@ -35,7 +35,7 @@ from .stream_order import DROPOUT_NS, LONG_AGO_NS, SHORTEST_PAUSE_NS, Dropouts, 
 
 # How far a DVL may lag GNSS and IMU and still find its partners, beyond what pairing waits for.
 RETENTION_NS = 10 * SECOND_NS
-# A DVL whose stamps are off by seconds, which G2 finds, lags others by as much, or they lag it.
+# A DVL whose stamps are off by seconds, which the full model finds, lags others by as much, or they lag it.
 WRONG_CLOCK_NS = 4 * SECOND_NS
 NEVER_NS = 2**63 - 1
 # The past of GNSS and IMU is looked through for what may go once in so many live samples.

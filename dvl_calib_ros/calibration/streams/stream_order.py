@@ -319,7 +319,7 @@ class Track(RowTable):
         return Brackets(np.where(near, after - 1, -1), after, fraction, found)
 
 
-# What follows sooner is another part of the same recording. Longer than a block of G2's samples and the longest delay,
+# What follows sooner is another part of the same recording. Longer than a block of its samples and the longest delay,
 # so that none holds those of two days.
 SHORTEST_PAUSE_NS = 15_000_000_000
 

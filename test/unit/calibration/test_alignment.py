@@ -176,7 +176,9 @@ OPTIONS = (
     options=st.sampled_from(OPTIONS),
 )
 @example(seed=3844923, unruly=0.0, lag_s=60.0, size=70, options={})  # an IMU that runs away from a DVL which lags
-@example(seed=3844923, unruly=0.01, lag_s=60.0, size=10_000, options={})  # stamps leap by years, G2 still needs before
+@example(
+    seed=3844923, unruly=0.01, lag_s=60.0, size=10_000, options={}
+)  # stamps leap by years, full still needs before
 @example(seed=2416835433, unruly=0.01, lag_s=0.9, size=1, options=OPTIONS[4])
 @example(seed=33890, unruly=0.01, lag_s=0.9, size=512, options={})  # a reference's stamps go back
 def test_columns_cut_anywhere_give_what_one_by_one_gives(seed, unruly, lag_s, size, options):

@@ -35,8 +35,8 @@ def with_m1(samples, parameters=WIDE) -> Calibrator:
     return calibrate(samples, parameters, models=("M1",))
 
 
-def assert_same(a: Calibrator, b: Calibrator, atol=0.0):
-    for name in BY_VELOCITY:
+def assert_same(a: Calibrator, b: Calibrator, atol=0.0, names=BY_VELOCITY):
+    for name in names:
         np.testing.assert_allclose(a.state(name).x, b.state(name).x, rtol=0, atol=atol)
         np.testing.assert_allclose(a.state(name).p, b.state(name).p, rtol=0, atol=atol)
     assert a.selection.segments == b.selection.segments
@@ -45,7 +45,7 @@ def assert_same(a: Calibrator, b: Calibrator, atol=0.0):
 # ---------------------------------------------------------------- what comes out
 
 
-@pytest.mark.parametrize("names", [("M1",), ("F1", "A1"), ("G2",), ("G1", "M7")], ids=" ".join)
+@pytest.mark.parametrize("names", [("M1",), ("F1", "A1"), ("full",), ("G1", "M7")], ids=" ".join)
 def test_a_model_without_the_others_is_what_it_is_among_them(names, one_by_one):
     samples = make_samples(variant(NOISY, seconds=30))
     alone = calibrate(samples, models=names, verified=True)
@@ -240,6 +240,16 @@ def test_switching_models_at_any_time_equals_having_run_that_model_from_the_star
             np.testing.assert_array_equal(switched.estimate().covariance, from_start.estimate().covariance)
 
 
+def with_or_without(segments):
+    """Segments with G1 for `full`, which takes over while GNSS is available, and joined."""
+    found = []
+    for each in segments:
+        each = each._replace(model="G1" if each.model == "full" else each.model)
+        if not found or found[-1].model != each.model:
+            found.append(each)
+    return found
+
+
 def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and_hysteresis():
     run = variant(NOISY, seconds=100, gnss_phase=0)
     outage = [
@@ -247,7 +257,7 @@ def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and
         for s in make_samples(run)
         if not (isinstance(s, ReferenceSample) and 40 <= (s.stamp_ns - START_NS) / SECOND < 60)
     ]
-    segments = calibrate(outage).selection.segments
+    segments = with_or_without(calibrate(outage).selection.segments)
     assert [segment.model for segment in segments] == ["F1", "G1", "F1", "G1"]
     at = [(segment.from_ns - START_NS) / SECOND for segment in segments]
     # lost 2 s after 39.8 s (the first sample beyond is at 42.0), then 3 s of hysteresis; back 3 s after 60 s
@@ -272,7 +282,7 @@ def test_iac_is_the_published_selection_and_switches_when_auto_does(given, expec
     ]
     auto, iac = (calibrate(outage, Parameters(model=model, **given)) for model in ("auto", "iac"))
     assert [segment.model for segment in iac.selection.segments] == [*expected, *expected]
-    assert [s.from_ns for s in iac.selection.segments] == [s.from_ns for s in auto.selection.segments]
+    assert [s.from_ns for s in iac.selection.segments] == [s.from_ns for s in with_or_without(auto.selection.segments)]
     assert iac.result().selected_because.sentence == "iac: GNSS is available"
     for name in BY_VELOCITY:  # what is selected changes no estimate
         np.testing.assert_array_equal(iac.state(name).x, auto.state(name).x)
@@ -484,7 +494,10 @@ def test_a_bag_that_loops_starts_the_calibration_anew_whichever_topic_jumps_firs
     assert looped.counts["calibration"]["restarts"] == 1
     assert "starts anew" in told[0]
     expected = calibrate(first + [s for s in samples if s not in first])
-    assert_same(looped, expected, atol=1e-12)
+    # of the first block of `full` streams that had not gone back yet lack a sample or two
+    assert_same(looped, expected, atol=1e-12, names=[name for name in BY_VELOCITY if name != "full"])
+    off = looped.state("full").x - expected.state("full").x
+    assert np.all(np.abs(off) < 0.5 * np.sqrt(np.diag(expected.state("full").p)))
 
 
 def test_a_dropout_of_ten_minutes_is_bridged_and_nothing_is_lost():

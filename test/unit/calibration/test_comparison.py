@@ -28,7 +28,7 @@ STD = np.array([*[math.radians(0.05)] * 3, *[0.02] * 3, 0.001, 0.01])
 def extrinsics(day: int, turn=(0.0, 0.0, 0.0), arm=(0.0, 0.0, 0.0), scale=0.0, late=0.0, **fields) -> Extrinsics:
     first_ns = 1_750_000_000_000_000_000 + day * DAY_NS
     made = {
-        "name": f"day{day}", "model": "G2", "first_ns": first_ns, "last_ns": first_ns + DAY_NS // 24,
+        "name": f"day{day}", "model": "full", "first_ns": first_ns, "last_ns": first_ns + DAY_NS // 24,
         "rotation_body_from_dvl": rotation_of(np.radians(turn)), "lever_arm": np.array(arm), "scale": scale,
         "time_offset": late, "covariance": np.diag(STD**2), "shown": np.ones(8, dtype=bool), "used": 1000,
     }  # fmt: skip
@@ -218,7 +218,7 @@ def test_what_one_of_two_has_not_shown_is_not_compared():
         "turn_z",
     ]
     assert not found.same_mounting and np.isnan(found.pairs[0].std[0])
-    assert [each.numbers["models"] for each in remarks(found) if each.code == "MODELS_DIFFER"] == ["G2, M7"]
+    assert [each.numbers["models"] for each in remarks(found) if each.code == "MODELS_DIFFER"] == ["full, M7"]
 
 
 def test_a_lever_arm_that_is_taken_as_known_and_is_another_is_remarked():

@@ -99,7 +99,7 @@ def test_live_and_in_blocks_say_the_same_of_heave_under_a_random_walk_too(random
     samples = sorted([*run.imu, *run.gnss, *run.dvl], key=lambda sample: sample.stamp_ns)
     parameters = Parameters(process_std_misalignment=random_walk)
     live, blocks = (feed(Calibrator(parameters, block_size=size), samples) for size in (1, 97))
-    for name in ("G1", "G2"):
+    for name in ("G1", "full"):
         one, other = live.estimate(name), blocks.estimate(name)
         np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-12)
         np.testing.assert_allclose(one.covariance, other.covariance, rtol=0, atol=1e-12)

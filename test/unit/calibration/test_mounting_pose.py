@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dvl_calib_ros.calibration.models import MODELS
+from dvl_calib_ros.calibration.models.own import DELAY
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
 from dvl_calib_ros.calibration.numerics.frames import rpy_from_rotation
@@ -27,7 +28,7 @@ def state_of(name: str, rng) -> GaussianState:
 @pytest.mark.slow
 @pytest.mark.parametrize("turned", [False, True])
 def test_the_covariance_is_that_of_poses_drawn_from_the_state(rng, turned):
-    model, state = MODELS["G2"], state_of("G2", rng)
+    model, state = MODELS["full"], state_of("full", rng)
     found = mounting_pose(model, state, PARAMETERS, turned)
     middle = Rotation.from_matrix(found.rotation_body_from_dvl)
     drawn = []
@@ -50,7 +51,7 @@ def spread(rng, n: int, covariance):
 
 
 def test_where_the_reference_point_is_comes_off_and_where_nothing_says_so_there_is_no_position(rng):
-    model, state = MODELS["G2"], state_of("G2", rng)
+    model, state = MODELS["full"], state_of("full", rng)
     at = np.array(mounting_pose(model, state, PARAMETERS).position)
     antenna = PARAMETERS.replace(reference_position=(-0.3, 0.0, 0.4))
     np.testing.assert_allclose(
@@ -68,7 +69,7 @@ def test_where_the_reference_point_is_comes_off_and_where_nothing_says_so_there_
 
 @pytest.mark.parametrize("given", [(0.5, 0.0, 0.2), (0.0, 0.0, 0.0)])
 def test_an_axis_that_the_data_do_not_show_is_where_it_was_said_to_be_or_unknown(rng, given):
-    model, state = MODELS["G2"], state_of("G2", rng)
+    model, state = MODELS["full"], state_of("full", rng)
     height = model.state_names.index("lever_arm_z")
     p = state.p.copy()
     p[height] = p[:, height] = 0.0
@@ -86,9 +87,11 @@ def test_what_a_model_does_not_estimate_is_the_parameters_with_variance_minus_on
 
 
 def test_scale_and_delay_are_what_was_set_and_what_was_found(rng):
-    state = state_of("G2", rng)
-    beside = scale_and_delay(MODELS["G2"], state, Parameters(mounting_rpy=(0.0, 0.0, np.pi / 2), dvl_time_offset=0.25))
-    assert beside.time_offset == pytest.approx(0.25 + state.x[-1])
+    state = state_of("full", rng)
+    beside = scale_and_delay(
+        MODELS["full"], state, Parameters(mounting_rpy=(0.0, 0.0, np.pi / 2), dvl_time_offset=0.25)
+    )
+    assert beside.time_offset == pytest.approx(0.25 + state.x[DELAY])
     assert beside.scale == pytest.approx(state.x[4])  # the DVL's y looks ahead
     assert beside.scale_std == pytest.approx(np.sqrt(state.p[4, 4]))
 

@@ -260,7 +260,7 @@ def test_auto_runs_a1_on_one_heading_too_where_the_vehicle_is_trimmed_and_says_s
 
 def test_with_gnss_headings_change_nothing():
     segments = calibrate(make_samples(MatchedRun("box", 120.0, gnss_std=0.05))).selection.segments
-    assert [segment.model for segment in segments] == ["F1", "G1"]
+    assert [segment.model for segment in segments] == ["F1", "G1", "full"]
 
 
 def test_f1_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):

@@ -84,7 +84,7 @@ def test_an_estimator_of_another_package_is_one_class_beside_its_entry(calibrate
     assert calibrated["states"]["Y1"] == pytest.approx(calibrated["by_blocks"]["Y1"], abs=1e-12)
     assert calibrated["std"]["Y1"][-1] < 0.01
     assert calibrated["verdicts"]["Y1"] == calibrated["verdicts"]["G1"]
-    assert calibrated["selected"] in ("G1", "G2")  # what another package brings is never taken by itself
+    assert calibrated["selected"] in ("G1", "full")  # what another package brings is never taken by itself
 
 
 @pytest.mark.parametrize(
@@ -93,7 +93,7 @@ def test_an_estimator_of_another_package_is_one_class_beside_its_entry(calibrate
         ("no_such_module:W1", "No module named 'no_such_module'"),
         ("math:pi", "math:pi is no Model"),
         ("dvl_calib_ros.calibration.models.published:PUBLISHED", "is no Model"),
-        ("dvl_calib_ros.calibration.models.own:G2", "there is a model 'G2' already"),
+        ("dvl_calib_ros.calibration.models.own:FULL", "there is a model 'full' already"),
     ],
 )
 def test_a_broken_one_is_named_in_one_line_and_the_others_are_there(monkeypatch, value, said):
@@ -116,7 +116,7 @@ def test_a_replay_with_a_broken_one_says_so_in_one_line(tmp_path):
     [("no_such_module:It", "No module named"), ("math:pi", "is no subclass of Estimator"), ("math", "AttributeError")],
 )
 def test_an_estimator_that_cannot_be_used_is_named_when_it_is_wanted(value, said):
-    refuses = kind_of(replace(MODELS["G2"], name="Z1", estimator=value))
+    refuses = kind_of(replace(MODELS["full"], name="Z1", estimator=value))
     with pytest.raises(ParameterError, match=f"model Z1: its estimator {value} cannot be used .*{said}"):
         refuses(None)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from functools import cache
 
@@ -20,20 +19,15 @@ from dvl_calib_ros.calibration.registration.gauss_newton import (
     DVL,
     LATE,
     REFERENCE,
-    Claimed,
-    Fitted,
     MotionFit,
-    N,
 )
 from dvl_calib_ros.calibration.registration.motion_streams import Curves, MotionStreams, make_motion
 from dvl_calib_ros.calibration.registration.registration import (
-    IN_TIME_STD_S,
     Clock,
     Registration,
     _is_possible,
     is_beyond_doubt,
     register,
-    turn_open,
 )
 from dvl_calib_ros.calibration.streams.interpolation import ImuColumns, attitude_at
 from dvl_calib_ros.simulation.injection import injection
@@ -416,18 +410,3 @@ def test_a_clock_that_is_told_apart_by_little_is_no_reason_against_a_calibration
     assert (said.code if said else None) == code
     without = replace(found, open_by=np.zeros(7)).contradiction(Parameters())
     assert without is not None and without.code == "CLOCK_LATE"
-
-
-def test_a_clock_that_a_steady_turn_hides_leaves_its_yaw_open_and_one_that_turns_show_does_not():
-    """Of yaw and clock a steady turn shows the sum, by 0.1 rad/s, and the clock hardly; it was found 0.4 s late."""
-    information = np.eye(N) * 1e6
-    information[2, 2], information[2, LATE], information[LATE, 2], information[LATE, LATE] = 1e6, 1e5, 1e5, 1e4 + 10.0
-    x = np.zeros(N)
-    x[LATE] = 0.4
-    claimed = Claimed(np.linalg.inv(information), 1.0, np.ones(N))
-    fit = Fitted(x, np.eye(3), 0.01, 100, 1.0, np.zeros(100), 3, np.arange(100), lambda: claimed)
-    std = 1.0 / math.hypot(1.0 / 0.4, 1.0 / IN_TIME_STD_S)
-    np.testing.assert_allclose(turn_open(fit, 0.0), [0.0, 0.0, -0.1 * std], atol=1e-9)
-    information[LATE, LATE] = 1e6
-    known = claimed._replace(p=np.linalg.inv(information))
-    assert not turn_open(fit._replace(claims=lambda: known, x=np.zeros(N)), 0.0).any()

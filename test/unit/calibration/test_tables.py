@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.estimators.block_estimator import DelayFilter
+from dvl_calib_ros.calibration.estimators.block_estimator import FullEstimator
 from dvl_calib_ros.calibration.estimators.registration_schedule import MOST, MOST_OF_A_BLOCK, KeptClocks
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
@@ -71,7 +71,7 @@ def test_rows_up_to_what_was_reserved_need_no_more_memory():
 @pytest.mark.parametrize(("rate_hz", "until_s"), [(5, 80), pytest.param(200, 50, marks=pytest.mark.slow)])
 def test_live_the_room_for_samples_is_taken_before_they_come(rate_hz, until_s):
     calibrator = Calibrator(Parameters())
-    (keeper,) = (each for each in calibrator._further if isinstance(each, DelayFilter))
+    (keeper,) = (each for each in calibrator._further if isinstance(each, FullEstimator))
 
     def feed(from_s: int, to_s: int) -> None:
         for number in range(from_s * rate_hz, to_s * rate_hz):

@@ -29,9 +29,9 @@ other_node: {ros__parameters: {lever_arm: [9, 9, 9]}}
     "text",
     [
         BLOCK,
-        "/**:\n  ros__parameters:\n    model: G2",
+        "/**:\n  ros__parameters:\n    model: full",
         "/**: {ros__parameters: {}}",
-        "/auv/dvl_calibration: {ros__parameters: {model: G2, mounting_rpy: [0, 0, 3]}}\n",
+        "/auv/dvl_calibration: {ros__parameters: {model: full, mounting_rpy: [0, 0, 3]}}\n",
         "/**: {ros__parameters: {lever_arm: [1, 2, 3]}}\ndvl_calibration:\n ros__parameters:\n  lever_arm: [3, 2, 1]\n",
         "auv:\n    dvl_calibration:\n        ros__parameters:\n            'lever_arm': [3, 2, 1]\n",
     ],

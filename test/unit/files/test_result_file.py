@@ -20,6 +20,7 @@ from yaml_text import parsed, written
 
 from dvl_calib_ros.calibration.comparison.mounting_change import Difference
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
+from dvl_calib_ros.calibration.models.own import REFERENCE_DELAY_STD_S
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
@@ -76,9 +77,12 @@ def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
     loaded = load_initial_calibration(saved, MOUNTING)
     for name, estimate in result.estimates.items():
         x, p = estimate.state.copy(), estimate.recording_covariance.copy()
-        if name in ("G1", "G2"):  # the constant error of the reference
-            x[6:8] = p[6:8] = p[:, 6:8] = 0.0
-            p[[6, 7], [6, 7]] = Parameters().reference_offset_std ** 2
+        if name in ("G1", "full"):  # the constant error of the reference
+            of_day = [6, 7] if name == "G1" else [16, 17, 18, 19]
+            x[of_day] = p[of_day] = p[:, of_day] = 0.0
+            p[of_day, of_day] = Parameters().reference_offset_std ** 2
+            if name == "full":
+                p[16, 16] = REFERENCE_DELAY_STD_S**2
         np.testing.assert_array_equal(loaded[name].x, x)
         np.testing.assert_array_equal(loaded[name].p, p)
 

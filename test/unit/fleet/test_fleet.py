@@ -98,7 +98,7 @@ def test_the_day_on_which_a_mounting_moved_is_said(made):
     (change,) = by_name["auv1"].compared.moved
     assert (change.last_before.name, change.first_after.name) == ("dive1", "dive2")
     assert by_name["auv2"].compared is None
-    assert result.word == "moved" and "auv1: The mounting has moved by 1.9" in repr(result)
+    assert result.word == "moved" and "auv1: The mounting has moved by 3.0" in repr(result)
     page = result.page.read_text()
     assert page.count("<img") >= 3 and "no.mcap" in page
     assert '<td class="text word">Damaged' in page  # a sentence, which wraps

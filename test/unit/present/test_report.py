@@ -346,7 +346,7 @@ def test_replay_writes_a_report_and_keeps_the_old_one(tmp_path, monkeypatch, cap
     assert (tmp_path / "report.html.bak").read_text() == "old"
     page = Page(report)
     shown = {row[0] for row in page.rows if row and row[0] in MODELS}
-    assert shown == {"M7", Parameters().gnss_model}  # what was asked for, and the selected one
+    assert shown == {"M7", "full"}  # what was asked for, and the selected one
 
 
 def test_a_report_that_cannot_be_written_is_refused_before_the_replay(tmp_path, capsys):

@@ -1,0 +1,576 @@
+"""The joint least-squares fit of `full`: blocks of time in, states with their covariance out.
+
+Blocks are multiplied out about a point of linearisation and added to a chain (slow_errors.py), so that one more block
+costs one more step. The point is renewed at block counts that grow by RENEWED_AT, and where the estimate has moved away
+from it: both follow from the blocks alone, so a live run and a replay agree. Levels and memory of the slow errors are
+integrated over points of their prior, weighted by the evidence; the estimate is mean and covariance of that mixture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from ..filters.cross_validation import FOLDS, HeldOutError
+from ..models.own import BIAS, DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, SCALE
+from ..models.parameters import Parameters
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from ..numerics.robust import median
+from ..numerics.samples import Index
+from .full_delay_search import better_delay
+from .full_forward_model import FitBlock, PredictedRows, predicted
+from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
+from .slow_errors import Bins, Chain, Eliminated, LogNormal, SlowErrors, binned_rows, gram_of, normal_points, scatter
+
+DEG = math.pi / 180.0
+OF_DAY = FULL.of_day
+LINEARISED = np.r_[PHI, SCALE, LEVER_ARM, DELAY, REFERENCE_DELAY]
+OF_VEHICLE = np.delete(np.arange(N_STATE), OF_DAY)
+# Sections between knots of the slow errors, and bins of rows, s; a bin holds at least so many intervals of the DVL.
+SECTION_S, BIN_S, BIN_INTERVALS = 10.0, 0.5, 2.0
+DENSER = 0.7
+# Squared misfit of three axes, in variances, that 1 % of good rows exceed: beyond it a row weighs gate / misfit.
+GATE = 11.3
+# The point of linearisation is renewed when a day has twice as many blocks, or when an angle, a scale, an arm or a
+# delay is so many σ away from it.
+FAR = 1.0
+# Gauss-Newton steps when the point is renewed: at most, and until a step is smaller than this share of σ.
+STEPS, LAST_STEP = 8, 0.1
+# Streams are kept of so many blocks (40 minutes); what older ones told stays as it is.
+KEPT_BLOCKS = 240
+# Points of the prior of slow errors that are integrated over.
+POINTS = 16
+# Where the data move them so far from the middle, in σ of the prior, they are drawn anew, so often at most.
+OFF_CENTRE, RECENTRED = 0.7, 4
+# A lever arm that is given is measured with a tape, m: so it is told again, but for this share of vehicles.
+TAPE_STD_M, WRONG_TAPE = 0.05, 0.1
+# White noise of no velocity is smaller, m/s. Fewer degrees of freedom do not show that of bins.
+LEAST_NOISE_MPS, FEWEST = 1e-4, 6
+# Mean of the smaller 90 % of squares of a standard normal number.
+TRIMMED_SQUARE = 0.623
+# A row that is further off than this, in variances of three axes, is an outlier.
+GATED = 4.0 * GATE
+# A sample of a slow DVL is left out if by that the misfit of the references beside it falls by so much (chi-square) and
+# to this share.
+LEAST_GAIN, SHARE_LEFT = 50.0, 0.5
+# A section of which the median is so many σ of these from the others', and so far (m/s), is no reference's slow error.
+GROSS, GROSS_MPS = 10.0, 0.5
+# Median of the absolute value of a standard normal number.
+MEDIAN_ABSOLUTE = 0.6745
+_UNIT_POINTS: Array = normal_points(5, POINTS)
+
+
+@dataclass(frozen=True)
+class Priors:
+    """What is known of slow errors before any data, as navigators state it of their instruments.
+
+    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s. heading, tilt: of an AHRS, rad.
+    memory: 10 to 300 s (90 %). climb: vertical speed of a vehicle whose reference measures none, m/s. deviation: share
+    of `heading_deviation_std` that the cycles of the heading have.
+    """
+
+    horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
+    vertical: LogNormal = field(default_factory=lambda: LogNormal(0.018, 1.7))
+    climb: LogNormal = field(default_factory=lambda: LogNormal(0.02, 3.0))
+    heading: LogNormal = field(default_factory=lambda: LogNormal(0.21 * DEG, 1.7))
+    tilt: float = 0.1 * DEG
+    memory: LogNormal = field(default_factory=lambda: LogNormal(55.0, 2.8))
+    deviation: LogNormal = field(default_factory=lambda: LogNormal(0.3, 3.0))
+
+
+class _Section(NamedTuple):
+    """Between two knots. seconds: its length. gram: of its rows, None without. fold: that it is held out with."""
+
+    seconds: float
+    gram: Array | None
+    fold: int
+
+
+@dataclass
+class _Day:
+    """One recording, or one day of several: its blocks, and what they told about the point of linearisation.
+
+    count: how many blocks it has had. sections: of those whose streams are kept. before: chains of what came before
+    these, by all sections, and without each fold. chain: of all. white: (3,) variance of a bin of weight one; single:
+    of a row about the median of its section. level, level_std: (3,) m/s of the medians of sections.
+    """
+
+    blocks: list[FitBlock] = field(default_factory=list)
+    count: int = 0
+    sections: list[_Section] = field(default_factory=list)
+    before: list[Chain] | None = None
+    chain: Chain | None = None
+    begin_s: float = math.nan
+    end_s: float = math.nan
+    white: Array = field(default_factory=lambda: np.full(3, math.nan))
+    single: Array = field(default_factory=lambda: np.full(3, math.nan))
+    level: Array = field(default_factory=lambda: np.zeros(3))
+    level_std: Array = field(default_factory=lambda: np.full(3, math.inf))
+
+
+class JointEstimate(NamedTuple):
+    """What all blocks tell. state: x, P of [vehicle, each day]. weights: (C,) of the points of slow errors."""
+
+    state: GaussianState
+    weights: Array
+
+
+class JointFit:
+    """Blocks in order, days one after the other.
+
+    used: references so far.
+    """
+
+    def __init__(
+        self, parameters: Parameters, prior: GaussianState, unknown: GaussianState, priors: Priors | None = None
+    ) -> None:
+        """prior: x (20,), P (20, 20) of the states on the first day. unknown: of another day's own states."""
+        self._parameters, self._prior, self._unknown = parameters, prior, unknown
+        self._priors = priors or Priors()
+        self._days = [_Day()]
+        self._x = prior.x.copy()  # of vehicle and days
+        self._linear = self._x.copy()  # the point of linearisation
+        self._is_climbing = False
+        self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
+        self._slow, self._deviation, self._log_prior = self._points()
+        self.used = self._gated = self._left_out = 0
+        self._misfit = 0.0
+        self._fitted: JointEstimate | None = None
+
+    def _points(self) -> tuple[SlowErrors, Array, Array]:
+        """Slow errors (C, 6), by how much the heading deviates more than its prior (C,), and the logarithm (C,) of how
+        much more likely each point is by the prior than by how points are drawn: about what the data have shown."""
+        p = self._priors
+        levels = p.horizontal, p.climb if self._is_climbing else p.vertical, p.heading, p.memory, p.deviation
+        median, factor = np.array(levels).T
+        at = _UNIT_POINTS + self._centre
+        horizontal, vertical, heading, memory, deviation = (median * factor**at).T
+        tilt = np.full_like(heading, p.tilt)
+        std = np.stack([horizontal, horizontal, vertical, tilt, tilt, heading], axis=1)
+        slow = SlowErrors(std, np.repeat(memory[:, None], std.shape[1], axis=1))
+        return slow, deviation, 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1))
+
+    def _recentre(self) -> None:
+        """Move the points to where the data say that the slow errors are; then what blocks told is added up anew."""
+        assert self._fitted is not None
+        if any(day.before is not None for day in self._days):
+            return
+        for _ in range(RECENTRED):
+            moved = self._fitted.weights @ _UNIT_POINTS
+            if np.abs(moved).max() < OFF_CENTRE:
+                return
+            self._centre = self._centre + moved
+            self._slow, self._deviation, self._log_prior = self._points()
+            for day in self._days:
+                if day.sections:
+                    day.chain = Chain.begun(self._slow)
+                    for section in day.sections:
+                        day.chain = day.chain.after(section.gram, section.seconds, self._slow)
+            self._solve()
+
+    # ------------------------------------------------------------------ blocks
+
+    def add(self, block: FitBlock) -> None:
+        """Take a block, after all others. Raises numpy.linalg.LinAlgError, and is as before, where numbers run away."""
+        day = self._days[-1]
+        state = self._x.copy(), self._fitted, self.used, self._gated, self._misfit
+        kept = [(each, replace(each, blocks=[*each.blocks], sections=[*each.sections])) for each in self._days]
+        try:
+            self._add(day, block)
+            assert self._fitted is not None
+            if not all(np.isfinite(value).all() for value in self._fitted.state):
+                raise np.linalg.LinAlgError("numbers that ran away")
+        except np.linalg.LinAlgError:
+            self._x, self._fitted, self.used, self._gated, self._misfit = state
+            self._days = [before for _, before in kept]
+            raise
+
+    def _add(self, day: _Day, block: FitBlock) -> None:
+        day.blocks.append(block)
+        day.count += 1
+        if day.count & (day.count - 1) == 0:
+            self._renew()
+            return
+        x = self._linear[self._of_day(len(self._days) - 1)]
+        day.blocks[-1] = block = self._without_contradicted(day, block, x)
+        self._add_parts(day, self._parts(block, x), x)
+        self._solve()
+        if self._is_far():
+            self._renew()
+
+    def end_day(self) -> None:
+        """Blocks from here on are of another day: what is of the day is to be found anew."""
+        self._days.append(_Day())
+        prior = self._unknown.x[OF_DAY]
+        self._x, self._linear = np.append(self._x, prior), np.append(self._linear, prior)
+        if self._fitted is not None:
+            x, p = self._fitted.state
+            more = np.zeros((len(x) + len(OF_DAY),) * 2)
+            more[: len(x), : len(x)] = p
+            more[len(x) :, len(x) :] = self._unknown.p[np.ix_(OF_DAY, OF_DAY)]
+            self._fitted = self._fitted._replace(state=GaussianState(self._x.copy(), more))
+
+    @property
+    def gated(self) -> int:
+        """References, and samples of a slow DVL, that are so far from the others that they hardly count."""
+        return self._gated + self._left_out
+
+    @property
+    def mean_misfit(self) -> float:
+        """Mean squared misfit of the references used, in variances of three axes; nan without any."""
+        return self._misfit / self.used if self.used else math.nan
+
+    @property
+    def has_data(self) -> bool:
+        """Whether any reference was compared."""
+        return self._fitted is not None and self.used > 0
+
+    @property
+    def states(self) -> list[GaussianState]:
+        """The states (20,) of every day, by all blocks; none before the first."""
+        if self._fitted is None or not self.has_data:
+            return []
+        return self._by_day(self._fitted.state)
+
+    def _by_day(self, state: GaussianState) -> list[GaussianState]:
+        each = (self._of_day(number) for number in range(len(self._days)))
+        return [_with_bias_in_mounting(state.x[at], state.p[np.ix_(at, at)]) for at in each]
+
+    def _of_day(self, number: int) -> Index:
+        """Places of the states (20,) of one day among all."""
+        at = np.arange(N_STATE)
+        at[OF_DAY] = len(OF_VEHICLE) + len(OF_DAY) * number + np.arange(len(OF_DAY))
+        return at
+
+    def _is_far(self) -> bool:
+        assert self._fitted is not None
+        moved = np.abs(self._x - self._linear) > FAR * np.sqrt(np.diag(self._fitted.state.p))
+        return any(moved[self._of_day(number)][LINEARISED].any() for number in range(len(self._days)))
+
+    # ------------------------------------------------------------------ linearisation
+
+    def _renew(self) -> None:
+        """Gauss-Newton about the newest estimate, over all blocks whose streams are kept."""
+        self._forget()
+        self._look_at_vertical()
+        self._search_delay(self._days[-1])
+        for _ in range(STEPS):
+            self._linearise()
+            before = self._x.copy()
+            self._solve()
+            self._recentre()
+            assert self._fitted is not None
+            moved = np.abs((self._x - before) / np.sqrt(np.diag(self._fitted.state.p))).max()
+            if not self._are_contradicted() and moved < LAST_STEP:
+                break
+
+    def _forget(self) -> None:
+        """Leave what the oldest blocks told as it is, and give up their streams."""
+        n = sum(len(day.blocks) for day in self._days)
+        for day in self._days:
+            while n > KEPT_BLOCKS and day.blocks:
+                block = day.blocks.pop(0)
+                n -= 1
+                until_s = block.end_s
+                before = day.before or [Chain.begun(self._slow)] * (1 + FOLDS)
+                while day.sections and day.begin_s < until_s - 1e-6:
+                    section = day.sections.pop(0)
+                    day.begin_s += section.seconds
+                    before = [
+                        each.after(None if fold == section.fold else section.gram, section.seconds, self._slow)
+                        for fold, each in enumerate(before, start=-1)
+                    ]
+                day.before = before
+
+    def _look_at_vertical(self) -> None:
+        """Whether the vertical is mostly that of a vehicle that holds its depth, not of a reference."""
+        measured = [block.measured[:, 2] for day in self._days for block in day.blocks]
+        is_climbing = 2 * sum(int(each.sum()) for each in measured) < sum(len(each) for each in measured)
+        if is_climbing != self._is_climbing and all(day.before is None for day in self._days):
+            self._is_climbing = is_climbing
+            self._slow, self._deviation, self._log_prior = self._points()
+
+    def _search_delay(self, day: _Day) -> None:
+        """Begin from the DVL's delay that fits clearly better than the one so far, if there is one."""
+        place = self._of_day(len(self._days) - 1)[DELAY]
+        self._x[place] = better_delay(day.blocks, float(self._x[place]), self._parameters)
+
+    def _linearise(self) -> None:
+        """Multiply all blocks out about the newest estimate."""
+        self._linear = self._x.copy()
+        self.used = self._gated = 0
+        self._misfit = 0.0
+        for number, day in enumerate(self._days):
+            x = self._linear[self._of_day(number)]
+            parts = [part for block in day.blocks for part in self._parts(block, x)]
+            day.sections, day.chain = [], None if day.before is None else day.before[0]
+            day.end_s = day.begin_s
+            self._measure_noise(day, parts)
+            self._add_parts(day, parts, x)
+
+    def _are_contradicted(self) -> bool:
+        """Leave out what `_without_contradicted` does, of all blocks; whether any."""
+        found = False
+        for number, day in enumerate(self._days):
+            x = self._x[self._of_day(number)]
+            for place, block in enumerate(day.blocks):
+                day.blocks[place] = self._without_contradicted(day, block, x)
+                found = found or day.blocks[place] is not block
+        return found
+
+    def _without_contradicted(self, day: _Day, block: FitBlock, x: Array) -> FitBlock:
+        """Without samples of a slow DVL that stand out, and without which the references beside fit much better.
+
+        Between its samples a vehicle can turn, so that neighbours alone do not tell an outlier. x: (20,).
+        """
+        suspicious = block.suspicious.tolist() if np.isfinite(day.single).all() else []
+        for at in reversed(suspicious):
+            fewer = block.without(np.array([at]))
+            (times, before), (also, after) = (self._misfits(day, each, x) for each in (block, fewer))
+            beside = np.abs(times - x[REFERENCE_DELAY] + x[DELAY] - block.dvl.times[at]) < block.interval_s
+            both = beside & np.isin(times, also, assume_unique=True)
+            left = after[np.searchsorted(also, times[both])].sum()
+            if before[both].sum() - left > LEAST_GAIN and left < SHARE_LEFT * before[both].sum():
+                self._left_out += int(block.from_s <= block.dvl.times[at] < block.end_s)
+                block = fewer
+        return block
+
+    def _misfits(self, day: _Day, block: FitBlock, x: Array) -> tuple[Array, Array]:
+        """Times (J,) s and misfits (J,) of a block's references about a state (20,)."""
+        parts = [part for part in self._parts(block, x) if part.rows is not None]
+        if not parts:
+            return np.zeros(0), np.zeros(0)
+        times = np.concatenate([part.rows.times for part in parts if part.rows is not None])
+        return times, np.concatenate([part.misfit(day.single) for part in parts])
+
+    def _parts(self, block: FitBlock, x: Array) -> list[_SectionRows]:
+        """Sections of a block about a state (20,) of its day."""
+        rows = predicted(block, x, self._parameters)
+        starts = _starts(block)
+        if rows is None:
+            return [_SectionRows(from_s, None, block) for from_s in starts]
+        bounds = np.searchsorted(rows.times, [*starts, block.end_s + 1e-9]).tolist()
+        each = (rows.part(slice(a, b)) if b > a else None for a, b in pairwise(bounds))
+        return [_SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
+
+    def _measure_noise(self, day: _Day, parts: Sequence[_SectionRows]) -> None:
+        """White noise of single rows and of bins, by their scatter within sections."""
+        left = [part.left for part in parts if part.rows is not None]
+        if not left:
+            return
+        levels = np.array([part.level for part in parts if part.rows is not None])
+        day.level = _masked_median(levels)
+        day.level_std = np.maximum(_masked_median(np.abs(levels - day.level)) / MEDIAN_ABSOLUTE, GROSS_MPS / GROSS)
+        day.single = np.maximum(_usual_square(np.concatenate(left)), LEAST_NOISE_MPS**2)
+        each = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
+        total, freedom = (np.sum(sums, axis=0) for sums in zip(*each, strict=True))
+        white = np.maximum(total / np.maximum(freedom, 1.0), LEAST_NOISE_MPS**2)
+        day.white = np.where(freedom < FEWEST, day.single, white)
+
+    def _add_parts(self, day: _Day, parts: Sequence[_SectionRows], x: Array) -> None:
+        """Add sections to the chain of their day. x: (20,) that they are about."""
+        for part in parts:
+            if day.chain is None:
+                day.chain = Chain.begun(self._slow)
+                day.begin_s = day.end_s = part.from_s
+            if part.from_s > day.end_s + 1e-6:
+                self._append(day, _Section(part.from_s - day.end_s, None, -1))
+            gram, fold = None, -1
+            is_gross = part.rows is not None and bool((np.abs(part.level - day.level) > GROSS * day.level_std).any())
+            if is_gross and part.rows is not None:
+                self._gated += len(part.rows.times)
+            elif part.rows is not None and np.isfinite(day.white).all():
+                misfit = part.misfit(day.single)
+                good = misfit <= GATED
+                self.used += int(np.count_nonzero(good))
+                self._gated += int(np.count_nonzero(~good))
+                self._misfit += float(misfit[good].sum())
+                bins = part.bins(day.single)
+                gram, fold = gram_of(bins, day.white, x, part.slope_variance), int(bins.fold[len(bins.fold) // 2])
+            self._append(day, _Section(SECTION_S, gram, fold))
+
+    def _append(self, day: _Day, section: _Section) -> None:
+        assert day.chain is not None
+        day.sections.append(section)
+        day.chain = day.chain.after(section.gram, section.seconds, self._slow)
+        day.end_s += section.seconds
+
+    # ------------------------------------------------------------------ solution
+
+    def _solve(self) -> None:
+        ended = [None if day.chain is None else day.chain.ended() for day in self._days]
+        self._fitted = self._mixture(ended, slice(None))
+        self._x = self._fitted.state.x.copy()
+
+    def without_folds(self) -> list[list[GaussianState]]:
+        """For every fold the states (20,) of every day by all sections that are not of it."""
+        assert self._fitted is not None
+        likeliest = int(np.argmax(self._fitted.weights))
+        points = slice(likeliest, likeliest + 1)
+        slow = self._slow.part(points)
+        found = []
+        for fold in range(FOLDS):
+            ended: list[Eliminated | None] = []
+            for day in self._days:
+                if day.chain is None:
+                    ended.append(None)
+                    continue
+                chain = Chain.begun(slow) if day.before is None else day.before[1 + fold].part(points)
+                for section in day.sections:
+                    chain = chain.after(None if section.fold == fold else section.gram, section.seconds, slow)
+                ended.append(chain.ended())
+            found.append(self._by_day(self._mixture(ended, points).state))
+        return found
+
+    def held_out_error(self) -> HeldOutError | None:
+        """Velocity error of references predicted by the states that have not seen their fold; None for too few.
+
+        Corrected as velocities are: mounting, scale, lever arm and delays, and not what errs in the instruments. That,
+        white and slow noise as the data show them, and what is not known of all states is predicted.
+        """
+        if not self.has_data:
+            return None
+        assert self._fitted is not None
+        likeliest = int(np.argmax(self._fitted.weights))
+        slow_variance, memory_s = self._slow.std[likeliest] ** 2, float(self._slow.memory_s[likeliest, 0])
+        sums, seconds = HeldOutSums(), 0.0
+        for day in self._days:
+            for block in day.blocks:
+                sums.claims(block)
+        for fold, states in enumerate(self.without_folds()):
+            for day, state in zip(self._days, states, strict=True):
+                published = state.x.copy()
+                published[NOT_TAKEN_OFF] = 0.0
+                nominal = np.zeros(N_STATE)
+                for block in day.blocks:
+                    if not (block.fold == fold).any():
+                        continue
+                    before, after = (predicted(block, x, self._parameters) for x in (nominal, published))
+                    if before is None or after is None:
+                        continue
+                    sums.add(before, after, fold, state, day.single, slow_variance)
+                    seconds += (block.end_s - block.from_s) * float(np.mean(block.fold == fold))
+        return sums.error(seconds, memory_s)
+
+    def _mixture(self, ended: Sequence[Eliminated | None], points: slice) -> JointEstimate:
+        """Mean and covariance over some points of the slow errors, with the lever arm as given and as wrong."""
+        as_given, as_wrong = self._by_prior(points, TAPE_STD_M), self._by_prior(points, math.inf)
+        information, vector, log_det = (np.stack(each) for each in zip(as_given, as_wrong, strict=True))
+        square = np.zeros(information.shape[:2])
+        for number, each in enumerate(ended):
+            if each is not None:
+                at = self._of_day(number)
+                information[:, :, at[:, None], at] += each.gram[:, :N_STATE, :N_STATE]
+                vector[:, :, at] += each.gram[:, :N_STATE, N_STATE]
+                square += each.gram[:, N_STATE, N_STATE]
+                log_det += each.log_determinant
+        covariance = np.linalg.inv(information)
+        covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
+        x = (covariance @ vector[..., None])[..., 0]
+        left = square - (x * vector).sum(axis=-1)
+        odds = np.log([[1.0 - WRONG_TAPE], [WRONG_TAPE]]) + self._log_prior[points]
+        evidence = odds - 0.5 * (left + log_det + np.linalg.slogdet(information)[1])
+        weights = np.exp(evidence - evidence.max())
+        weights /= weights.sum()
+        mean = np.tensordot(weights, x)
+        spread = x - mean
+        p = np.tensordot(weights, covariance) + np.einsum("ac,aci,acj->ij", weights, spread, spread)
+        return JointEstimate(GaussianState(mean, p), weights.sum(axis=0))
+
+    def _by_prior(self, points: slice, tape_std: float) -> tuple[Array, Array, Array]:
+        """Information (C, n, n), its product with the state (C, n), minus its log determinant (C,), by the prior.
+
+        tape_std: of a lever arm that is given, m, where nothing better is known of it.
+        """
+        deviation = self._deviation[points]
+        n = len(OF_VEHICLE) + len(OF_DAY) * len(self._days)
+        information, vector = np.zeros((len(deviation), n, n)), np.zeros((len(deviation), n))
+        for number in range(len(self._days)):
+            at = self._of_day(number)
+            known = self._prior if number == 0 else self._unknown
+            own, of_state = known.information
+            places = OF_DAY if number else np.arange(N_STATE)
+            information[:, at[places][:, None], at[places]] += own[np.ix_(places, places)]
+            vector[:, at[places]] += of_state[places]
+        scale = np.ones((len(deviation), n))
+        scale[:, HEADING] = 1.0 / deviation[:, None]
+        if any(self._parameters.lever_arm):
+            scale[:, LEVER_ARM] = np.maximum(np.sqrt(np.diag(self._prior.p)[LEVER_ARM]) / tape_std, 1.0)
+        information *= scale[:, :, None] * scale[:, None]
+        return information, vector * scale, -2.0 * np.log(scale).sum(axis=1)
+
+
+def _with_bias_in_mounting(x: Array, p: Array) -> GaussianState:
+    """The states x (20,), P (20, 20) of one day as for no bias of the DVL, and with what there is of it in P.
+
+    Nobody takes a bias off velocities, so the mounting that is best at the speeds driven has it in it (Schmidt's
+    consider filter).
+    """
+    gain = p[:, BIAS] @ np.linalg.inv(p[BIAS, BIAS])
+    moved = gain @ x[BIAS]
+    return GaussianState(x - moved, p + np.outer(moved, moved))
+
+
+class _SectionRows:
+    """Rows of a section, which begins at a time.
+
+    level: (3,) m/s, their median. left: (J, 3) m/s about it, nan along axes not measured.
+    """
+
+    def __init__(self, from_s: float, rows: PredictedRows | None, block: FitBlock) -> None:
+        self.from_s, self.rows, self._bin_s = from_s, rows, _bin_s(block)
+        self.slope_variance = block.slope_variance
+        self._bins: Bins | None = None
+        if rows is not None:
+            residual = np.where(rows.weight > 0.0, rows.residual, np.nan)
+            self.level = _masked_median(residual)
+            self.left = residual - self.level
+
+    def misfit(self, single: Array) -> Array:
+        """How far rows (J,) are from the others, in variances (3,) of single ones."""
+        found: Array = (np.nan_to_num(self.left) ** 2 / single).sum(axis=1)
+        return found
+
+    def bins(self, single: Array) -> Bins:
+        """Means of its rows over time, those weighing less that are far from the others. single: as of `misfit`."""
+        assert self.rows is not None
+        if self._bins is None:
+            weight = np.minimum(1.0, GATE / np.maximum(self.misfit(single), 1e-9))
+            self._bins = binned_rows(self.rows, weight, self.from_s, self.from_s + SECTION_S, self._bin_s)
+        return self._bins
+
+
+def _usual_square(values: Array) -> Array:
+    """Variance (3,) of (J, 3), nan aside, by the smaller 90 % of the squares, which outliers do not reach."""
+    found = np.zeros(3)
+    for axis, column in enumerate(values.T):
+        squares = np.sort(column[np.isfinite(column)] ** 2)
+        kept = squares[: math.ceil(0.9 * len(squares))]
+        found[axis] = kept.mean() / TRIMMED_SQUARE if len(kept) else 0.0
+    return found
+
+
+def _masked_median(values: Array) -> Array:
+    """Median (3,) over the first axis of (J, 3) without nan; zero where there is none."""
+    finite = np.isfinite(values)
+    if finite.all():
+        return np.sort(values, axis=0)[len(values) // 2]
+    columns = [column[known] for column, known in zip(values.T, finite.T, strict=True)]
+    return np.array([median(column) if len(column) else 0.0 for column in columns])
+
+
+def _bin_s(block: FitBlock) -> float:
+    """References closer together than the DVL's samples share these, and go into one bin."""
+    times = block.reference.times
+    apart = (times[-1] - times[0]) / max(len(times) - 1, 1)
+    return max(BIN_S, BIN_INTERVALS * block.interval_s) if apart < DENSER * block.interval_s else BIN_S
+
+
+def _starts(block: FitBlock) -> list[float]:
+    return [block.from_s + SECTION_S * n for n in range(round((block.end_s - block.from_s) / SECTION_S))]

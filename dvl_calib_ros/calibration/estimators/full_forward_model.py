@@ -1,0 +1,282 @@
+"""What `full` predicts of a reference velocity, and how that changes with its states.
+
+The reference velocity at stamp s is, in east-north-up and with t = s - r,
+
+    z(s) = Z(h) A(t) [ Tᵀ (I + [φ×])⁻¹ diag(1 + δk)⁻¹ (v(t + d) - b) - ω(t) × l ] + c
+
+with the attitude A, the heading deviation h (one and two cycles of the heading), the delays r of the reference and d of
+the DVL, the nominal mounting T, misalignment φ and scale errors δk as of `error_model`, the DVL's bias b, the lever arm
+l and a constant error c. A reference in the body's axes is the bracket itself. Between its samples the DVL's velocity
+is a cubic spline: a straight line would take 2 per cent from waves sampled at 4 Hz.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..models.own import (
+    BIAS,
+    DELAY,
+    HEADING,
+    LEVER_ARM,
+    N_STATE,
+    PHI,
+    REFERENCE_DELAY,
+    REFERENCE_ERROR,
+    SCALE,
+    heading_cycles,
+)
+from ..models.parameters import Parameters
+from ..numerics.frames import Array, cross, rotation_from_quaternion, skew, squared
+from ..numerics.kalman import GaussianState
+from ..numerics.robust import robust_std
+from ..numerics.samples import Index, Mask
+from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
+from ..streams.outliers import deviation_from_neighbours, neighbours
+
+# Slow errors: of the reference, east, north, up (m/s); of the attitude, about east, north, up (rad).
+SLOW = 6
+# No DVL says anything of a delay longer than this, s.
+LONGEST_DELAY_S = 3.2
+# Angular acceleration is read over so much to either side, s.
+TURNING_S = 0.1
+# Samples closer together than this need no spline, s.
+DENSE_S = 0.15
+# Fewer DVL samples are not looked at for outliers. Those of one slower than this (s) are suspicious from so many σ on,
+# which is no less than this (m/s).
+FEWEST_DVL, SLOW_S, SUSPICIOUS, LEAST_SCATTER_MPS = 8, 0.45, 6.0, 0.03
+# The DVL's acceleration is read over so much to either side (s), and so many of its intervals.
+SLOPE_REACH_S, SLOPE_INTERVALS = 0.5, 2.0
+# Median of chi-square with one degree of freedom.
+MEDIAN_SQUARE = 0.4549
+# Between DVL samples further apart than this many of their usual intervals, and than this (s), nothing is known.
+GAP_INTERVALS, GAP_S = 3.0, 1.2
+
+
+@dataclass(frozen=True)
+class FitBlock:
+    """All streams of a block of time, those of DVL and IMU with what a delay of LONGEST_DELAY_S may ask for.
+
+    from_s, end_s: of the block. slope: (N, 3) m/s² of the DVL's spline at its samples; imu_slope: (M, 7) per s, of the
+    IMU's quaternion, whose sign does not change from one to the next, and angular velocity. measured: (J, 3) which axes
+    of its own frame a reference measures. fold: (J,) that each reference belongs to.
+    """
+
+    from_s: float
+    end_s: float
+    dvl: DvlColumns
+    slope: Array
+    imu: ImuColumns
+    imu_slope: Array
+    reference: ReferenceColumns
+    measured: Mask
+    fold: NDArray[np.int64]
+
+    @cached_property
+    def suspicious(self) -> Index:
+        """Places of samples of a slow DVL that are further from what neighbours tell than most, and than these."""
+        if self.interval_s < SLOW_S or len(self.dvl.times) < FEWEST_DVL:
+            return np.zeros(0, dtype=np.intp)
+        off = deviation_from_neighbours(self.dvl.velocity)
+        far = (np.abs(off) / np.maximum(robust_std(off), LEAST_SCATTER_MPS)).max(axis=1)
+        return np.flatnonzero((far > SUSPICIOUS) & (far >= neighbours(far)))
+
+    def without(self, places: Index) -> FitBlock:
+        """Return it without some of the DVL's samples."""
+        dvl = DvlColumns(*(np.delete(column, places, axis=0) for column in self.dvl))
+        return replace(self, dvl=dvl, slope=spline_slopes(*dvl))
+
+    @cached_property
+    def slope_reach_s(self) -> float:
+        """How far to either side the DVL's acceleration is read: one of less is its noise."""
+        return max(SLOPE_REACH_S, SLOPE_INTERVALS * self.interval_s)
+
+    @cached_property
+    def slope_variance(self) -> float:
+        """(m/s²)² per axis, of the acceleration that is read, by noise of the DVL alone."""
+        if len(self.dvl.times) < 6:
+            return 0.0
+        fourth = np.diff(self.dvl.velocity, 4, axis=0) ** 2 / 70.0  # of white noise, its variance
+        noise = float(np.sort(fourth, axis=0)[len(fourth) // 2].mean()) / MEDIAN_SQUARE
+        return noise / (2.0 * self.slope_reach_s**2)
+
+    @cached_property
+    def interval_s(self) -> float:
+        """Usual time between DVL samples."""
+        return float(np.sort(np.diff(self.dvl.times))[len(self.dvl.times) // 2 - 1])
+
+
+class PredictedRows(NamedTuple):
+    """J references: times (J,) s, residual (J, 3) m/s about the state, derivatives of the prediction by the state
+    (J, 3, 20) and by slow errors (J, 3, 6), weight of each axis (J, 3), fold (J,)."""
+
+    times: Array
+    residual: Array
+    columns: Array
+    slow: Array
+    weight: Array
+    fold: NDArray[np.int64]
+
+    def part(self, at: slice) -> PredictedRows:
+        """Those of some references."""
+        t, r, c, s, w, f = self
+        return PredictedRows(t[at], r[at], c[at], s[at], w[at], f[at])
+
+
+def spline_slopes(times: Array, values: Array) -> Array:
+    """Slopes (N, k) per s at the samples (N,), (N, k) of the cubic spline through them; parabolas at both ends.
+
+    Of samples denser than DENSE_S those of parabolas through three, which are then as good.
+    """
+    n = len(times)
+    step = np.diff(times)
+    rise = np.diff(values, axis=0) / step[:, None]
+    if n < 3:
+        return np.broadcast_to(rise.mean(axis=0) if n > 1 else 0.0, values.shape).copy()
+    inner = (step[1:, None] * rise[:-1] + step[:-1, None] * rise[1:]) / (step[1:] + step[:-1])[:, None]
+    first, last = 2.0 * rise[0] - inner[0], 2.0 * rise[-1] - inner[-1]
+    if n > (times[-1] - times[0]) / DENSE_S:
+        return np.concatenate([[first], inner, [last]])
+    matrix = np.zeros((n, n))
+    at = np.arange(1, n - 1)
+    matrix[at, at - 1], matrix[at, at + 1] = step[1:], step[:-1]
+    matrix[at, at] = 2.0 * (step[1:] + step[:-1])
+    matrix[0, 0] = matrix[-1, -1] = 1.0
+    right = np.empty_like(values)
+    right[1:-1] = 3.0 * (step[1:, None] * rise[:-1] + step[:-1, None] * rise[1:])
+    right[0], right[-1] = first, last
+    return np.linalg.solve(matrix, right)
+
+
+class AtTimes(NamedTuple):
+    """Values (J, k), and whether they are known (J,)."""
+
+    value: Array
+    known: Mask
+
+
+def spline_at(stamps: Array, values: Array, slope: Array, times: Array, gap_s: float) -> AtTimes:
+    """What the cubic spline through samples is at times (J,) s; not known beyond them and across a gap.
+
+    stamps (N,) s; values, slope (N, k), see `spline_slopes`.
+    """
+    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    before = after - 1
+    step = stamps[after] - stamps[before]
+    part = ((times - stamps[before]) / step)[:, None]
+    rest = 1.0 - part
+    value = (
+        values[before] * (rest * rest * (1.0 + 2.0 * part))
+        + values[after] * (part * part * (1.0 + 2.0 * rest))
+        + step[:, None] * part * rest * (slope[before] * rest - slope[after] * part)
+    )
+    return AtTimes(value, (times >= stamps[0]) & (times <= stamps[-1]) & (step <= gap_s))
+
+
+def dvl_at(block: FitBlock, times: Array) -> AtTimes:
+    """The DVL's velocity (J, 3) m/s at times (J,) s."""
+    return spline_at(*block.dvl, block.slope, times, max(GAP_INTERVALS * block.interval_s, GAP_S))
+
+
+class Attitude(NamedTuple):
+    """``rotation_enu_from_body`` (J, 3, 3), whether it is known, and angular velocity (J, 3) rad/s, known (J,)."""
+
+    rotation: Array
+    oriented: Mask
+    rates: Array
+    known: Mask
+
+
+def attitude_of(block: FitBlock, times: Array, gap_s: float) -> Attitude:
+    """Attitude and angular velocity at times (J,) s.
+
+    By a spline as well: at 1 Hz the shortest turn between two attitudes is off by a degree where a turn begins.
+    """
+    imu, n = block.imu, len(times)
+    rates = spline_at(imu.times, imu.angular_velocity, block.imu_slope[:, 4:], times, gap_s)
+    if np.isnan(imu.orientation).any():  # no attitude, of which a body's own reference needs none
+        return Attitude(np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros(n, dtype=bool), *rates)
+    between = spline_at(imu.times, imu.orientation, block.imu_slope[:, :4], times, gap_s)
+    q = between.value / np.sqrt(squared(between.value))[:, None]
+    return Attitude(rotation_from_quaternion(q), between.known, *rates)
+
+
+def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRows | None:
+    """Rows of a block about a state x (20,); None where nothing can be compared."""
+    reference = block.reference
+    at = reference.times - x[REFERENCE_DELAY]
+    if len(block.dvl.times) < 4 or len(block.imu.times) < 2 or not len(at):
+        return None
+    rotation, oriented, rates, turning_known = attitude_of(block, at, parameters.imu_timeout)
+    seen = dvl_at(block, at + x[DELAY])
+    use = seen.known & (oriented | reference.in_body) & turning_known
+    use &= squared(np.where(block.measured, reference.velocity, 0.0)) >= parameters.min_speed**2
+    if parameters.max_turn_rate > 0.0:
+        use &= squared(rates) <= parameters.max_turn_rate**2
+    if not use.any():
+        return None
+    at, rotation, rates, in_body = at[use], rotation[use], rates[use], reference.in_body[use]
+    before, after = (
+        spline_at(block.imu.times, block.imu.angular_velocity, block.imu_slope[:, 4:], at + way, np.inf).value
+        for way in (-TURNING_S, TURNING_S)
+    )
+    turning = (after - before) / (2.0 * TURNING_S)
+    t = parameters.rotation_dvl_from_body
+    inverse = np.linalg.inv(np.eye(3) + skew(x[PHI]))
+    gain = 1.0 / (1.0 + np.append(x[SCALE], 0.0))
+    arm = np.array(parameters.lever_arm) + x[LEVER_ARM]
+    scaled = (seen.value[use] - x[BIAS]) * gain
+    in_dvl = scaled @ inverse.T
+    through = t.T @ inverse * gain
+    reach, stamps = block.slope_reach_s, at + x[DELAY]
+    rise = dvl_at(block, stamps + reach).value - dvl_at(block, stamps - reach).value
+    accelerating = rise / (2.0 * reach) @ through.T
+    body = in_dvl @ t - cross(rates, arm)
+    n = len(at)
+    own = np.zeros((n, 3, N_STATE))
+    own[:, :, PHI] = t.T @ inverse @ skew(in_dvl)
+    own[:, :, SCALE] = -(t.T @ inverse)[None, :, :2] * (scaled * gain)[:, None, :2]
+    own[:, :, LEVER_ARM] = -skew(rates)
+    own[:, :, BIAS] = -through
+    own[:, :, DELAY] = accelerating
+    own[:, :, REFERENCE_DELAY] = cross(turning, arm) - accelerating
+    turn = np.where(in_body[:, None], 0.0, 1.0)
+    own[:, :, REFERENCE_DELAY] -= turn * cross(rates, body)
+    cycles = heading_cycles(rotation)
+    off = np.where(in_body, 0.0, cycles @ x[HEADING])
+    onto = np.where(in_body[:, None, None], np.eye(3), _about_up(off) @ rotation)
+    predicted_velocity = np.matmul(onto, body[..., None])[..., 0]
+    columns = onto @ own
+    across = np.stack([-predicted_velocity[:, 1], predicted_velocity[:, 0], np.zeros(n)], axis=1) * turn
+    columns[:, :, HEADING] = across[:, :, None] * cycles[:, None, :]
+    columns[:, :, REFERENCE_ERROR] = turn[:, :, None] * np.eye(3)
+    slow = np.zeros((n, 3, SLOW))
+    slow[:, :, :3] = np.eye(3)
+    slow[:, :, 3:] = -turn[:, :, None] * skew(predicted_velocity)
+    residual = reference.velocity[use] - predicted_velocity - turn * x[REFERENCE_ERROR]
+    return PredictedRows(
+        reference.times[use], residual, columns, slow, block.measured[use].astype(float), block.fold[use]
+    )
+
+
+def _about_up(angle: Array) -> Array:
+    """Rotations (J, 3, 3) by angles (J,) about the third axis."""
+    turned = np.zeros((len(angle), 3, 3))
+    turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angle)
+    turned[:, 1, 0] = np.sin(angle)
+    turned[:, 0, 1] = -turned[:, 1, 0]
+    turned[:, 2, 2] = 1.0
+    return turned
+
+
+def deviation_of(state: GaussianState) -> GaussianState:
+    """How the heading deviates by a state x (20,), P (20, 20), as `Estimate.heading_deviation`: what it is off by."""
+    p = np.zeros((5, 5))
+    p[:4, :4] = state.p[HEADING, HEADING]
+    p[4, 4] = 1e-12
+    return GaussianState(-np.append(state.x[HEADING], 0.0), p)

@@ -1,0 +1,62 @@
+"""The velocity error of `full` on references that its states have not seen, and what is predicted of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from ..filters.cross_validation import HeldOutError, held_out_from_sums
+from ..models.own import BIAS, HEADING, REFERENCE_ERROR
+from ..numerics.frames import Array
+from ..numerics.kalman import GaussianState
+from .full_forward_model import FitBlock, PredictedRows
+
+# What errs in the instruments, and no corrected velocity is without.
+NOT_TAKEN_OFF = np.r_[BIAS, HEADING, REFERENCE_ERROR]
+
+
+class HeldOutSums:
+    """Squares (m/s)² over held-out references: before and after, of white and slow noise, and of what is not known."""
+
+    def __init__(self) -> None:
+        self._n = 0
+        self._before = self._after = self._white = self._slow = self._unknown = self._known = 0.0
+        self._references, self._claimed = 0, 0.0
+
+    def add(
+        self, before: PredictedRows, after: PredictedRows, fold: int, state: GaussianState, white: Array, slow: Array
+    ) -> None:
+        """Take a block's rows of a fold, as mounted and corrected. white: (3,), slow: (6,) variances."""
+        mine = after.fold == fold
+        times = after.times[mine]
+        also = np.isin(times, before.times, assume_unique=True)
+        at = np.flatnonzero(mine)[also]
+        was = np.searchsorted(before.times, after.times[at])
+        weight, h = after.weight[at], after.columns[at]
+        self._n += len(at)
+        self._before += float((weight * before.residual[was] ** 2).sum())
+        self._after += float((weight * after.residual[at] ** 2).sum())
+        self._white += float((weight * white).sum())
+        self._slow += float((weight * (after.slow[at] ** 2 * slow).sum(axis=2)).sum())
+        self._unknown += float((weight * ((h @ state.p) * h).sum(axis=2)).sum())
+        self._known += float((weight * (h[:, :, NOT_TAKEN_OFF] @ state.x[NOT_TAKEN_OFF]) ** 2).sum())
+
+    def claims(self, block: FitBlock) -> None:
+        """Take what a block's references claim of their noise."""
+        variance = np.diagonal(block.reference.noise, axis1=1, axis2=2)
+        self._references += len(variance)
+        self._claimed += float((block.measured * variance).sum())
+
+    def error(self, seconds: float, memory_s: float) -> HeldOutError | None:
+        """Of all; seconds that they last, and memory (s) of the slow noise."""
+        noise = self._white + self._slow
+        found = held_out_from_sums(
+            self._n, [self._before, self._after, noise + self._unknown + self._known, self._unknown, 0.0]
+        )
+        if found is None or noise <= 0.0:
+            return found
+        spread = self._white**2 / self._n + self._slow**2 * memory_s / max(seconds, memory_s)
+        claimed = math.sqrt(self._claimed / max(self._references, 1))
+        return replace(found, independent=noise**2 / spread, claimed=claimed)
