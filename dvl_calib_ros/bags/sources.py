@@ -209,15 +209,16 @@ def _until_damage(batches: Batches, path: Path, salvage: Salvage, counts: Mappin
 
     def all_batches(topics: Collection[str]) -> Iterator[Batch]:
         read = 0
+        announced = sum(count for channel, count in counts.items() if channel.topic in topics)
         try:
             for batch in batches(topics):
                 read += batch.size
                 yield batch
-            if read < (announced := sum(count for channel, count in counts.items() if channel.topic in topics)):
+            if read < announced:
                 raise DamagedError(f"it announces {announced} messages, its index leads to {read}")
         except DAMAGE as error:
-            damage = yield from _rest(salvage(path), topics, _Given(batches(topics), read))
-            raise DamagedError(damage or said(error)) from error
+            damage, found = yield from _rest(salvage(path), topics, _Given(batches(topics), read))
+            raise DamagedError(damage or said(error), max(announced - read - found, 0)) from error
 
     return all_batches
 
@@ -248,21 +249,24 @@ def _key(message: BagMessage) -> int:
     return hash((channel.topic, data))
 
 
-def _rest(salvaged: Iterator[Salvaged], topics: Collection[str], given: _Given) -> Generator[Batch, None, str]:
-    """The messages of a damaged recording that were not given before. Returns what is damaged."""
-    damage = ""
+def _rest(
+    salvaged: Iterator[Salvaged], topics: Collection[str], given: _Given
+) -> Generator[Batch, None, tuple[str, int]]:
+    """Yield the messages of a damaged recording that were not given before; return the damage and their number."""
+    damage, found = "", 0
 
     def others() -> Iterator[BagMessage]:
-        nonlocal damage
+        nonlocal damage, found
         try:
             for message in _with_channels(salvaged):
                 if message[1].topic in topics and message not in given:
+                    found += 1
                     yield message
-        except DAMAGE as error:
-            damage = said(error)
+        except DAMAGE as error:  # salvaging has not seen the messages of the index: its own count is too high
+            damage = error.what if isinstance(error, DamagedError) else said(error)
 
     yield from batched(by_log_time(others()))
-    return damage
+    return damage, found
 
 
 def said(error: Exception) -> str:

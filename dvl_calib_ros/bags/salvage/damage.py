@@ -21,7 +21,11 @@ class Salvaged(NamedTuple):
 
 
 class DamagedError(Exception):
-    """What is damaged, in words. Raised after the last message that is whole."""
+    """What is damaged, in words, and how many messages are lost. Raised after the last message that is whole."""
+
+    def __init__(self, what: str, lost: int = 0) -> None:
+        super().__init__(what + (f", {lost} message{'s' if lost > 1 else ''} lost" if lost else ""))
+        self.what = what
 
 
 class Damage:
@@ -51,5 +55,4 @@ class Damage:
         if self:
             more = f" (the first of {self._places} damaged places)" if self._places > 1 else ""
             what = f"{self._first}{more}, {self.skipped} bytes skipped" if self._places else "less than it counts"
-            lost = f", {self.lost} message{'s' if self.lost > 1 else ''} lost" if self.lost else ""
-            raise DamagedError(what + lost)
+            raise DamagedError(what, self.lost)

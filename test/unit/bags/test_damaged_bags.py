@@ -27,6 +27,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from dvl_calib_ros.bags import files
+from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.salvage import mcap_file
 from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.cli.main import main
@@ -151,6 +152,20 @@ def test_a_damaged_chunk_costs_no_other_and_the_bytes_it_costs_are_said(tmp_path
     skipped = int(re.search(r"(\d+) bytes skipped", note)[1])
     assert 0 < skipped <= end - start
     assert f"{len(found)} whole messages" in note
+
+
+def test_only_lost_messages_of_the_topics_that_are_read_are_counted(tmp_path):
+    whole = bytearray(content(ZSTD))
+    (_, before), (end, count) = chunks(ZSTD)[1:3]
+    whole[end - 40] ^= 0xFF
+    path = tmp_path / "damaged.mcap"
+    path.write_bytes(whole)
+    with BagReader([path]) as bag:
+        found = list(bag.raw_messages(["dvl/twist"]))
+        (note,) = bag.notes
+    lost = [topic for topic, *_ in messages()[before:count]].count("dvl/twist")
+    assert 1 == lost < count - before
+    assert ", 1 message lost)" in note and f"{len(found)} whole messages" in note
 
 
 def test_a_damaged_length_in_a_chunk_without_checksum_costs_only_its_message(tmp_path):
