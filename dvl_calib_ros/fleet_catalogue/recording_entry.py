@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
-import gc
 import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import date, datetime, timezone
 from typing import Any
@@ -14,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..bag_replay.checked_replay import checked_replay
-from ..bag_replay.replay import Replayed, extrinsics_of_replay
+from ..bag_replay.replay import Replayed, extrinsics_of_replay, memory_given_back
 from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models.parameters import Parameters
 from ..calibration.results.extrinsics import Extrinsics
@@ -63,12 +60,10 @@ class Entry:
     is_final: bool = True
 
 
+@memory_given_back()
 def entry_of(task: Task) -> Entry:
     """Calibrate. Whatever goes wrong is the entry's error."""
     where = task.recording.name
-    kept = not gc.get_freeze_count()  # unless someone else keeps something away from the collector
-    if kept:
-        gc.freeze()  # looking through all that was imported takes a quarter of a short recording's time
     try:
         with task.recording.at_hand() as path:
             try:
@@ -77,17 +72,6 @@ def entry_of(task: Task) -> Entry:
                 return failed(where, as_text(str(error).replace(str(path), task.recording.where)))
     except Exception as error:
         return failed(where, as_text(f"{type(error).__name__}: {error}"), is_final=False)
-    finally:
-        _give_back()
-        if kept:
-            gc.unfreeze()
-
-
-def _give_back() -> None:
-    """Return memory to the system: what glibc keeps between large arrays grows by a megabyte with each recording."""
-    gc.collect()
-    with suppress(OSError, AttributeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 def failed(where: str, why: str, is_final: bool = True) -> Entry:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import heapq
 import json
 import math
 import re
+import weakref
 from pathlib import Path
 
 import pytest
 from command_line import fail, succeed
-from io_fixtures import write_bag
+from io_fixtures import run, write_bag
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.checked_replay import checked_replay
@@ -121,3 +123,15 @@ def test_an_initial_calibration_that_the_data_contradict_is_said_and_left_out(pl
     fitting = checked_replay([place / "tuesday"], Parameters(initial_calibration=str(tmp_path / "monday.yaml")))
     assert not any(each.code == "INITIAL_CONTRADICTED" for each in fitting.findings)
     assert fitting.result.estimate.std[2] < alone.estimate.std[2]  # it went on from there
+
+
+def test_a_calibrator_is_freed_as_soon_as_its_replay_is_done(tmp_path):
+    """Calibrators refer to themselves: many replays in one process grew it until the garbage collector ran."""
+    calibrators = []
+    gc.disable()
+    try:
+        bag = write_bag(tmp_path / "bag", run(30.0))
+        replay([bag], Parameters(), on_finished=lambda each: calibrators.append(weakref.ref(each)))
+        assert [each() for each in calibrators] == [None]
+    finally:
+        gc.enable()
