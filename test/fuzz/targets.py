@@ -122,8 +122,8 @@ def run_message(data: bytes) -> None:
     """The first byte says which message, of which stream."""
     if not data:
         return
-    feed = MessageFeed(_CALIBRATOR, lambda _: None)
-    msgtype, take = [(TWIST_TYPE, feed.dvl), (TWIST_TYPE, feed.reference), (IMU_TYPE, feed.imu)][data[0] % 3]
+    _FEED.forget()
+    msgtype, take = [(TWIST_TYPE, _FEED.dvl), (TWIST_TYPE, _FEED.reference), (IMU_TYPE, _FEED.imu)][data[0] % 3]
     half = 1 + (len(data) - 1) // 2
     for part in (data[1:], data[1:half], data[half:]):
         try:
@@ -430,6 +430,7 @@ def _part() -> Part:
 
 _ALIASES = b"a: &a [1.0e-3, .nan]\nb: *a\nc: {d: !!binary aGFsbG8=, <<: {x: 1}}\n"
 _CALIBRATOR = Calibrator(Parameters())
+_FEED = MessageFeed(_CALIBRATOR, lambda _: None)
 _SMALLEST_BAG = _small_mcap()
 _MESSAGE_ENDS = [_small_run()[number][2] for number in (0, 0, 1)]
 TARGETS = {
