@@ -19,7 +19,7 @@ SHARES = {
     "message": 0.27, "mcap_records": 0.25, "override": 0.1, "urdf": 0.1, "sqlite_pages": 0.06, "trajectory": 0.05,
     "parameters": 0.03, "result_file": 0.03, "mcap": 0.03, "flips": 0.03, "definition": 0.02, "metadata": 0.02,
     "sqlite": 0.01, "names": 0.02, "settings": 0.01, "columns": 0.005, "log_times": 0.005, "live": 0.005, "part": 0.01,
-    "stamps": 0.002,
+    "stamps": 0.002, "log": 0.03,
 }  # fmt: skip
 LIMITS = (
     "-timeout=20",
