@@ -67,7 +67,8 @@ class Judge:
         rpy, turned = mounting["corrected_rpy"], np.array(mounting["pose_covariance"])[3:, 3:]
         std = rpy_std_deg(rpy, turned).tolist()
         # what another day adds is none of this recording's, whose truth is one
-        of_days = (np.array(document["covariance"]) - np.array(document["covariance_of_recording"]))[:3, :3]
+        own = document["models"][document["model"]]
+        of_days = (np.array(own["covariance"]) - np.array(own["covariance_of_recording"]))[:3, :3]
         body_from_dvl = Rotation.from_euler("xyz", rpy).as_matrix()
         own_std = rpy_std_deg(rpy, turned - body_from_dvl @ of_days @ body_from_dvl.T).tolist()
         off = [

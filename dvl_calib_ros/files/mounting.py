@@ -21,7 +21,6 @@ from ..calibration.numerics.error_model import corrected_mounting
 from ..calibration.numerics.frames import (
     FLU_FROM_FRD,
     Array,
-    quaternion_from_rotation,
     rotation_from_rpy,
     rpy_from_rotation,
 )
@@ -124,8 +123,8 @@ class CalibratedMounting:
         """Arguments of tf2's static_transform_publisher. Raises InputError where the position is not known."""
         if self.position is None:
             raise InputError(f"{self.path}: {POSITION_UNKNOWN}")
-        quaternion = quaternion_from_rotation(self.rotation_body_from_dvl_frame)
-        return static_transform_arguments(self.position, quaternion, self.base_frame, self.dvl_frame)
+        rotation = self.rotation_body_from_dvl_frame
+        return static_transform_arguments(self.position, rotation, self.base_frame, self.dvl_frame)
 
 
 def load_calibrated_mounting(path: Path) -> CalibratedMounting:

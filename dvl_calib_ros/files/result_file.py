@@ -33,6 +33,7 @@ from ..calibration.numerics.frames import (
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.tests import chi2_sf
 from ..calibration.results.held_out_verification import verification_document
+from ..calibration.results.mounting_quantities import Quantity, quantities
 from ..calibration.results.results import Estimate, Result, mounting_pose, position_in_body, scale_and_delay
 from ..disk.atomic import own_stream, save_bytes
 from ..disk.yaml_files import load_yaml
@@ -40,6 +41,7 @@ from ..errors import InputError, printable
 from ..verdict.kinds import Severity
 from ..verdict.reasons import finding
 from ..version import __version__
+from .urdf import origin_tag
 
 _ANY_FORMAT = "dvl_calib_ros result"
 FORMAT = f"{_ANY_FORMAT} 1"
@@ -66,7 +68,7 @@ def estimate_document(estimate: Estimate) -> dict[str, Any]:
 def result_document(
     result: Result, dvl_frame: str = "dvl_link", turned: bool = False, water: Water | None = None
 ) -> dict[str, Any]:
-    """A result as plain data for the result file.
+    """A result as plain data for the result file, what a person looks for first and the matrices last.
 
     water: what is known of it. turned: the driver's data are forward-right-down and were turned. The mounting is that
     of the forward-left-up axes, as mounting_rpy is; the transform is that of dvl_frame itself, for those who use the
@@ -76,54 +78,55 @@ def result_document(
     parameters = result.parameters
     nominal = rotation_from_rpy(parameters["mounting_rpy"])
     corrected = estimate.rotation_body_from_dvl(nominal.T)
-    rpy, quaternion = rpy_from_rotation(corrected), quaternion_from_rotation(corrected)
-    to_frame = quaternion_from_rotation(corrected @ FLU_FROM_FRD) if turned else quaternion
+    of_frame = corrected @ FLU_FROM_FRD if turned else corrected
     verification = result.verifications.get(result.selected)
     parent, child = parameters["base_frame"], parameters["dvl_frame"] or dvl_frame
     model, state = MODELS[estimate.model], GaussianState(estimate.state, estimate.covariance)
     checked = Parameters.from_mapping(parameters)
-    pose = mounting_pose(model, state, checked, turned)
     position = position_in_body(model, state, checked)
     beside = scale_and_delay(model, state, checked)
+    arguments = None if position is None else static_transform_arguments(position, of_frame, parent, child)
     return {
         "format": FORMAT,
         "software": f"dvl_calib_ros {__version__}",
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "ends_with": _END,
         "model": result.selected,
-        **estimate_document(estimate),
-        "std": _std_in_words(estimate, estimate.std),
-        "std_of_recording": _std_in_words(estimate, estimate.recording_std),
-        "std_by_filter": _std_in_words(estimate, estimate.filter_std),
+        "used": estimate.used,
+        "gated": estimate.gated,
+        "convergence": estimate.convergence.value,
+        "found": {each.name: _in_words(each) for each in quantities(result)},
+        "mounting": {
+            "static_transform_publisher": None if arguments is None else f"{_PUBLISHER} {arguments}",
+            "urdf_origin": origin_tag(position, rpy_from_rotation(of_frame)),
+            "frame_id": parent,
+            "child_frame_id": child,
+            "dvl_data_axes": FRD if turned else FLU,
+            "nominal_rpy": list(parameters["mounting_rpy"]),
+            "corrected_rpy": rpy_from_rotation(corrected).tolist(),
+            "corrected_quaternion_xyzw": list(quaternion_from_rotation(corrected)),
+            "scale_error_xyz": estimate.scale.tolist(),
+            "lever_arm": estimate.lever_arm(parameters["lever_arm"]).tolist(),
+            "position": None if position is None else list(position),
+            "scale_error_ahead": beside.scale,
+            "scale_error_ahead_std": beside.scale_std,
+            "dvl_time_offset": beside.time_offset,
+            "dvl_time_offset_std": beside.time_offset_std,
+            "pose_covariance": mounting_pose(model, state, checked, turned).covariance.tolist(),
+        },
         **({} if verification is None else {"verification": verification_document(verification)}),
         **({"suggestion": result.suggestion.sentence} if result.suggestion else {}),
         **({"doubts": [each.as_dict() for each in result.doubts]} if result.doubts else {}),
         "time_span": {"first_ns": result.first_ns, "last_ns": result.last_ns},
         "selected": [{"from_ns": segment.from_ns, "model": segment.model} for segment in result.segments],
-        "mounting": {
-            "nominal_rpy": list(parameters["mounting_rpy"]),
-            "corrected_rpy": rpy.tolist(),
-            "corrected_quaternion_xyzw": list(quaternion),
-            "scale_error_xyz": estimate.scale.tolist(),
-            "lever_arm": estimate.lever_arm(parameters["lever_arm"]).tolist(),
-            "position": None if position is None else list(position),
-            "pose_covariance": pose.covariance.tolist(),
-            "scale_error_ahead": beside.scale,
-            "scale_error_ahead_std": beside.scale_std,
-            "dvl_time_offset": beside.time_offset,
-            "dvl_time_offset_std": beside.time_offset_std,
-            "dvl_data_axes": FRD if turned else FLU,
-            "frame_id": parent,
-            "child_frame_id": child,
-            "static_transform_publisher": None
-            if position is None
-            else f"{_PUBLISHER} {static_transform_arguments(position, to_frame, parent, child)}",
-        },
         **days_document(result),
-        "models": {name: estimate_document(each) for name, each in result.estimates.items()},
         "counts": {name: dict(counts) for name, counts in result.counts.items()},
         **({} if water is None else {"water": water_document(water)}),
         "parameters": dict(parameters),
+        "std": _std_in_words(estimate, estimate.std),
+        "std_of_recording": _std_in_words(estimate, estimate.recording_std),
+        "std_by_filter": _std_in_words(estimate, estimate.filter_std),
+        "models": {name: estimate_document(each) for name, each in result.estimates.items()},
         _END: True,
     }
 
@@ -148,6 +151,11 @@ def days_document(result: Result) -> dict[str, Any]:
     }
 
 
+def _in_words(found: Quantity) -> str:
+    unit = found.unit.strip().replace("°", "deg")  # ASCII, for the node prints a result that it cannot save
+    return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not shown by this data)")
+
+
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
     units = {"phi": (math.degrees(1.0), "deg"), "delta": (100.0, "%")}
     known = {each.name: (1.0, each.unit) for each in MODELS[estimate.model].nuisance}
@@ -158,9 +166,10 @@ def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
     return words
 
 
-def static_transform_arguments(position: Any, quaternion: Any, parent: str, child: str) -> str:
-    """Arguments of tf2's static_transform_publisher: position (3,) m and quaternion (x, y, z, w) of child in parent."""
-    numbers = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*position, *quaternion), strict=True)
+def static_transform_arguments(position: Any, rotation: Array, parent: str, child: str) -> str:
+    """Arguments of tf2's static_transform_publisher: position (3,) m and rotation (3, 3) of child in parent."""
+    values = (*position, *quaternion_from_rotation(rotation))
+    numbers = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True)
     arguments = " ".join(f"--{name} {value:.9g}" for name, value in numbers)
     parent, child = (shlex.quote(printable(name)) for name in (parent, child))  # a bag may name any frame
     frames = f"--frame-id {parent} --child-frame-id {child}"
@@ -168,9 +177,9 @@ def static_transform_arguments(position: Any, quaternion: Any, parent: str, chil
 
 
 def result_text(document: Mapping[str, Any]) -> str:
-    """A result document as YAML."""
+    """A result document as YAML, a command or a row of a matrix on one line."""
     dumper = yaml.CSafeDumper if yaml.__with_libyaml__ else yaml.SafeDumper  # the same in a quarter of the time
-    return str(yaml.dump(dict(document), Dumper=dumper, sort_keys=False, default_flow_style=None, width=120))
+    return str(yaml.dump(dict(document), Dumper=dumper, sort_keys=False, default_flow_style=None, width=1 << 20))
 
 
 def check_in_folder(path: Path, folder: Path) -> None:

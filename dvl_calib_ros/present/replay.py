@@ -14,7 +14,7 @@ from ..bag_replay.replay import Replayed
 from ..calibration.assessment.dead_reckoning import in_words, metres
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.frames import FLU_FROM_FRD, rpy_from_rotation
+from ..calibration.numerics.frames import rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.results.mounting_quantities import not_shown, quantities
 from ..calibration.results.results import Result, Verification
@@ -273,16 +273,15 @@ def _paste(run: Replayed) -> Commands:
     result = run.result
     parameters = Parameters.from_mapping(result.parameters)
     rotation = result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
-    arm = result.position_in_body
-    tag = origin_tag(arm, rpy_from_rotation(rotation))
-    lines = [("URDF", tag)]
+    mounting = result_document(result, run.dvl_frame, run.turned)["mounting"]
+    static, own = mounting["static_transform_publisher"], mounting["urdf_origin"]
+    lines = [("URDF", own)]
     if run.turned:
-        own = origin_tag(arm, rpy_from_rotation(rotation @ FLU_FROM_FRD))
+        tag = origin_tag(result.position_in_body, rpy_from_rotation(rotation))
         lines = [
             ("URDF", f"{tag}  (forward-left-up axes)"),
             ("", f"{own}  ({run.dvl_frame} of the driver: forward-right-down)"),
         ]
-    static = result_document(result, run.dvl_frame, run.turned)["mounting"]["static_transform_publisher"]
     return Commands(lines, on_page=[("tf", static)] if static else [])
 
 

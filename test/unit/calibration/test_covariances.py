@@ -81,7 +81,7 @@ def test_iac_publishes_what_the_papers_filter_says_and_saves_all_three():
     np.testing.assert_array_equal(published.x, calibrator.state(name).x)
     # what its mounting is worth is another question
     np.testing.assert_array_equal(calibrator.next_recording(name).p, estimate.covariance)
-    document = result_document(calibrator.result())
+    document = result_document(calibrator.result())["models"][name]
     for key, expected in (
         ("covariance_of_filter", estimate.filter_covariance),
         ("covariance_of_recording", estimate.recording_covariance),

@@ -24,6 +24,7 @@ from dvl_calib_ros.calibration.models.own import REFERENCE_DELAY_STD_S
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.calibration.results.results import Result
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
@@ -108,15 +109,14 @@ def test_a_file_of_before_the_bias_was_kept_is_read_and_one_that_claims_too_much
     path, document = tmp_path / "result.yaml", result_document(of_biased)
     for each in document["models"].values():
         each["by_dvl_bias"] = (10.0 * np.array(each["by_dvl_bias"])).tolist()
-    document["by_dvl_bias"] = copy.deepcopy(document["models"]["G1"]["by_dvl_bias"])
     save_text(path, result_text(document))
     with pytest.raises(InputError, match="damaged, its by_dvl_bias is more than its covariance"):
         load_extrinsics(path, "a")
-    document["by_dvl_bias"], document["models"]["G1"]["by_dvl_bias"] = [[1.0, 2.0]], [[1.0, 2.0]]
+    document["models"]["G1"]["by_dvl_bias"] = [[1.0, 2.0]]
     save_text(path, result_text(document))
     with pytest.raises(InputError, match="damaged, or of another version"):
         load_extrinsics(path, "a")
-    for each in (document, *document["models"].values()):
+    for each in document["models"].values():
         del each["by_dvl_bias"]
     save_text(path, result_text(document))
     assert not load_extrinsics(path, "a").by_bias.any()
@@ -148,14 +148,24 @@ def test_a_frame_name_from_a_bag_cannot_smuggle_a_command_into_the_line_to_paste
 def test_the_file_says_what_a_user_asks_of_it(saved, result):
     content = parsed(saved.read_text())
     assert content["model"] == result.selected
-    assert content["state"] == result.estimate.state.tolist()
-    assert content["state_names"] == list(MODELS[result.selected].state_names)
+    own = content["models"][result.selected]
+    assert own["state"] == result.estimate.state.tolist()
+    assert own["state_names"] == list(MODELS[result.selected].state_names)
     assert content["time_span"] == {"first_ns": result.first_ns, "last_ns": result.last_ns}
     assert content["counts"]["dvl"]["accepted"] > 0
     assert content["parameters"]["mounting_rpy"] == list(MOUNTING)
     assert content["software"].startswith("dvl_calib_ros ")
     sigma = math.degrees(result.estimate.std[2])
     assert content["std"]["phi_z"] == f"{sigma:.4f} deg"
+
+
+def test_who_opens_the_file_sees_mounting_sigma_and_the_lines_to_paste_at_once(saved, result):
+    lines = saved.read_text().splitlines()[:30]
+    head = "\n".join(lines)
+    for each in quantities(result):
+        assert f"{each.name}: {each.value:.2f} +- {each.std:.2f} " in head
+    assert "static_transform_publisher --x 1 " in head.replace("\n    ", " ") and '<origin xyz="1 0 -0.5" rpy="' in head
+    assert "covariance" not in head.partition("pose_covariance")[0] and list(parsed(saved.read_text()))[-2] == "models"
 
 
 # ---------------------------------------------------------------------- a good result is never lost
@@ -333,7 +343,8 @@ def change(path: Path, edit) -> Path:
 
 DAMAGE = {
     "newer format": (lambda c: c.update(format="dvl_calib_ros result 2"), "another version of this software"),
-    "top only": (lambda c: c["state"].__setitem__(2, 0.5), "its state is another in two places"),
+    "top only": (lambda c: c.update(gated=7000), "its gated is another in two places"),
+    "top of before": (lambda c: c.update(state=[0.5]), "its state is another in two places"),
     "below only": (lambda c: c["models"][c["model"]].update(used=7), "its used is another in two places"),
     "nominal only": (lambda c: c["parameters"].update(mounting_rpy=[0.0, 0.0, 0.1]), "mounting is another in two"),
     "foreign format": (lambda c: c.update(format="other 2"), "not a result file of this software"),
@@ -394,7 +405,6 @@ def test_a_file_of_before_g1_had_the_error_of_the_reference_is_read_with_its_pri
         g1["state_names"], g1["state"] = g1["state_names"][:6], g1["state"][:6]
         g1["covariance"] = [row[:6] for row in g1.pop("covariance_of_recording")[:6]]
         if content["model"] == "G1":
-            del content["covariance_of_recording"]
             content.update(copy.deepcopy(g1))
 
     before = load_initial_calibration(change(saved, as_before))["G1"]
