@@ -87,6 +87,14 @@ def given(arguments: argparse.Namespace) -> Given:
     return Given(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic, named)
 
 
+def options_given(arguments: argparse.Namespace) -> list[str]:
+    """Return the options that name parameters and topics, for the command to type next."""
+    from ..present.numbers import options
+
+    topics = [(role, getattr(arguments, f"{role}_topic")) for role in ("dvl", "gnss", "imu")]
+    return options(topics, arguments.overrides, arguments.params)
+
+
 def print_found(discovery: Discovery, bags: Sequence[Path]) -> None:
     """What was found in recordings, and where; on standard output, dim."""
     from rich.markup import escape

@@ -46,9 +46,9 @@ def run(arguments: argparse.Namespace) -> None:
     parameters = common.load(arguments)
     with _recordings(arguments) as bags:
         examination = examine(common.opened(bags, parameters), parameters, common.given(arguments))
-    is_live = arguments.live is not None
+    is_live, named = arguments.live is not None, common.options_given(arguments)
     common.deliver(
-        lambda: common.print_document(present.examination(examination, is_live)),
+        lambda: common.print_document(present.examination(examination, is_live, named)),
         (arguments.json, lambda path: common.write_json(path, examination.document())),
         (arguments.report, lambda path: write_report(path, examination)),
     )

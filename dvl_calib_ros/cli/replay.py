@@ -84,14 +84,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
     from ..present import replay as present
-    from ..present.numbers import options
 
     common.print_found(discovery, arguments.bags)
     findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])
     known = {str(found) for found in replayed.findings}
     warnings = [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
-    topics = [(role, getattr(arguments, f"{role}_topic")) for role in ("dvl", "gnss", "imu")]
-    named = options(topics, arguments.overrides, arguments.params)
+    named = common.options_given(arguments)
     commands = present.next_commands(replayed, arguments.bags, arguments.save, named, bool(findings))
     common.print_document(
         present.replayed(replayed, arguments.bags, models, details=bool(models), warnings=warnings, commands=commands)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from ..examination.examine import NO_IMU, Content, Examination, Shown
 from ..files.parameter_files import as_yaml
 from ..recordings.topics import Topics
@@ -17,10 +19,10 @@ ANSWERS = {
 }
 
 
-def examination(examined: Examination, is_live: bool = False) -> Document:
+def examination(examined: Examination, is_live: bool = False, named: Sequence[str] = ()) -> Document:
     """What is in a recording, what is wrong with it, what its motion shows, and what to type next.
 
-    is_live: it was made of a running system, to be looked at alone.
+    is_live: it was made of a running system, to be looked at alone. named: options that were given, for what is next.
     """
     severity, answer = ANSWERS[examined.verdict]
     names = ", ".join(path.name or str(path) for path in examined.paths)
@@ -47,7 +49,7 @@ def examination(examined: Examination, is_live: bool = False) -> Document:
                 motion,
                 [table_by(SHOWN, examined.shown, (SHOWN_NOTE,), words=4)] if examined.shown else [Sentence(nothing)],
             ),
-            Section("", [Commands(next_commands(examined, is_live))]),
+            Section("", [Commands(next_commands(examined, is_live, named))]),
         ],
         lead=lead,
     )
@@ -68,7 +70,7 @@ SHOWN: Columns[Shown] = {
 }
 
 
-def next_commands(examined: Examination, is_live: bool = False) -> list[tuple[str, str]]:
+def next_commands(examined: Examination, is_live: bool, named: Sequence[str]) -> list[tuple[str, str]]:
     """What to type next."""
     if is_live:  # the node on the topics that were found, with what was found of them
         discovery, default = examined.discovery, Topics()
@@ -84,5 +86,5 @@ def next_commands(examined: Examination, is_live: bool = False) -> list[tuple[st
         for word in found.remedy.partition("for this bag: ")[2].split(" leaves")[0].split()
     ]
     if examined.verdict == "no" and not given:
-        return [("next", "dvl-calib doctor BAG   (once it is recorded again)")]
-    return [("next", typed("replay", examined.paths, *given, "--save", "calibration.yaml"))]
+        return [("next", f"{typed('doctor', (), 'BAG', *named)}   (once it is recorded again)")]
+    return [("next", typed("replay", examined.paths, *named, *given, "--save", "calibration.yaml"))]

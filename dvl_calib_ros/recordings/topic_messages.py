@@ -157,7 +157,8 @@ def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType
         at_ns = stamped(message, at_log_ns)
         found = difference(at_ns, *kind.place(message), kind.covariance(message))
         if found is not None:
-            variances = np.full(3, np.nan) if found.covariance is None else np.diag(found.covariance)
+            claimed = None if found.covariance is None else np.diag(found.covariance)
+            variances = np.full(3, np.nan) if claimed is None or not (claimed > 0.0).all() else claimed
             # by the log time of the middle of its window, as if it had been measured then
             rows.append(_Row(arrival, at_log_ns - (at_ns - found.stamp_ns), found.stamp_ns, found.velocity, variances))
     return rows

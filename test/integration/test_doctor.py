@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 from command_line import fail, succeed
 from conftest import ROOT
 from io_fixtures import TOPICS, mcap_bytes, write_bag
+from stacks import Told, rtk_positions_only
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.checked_replay import checked_replay
@@ -278,6 +280,26 @@ def test_the_page_says_whether_it_can_calibrate_and_what_to_type_next(tmp_path, 
     assert document["topics"]["dvl"]["messages"] == 600
     assert set(document["shown"]) == {"roll", "pitch", "yaw", "scale"}
     assert "█" in out
+
+
+def test_what_to_type_next_keeps_the_options_that_were_given(tmp_path, capsys):
+    sound = ROOT / "bags" / "harbour_box"
+    (tmp_path / "vehicle.yaml").write_text("/**:\n  ros__parameters:\n    min_speed: 0.4\n")
+    given = ("--params", str(tmp_path / "vehicle.yaml"), "-p", "model:=M5", "--gnss-topic", "gnss/twist")
+    out, _ = succeed(capsys, "doctor", sound, *given)
+    assert f"next  dvl-calib replay {sound} {shlex.join(given)} --save calibration.yaml" in out
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("variance", [-1.0, 0.0, math.nan])
+def test_of_positions_with_variances_that_are_none_no_error_is_claimed(variance, tmp_path, capsys):
+    told = Told()
+    rtk_positions_only(told)
+    for _, topic, _, message in told.rows:
+        if topic == "/rtk/fix":
+            message.position_covariance = np.diag([variance] * 3).ravel()
+    out, errors = succeed(capsys, "doctor", told.write(tmp_path / "bag"))
+    assert "no covariance" in out and "nan" not in out + errors
 
 
 CLAIMED_RUNS: dict[str, dict[str, Any]] = {
