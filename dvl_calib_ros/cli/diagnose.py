@@ -2,6 +2,8 @@
 
 With --simulator: what a simulator's DVL lacks beside the vehicle's. One sentence with the answer comes first. Several
 bags must be of one vehicle; whole bags are then held out.
+
+Exit code 0: the data answer. 1: their answer is unknown. 2: bad usage or input.
 """
 
 from __future__ import annotations
@@ -42,11 +44,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_simulator_arguments(parser)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Diagnose, print, save."""
+def run(arguments: argparse.Namespace) -> int:
+    """Diagnose, print, save; 1 if the data show no cause."""
     if arguments.simulator:
         run_against_simulator(arguments, DEFAULTS)
-        return
+        return 0
     check_without(arguments)
     from ..diagnosis.answer.compensation import compensated, parameter_file
     from ..diagnosis.answer.results import diagnosis_document
@@ -55,6 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..diagnosis.model.recorded_streams import recording_names
     from ..disk.atomic import save_all
     from ..present import diagnosis as present
+    from ..verdict.kinds import Severity
 
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
@@ -104,6 +107,7 @@ def run(arguments: argparse.Namespace) -> None:
         (arguments.twin, write_all_twins),
         (arguments.report, lambda path: write_report(path, diagnosis)),
     )
+    return int(diagnosis.reasons[0].severity is Severity.REJECT)
 
 
 def _applied_to_each(path: Path | None, names: Sequence[str]) -> dict[str, Path]:

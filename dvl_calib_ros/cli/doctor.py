@@ -2,6 +2,8 @@
 
 One page: topics and rates, where the DVL sits, every fault with its remedy, what the motion shows, what to type next.
 With --live the same of a running system: of its topics so many seconds are recorded, and looked at.
+
+Exit code 0: the recording can calibrate, or a part. 1: it cannot. 2: bad usage or input.
 """
 
 from __future__ import annotations
@@ -35,8 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_discovery_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Examine, print, save."""
+def run(arguments: argparse.Namespace) -> int:
+    """Examine, print, save; 1 for a recording that cannot calibrate."""
     from ..examination.examine import examine
     from ..present import examination as present
 
@@ -52,6 +54,7 @@ def run(arguments: argparse.Namespace) -> None:
         (arguments.json, lambda path: common.write_json(path, examination.document())),
         (arguments.report, lambda path: write_report(path, examination)),
     )
+    return int(examination.verdict == "no")
 
 
 def _check(arguments: argparse.Namespace) -> None:

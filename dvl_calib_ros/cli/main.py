@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; 0 on success, 2 on bad usage or bad input, said in one line on standard error."""
+    """Run a command; 0 on success, 1 for an answer against the data, 2 for bad usage or input (one line)."""
     argv = sys.argv[1:] if argv is None else argv
     try:
         from .command_line import run

@@ -2,6 +2,8 @@
 
 Topics, mounting, lever arm and frames are found in the bag where no option says otherwise. The answer comes first: a
 verdict, the corrected mounting and what to type next. -p takes angles in degrees: -p mounting_rpy:="[0, 0, 45deg]".
+
+Exit code 0: the calibration is usable. 1: it is rejected. 2: bad usage or input.
 """
 
 from __future__ import annotations
@@ -33,13 +35,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_discovery_options(parser)
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Look into the bags, replay them, save, print."""
+def run(arguments: argparse.Namespace) -> int:
+    """Look into the bags, replay them, save, print; 1 for a rejected calibration."""
     from ..bag_replay.checked_replay import checked_replay
     from ..bag_replay.replay import replay_document
     from ..calibration.models import MODELS
     from ..errors import InputError
     from ..files.result_file import result_document, save_result
+    from ..verdict.kinds import Severity
 
     asked = [] if arguments.models is None else common.chosen("--models", arguments.models, tuple(MODELS))
     models = list(MODELS) if arguments.verbose or not asked else asked
@@ -80,6 +83,8 @@ def run(arguments: argparse.Namespace) -> None:
         (arguments.save, save),
         (arguments.report, lambda path: write_report(path, replayed, arguments.bags, models)),
     )
+    verification = result.verifications.get(result.selected)
+    return int(verification is not None and verification.verdict is Severity.REJECT)
 
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:

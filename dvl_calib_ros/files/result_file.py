@@ -95,7 +95,7 @@ def result_document(
         "used": estimate.used,
         "gated": estimate.gated,
         "convergence": estimate.convergence.value,
-        "found": {each.name: _in_words(each) for each in quantities(result)},
+        "found": {each.name: _in_words(each) for each in mounting_found(result)},
         "mounting": {
             "static_transform_publisher": None if arguments is None else f"{_PUBLISHER} {arguments}",
             "urdf_origin": origin_tag(position, rpy_from_rotation(of_frame)),
@@ -149,6 +149,16 @@ def days_document(result: Result) -> dict[str, Any]:
             for day in result.own_days
         ]
     }
+
+
+def mounting_found(result: Result) -> list[Quantity]:
+    """Return the quantities found, angles within half a turn of those configured."""
+    return [
+        each
+        if each.unit != "°"
+        else each._replace(value=each.nominal + math.remainder(each.value - each.nominal, 360.0))
+        for each in quantities(result)
+    ]
 
 
 def _in_words(found: Quantity) -> str:

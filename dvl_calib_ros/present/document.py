@@ -240,7 +240,8 @@ def facts_by(facts: Mapping[str, Callable[[T], str]], of: T) -> Facts:
 
 @dataclass(frozen=True)
 class Number(_Printable):
-    """A quantity that was found, in its unit. std: its σ. nominal: as configured. note: what is to be known of it.
+    """A quantity that was found, in its unit. std: its σ. nominal: as configured. change: from that. note: what is to
+    be known of it.
 
     is_shown: whether the data show it.
     """
@@ -249,6 +250,7 @@ class Number(_Printable):
     value: str
     std: str = ""
     nominal: str = ""
+    change: str = ""
     note: str = ""
     is_shown: bool = True
 
@@ -264,14 +266,14 @@ class Numbers:
         """They as rows."""
         if any(each.std for each in self.numbers):
             stds = (each.std if each.is_shown else f"{each.std} ?" for each in self.numbers)
-            rows = [(each.name, each.nominal, each.value, std) for each, std in zip(self.numbers, stds, strict=True)]
-            return Table(("", "nominal", "corrected", "±1σ"), rows)
+            rows = [(n.name, n.nominal, n.value, n.change, std) for n, std in zip(self.numbers, stds, strict=True)]
+            return Table(("", "configured", "corrected", "change", "±1σ"), rows)
         return Table(("", "", ""), [(each.name, each.value, each.note) for each in self.numbers])
 
 
 @dataclass(frozen=True)
 class Worth(_Printable):
-    """Drift of dead reckoning, m per km, without and with what was found: the largest on a page."""
+    """Drift of dead reckoning on a straight kilometre, m, without and with what was found: the largest on a page."""
 
     before: str
     after: str

@@ -12,13 +12,14 @@ import numpy as np
 
 from ..bag_replay.replay import Replayed
 from ..calibration.assessment.dead_reckoning import in_words, metres
+from ..calibration.assessment.manoeuvre_planner import drift_left_open
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.results.mounting_quantities import not_shown, quantities
 from ..calibration.results.results import Result, Verification
-from ..files.result_file import result_document
+from ..files.result_file import mounting_found, result_document
 from ..files.urdf import origin_tag
 from ..verdict.kinds import Severity
 from .document import (
@@ -71,6 +72,7 @@ AGAINST_IMU = (
     "Angles are relative to the IMU: a constant error of its heading is in the yaw, one of its level in roll and "
     "pitch. Both are harmless as long as the same IMU is used."
 )
+STRAIGHT = "A straight kilometre of dead reckoning ends {0.before} m off as mounted, {0.after} m (1σ) corrected."
 NO_RESIDUALS = ". No reference is beside enough of them for residuals."
 RESIDUALS = (
     "; residuals are at the reference point, corrected by estimates that had not seen the data, with all that was "
@@ -170,7 +172,7 @@ def replayed(
     streams = [(name, result.counts[key]) for key, name in _STREAMS]
     # an angle that the data do not show is none to put on a vehicle
     is_shown = not rejected and any(each.shown for each in quantities(result)[:3])
-    worth = Worth(metres(drift.before.per_km), metres(drift.after.per_km)) if drift and not rejected else None
+    worth = Worth(*map(metres, straight_kilometre(result))) if is_shown else None
     return Document(
         title="DVL calibration",
         subtitle=", ".join(map(str, bags)),
@@ -192,6 +194,7 @@ def replayed(
             section("", Warned(), where=Where.PAGE),
             section(
                 "What it means for navigation",
+                None if worth is None else Sentence(STRAIGHT.format(worth)),
                 *map(Sentence, in_words(drift) if drift else ()),
                 Map(drift) if drift and drift.on_a_map else None,
                 figures("replay_figures.navigation_pictures", drift, {"": drift}, "", history.stamps_ns)
@@ -217,6 +220,15 @@ def replayed(
         lead=first,
         folded=[note for note in run.notes if note.startswith(others)] if warnings is None else (),
     )
+
+
+def straight_kilometre(result: Result) -> tuple[float, float]:
+    """Return how far dead reckoning ends beside a straight kilometre, m: as mounted, and 1σ with the correction."""
+    parameters = Parameters.from_mapping(result.parameters)
+    ahead, nominal = np.eye(3)[0], parameters.rotation_dvl_from_body
+    measured = (1.0 + result.estimate.scale) * (result.estimate.rotation_body_from_dvl(nominal).T @ ahead)
+    off = 1000.0 * float(np.linalg.norm((nominal.T @ measured - ahead)[:2]))
+    return off, drift_left_open(result.estimate, parameters)
 
 
 def _answer(verification: Verification | None) -> Answer:
@@ -249,13 +261,14 @@ def _mounting(run: Replayed) -> Iterator[Item]:
     numbers = [
         Number(
             names.get(each.name, each.name),
-            each.in_unit(each.value, signed=True),
+            each.in_unit(each.value),
             each.in_unit(each.std),
             each.in_unit(each.nominal),
+            each.in_unit(each.value - each.nominal, signed=True),
             "" if each.shown else "not shown by this data",
             each.shown,
         )
-        for each in quantities(run.result)
+        for each in mounting_found(run.result)
     ]
     yield Numbers(numbers)
     if not MODELS[run.result.selected].aided:

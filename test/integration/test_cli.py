@@ -243,6 +243,23 @@ def test_a_model_that_is_none_is_named_with_those_there_are(capsys, bag, models,
     assert name in error and f"{', '.join(MODELS)}, or all" in error
 
 
+def test_replay_says_what_was_configured_what_it_is_now_and_the_change_within_80_columns(capsys, tmp_path):
+    bag = write_bag(tmp_path / "bag", run())
+    assert main(["replay", str(bag), "-p", "mounting_rpy:=[0,0,0.3]"]) == 1
+    assert "Not to be used" in capsys.readouterr().out
+    assert main(["replay", str(bag), "-p", "mounting_rpy:=[-180deg,0,0]"]) == 0  # this motion shows no roll
+    roll = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("  roll"))
+    assert -190.0 < float(roll.split()[2][:-1]) < -170.0
+    assert main(["replay", str(bag)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    at = next(i for i, line in enumerate(lines) if line.split() == ["configured", "corrected", "change", "±1σ"])
+    assert all(len(line) <= 80 for line in lines[at : at + 10])
+    yaw = next(line for line in lines[at:] if line.startswith("  yaw"))
+    assert yaw.split()[1:4:2] == ["0.00°", f"{float(yaw.split()[2][:-1]):+.2f}°"]
+    assert any(line.startswith("A straight kilometre of dead reckoning ends ") for line in lines)
+    assert main(["replay", str(tmp_path / "none")]) == 2
+
+
 def test_replay_shows_estimates_and_counts_and_keeps_warnings_apart(capsys, bag):
     out, errors = succeed(capsys, "replay", bag, bag, "-v", "-p", "prior_source:=initial_window")
     assert "200 duplicate" in out and "Model: full" in out

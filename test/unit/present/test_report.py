@@ -90,7 +90,7 @@ def test_the_mounting_stands_large_on_top_as_a_user_mounts_it(made):
     found = quantities(replayed.result)
     assert {each.name for each in found} >= {"roll", "pitch", "yaw", "scale"}
     for each in found:
-        assert f"{each.in_unit(each.value, signed=True)} ± {each.in_unit(each.std)} (1σ)" in summary
+        assert f"{each.in_unit(each.value)} ± {each.in_unit(each.std)} (1σ)" in summary
     assert "φ" not in summary and "from above" in summary and "from starboard" in summary
 
 
