@@ -74,6 +74,7 @@ def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> Non
     dated = _dated(comparison.calibrations)
     order = {id(each): index for index, each in enumerate(comparison.calibrations)}
     value = quantity.factor * np.array([values_of(each)[quantity.component] for each in known])
+    value = np.unwrap(value, period=360.0) if quantity.unit == "°" else value  # a DVL mounted upside down
     std = quantity.factor * np.array([each.std[quantity.component] for each in known])
     at = [_middle(each) if dated else float(order[id(each)]) for each in known]
     axes.errorbar(at, value, std, fmt="o", color=_POINT, markersize=4.0, capsize=2.5, elinewidth=1.2)

@@ -92,8 +92,6 @@ class Table(_Printable):
         Whether it has many columns.
     words
         How many columns at the left are words; the others are numbers.
-    folded
-        Whether a phone shows each row as a block, with the headings beside the values.
 
     """
 
@@ -104,7 +102,6 @@ class Table(_Printable):
     notes: Sequence[str] = ()
     dense: bool = False
     words: int = 1
-    folded: bool = False
 
     def frame(self) -> pandas.DataFrame:
         """The table as a DataFrame: a column of numbers holds these, with their σ and whether they are shown (no ?) in

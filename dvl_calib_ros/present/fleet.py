@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison.mounting_change import ANSWERS, fused
+from ..calibration.comparison.mounting_change import ANSWERS, Comparison, fused
 from ..calibration.comparison.mounting_change_reasons import moved, reasons, suspicious
 from ..calibration.results.extrinsics import SCALE, Extrinsics
 from ..calibration.results.mounting_quantities import date
@@ -60,7 +60,7 @@ def fleet(result: Fleet) -> Document:
         said = ["No vehicle has two days that show the same angle, so nothing can be compared."]
     said.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
-    sitting = [VehicleNow(each, now(each)) for each in vehicles]
+    sitting = [VehicleNow(each, now(each)) for each in sorted(vehicles, key=_by_need)]
     speeds = [
         VehicleSpeeds(each, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.scale))
         for each in vehicles
@@ -82,29 +82,31 @@ def fleet(result: Fleet) -> Document:
         answer=Answer(result.word, severity, said),
         warnings=result.notes,
         sections=[
-            Section("Vehicles", [replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True, folded=True)]),
+            Section("Vehicles", [replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True)]),
             section(
                 "Recordings that need a person",
                 table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=2),
             ),
-            *(_trend(each) for each in sorted(vehicles, key=_by_word)),
+            *(_trend(each.name, each.compared) for each, _ in sitting if each.compared is not None),
             section(
                 "Speed of sound",
-                replace(table_by(SPEEDS, [each for each in speeds if each.days], (SPEED_NOTE,)), folded=True),
+                table_by(SPEEDS, [each for each in speeds if each.days], (SPEED_NOTE,)),
                 *waters,
             ),
             section(
                 "Deviation of the compass",
-                replace(table_by(COMPASS, compasses, (COMPASS_NOTE,)), dense=True, folded=True),
+                replace(table_by(COMPASS, compasses, (COMPASS_NOTE,)), dense=True),
                 drawn if compasses else None,
             ),
         ],
     )
 
 
-def _by_word(vehicle: VehicleHistory) -> int:
-    """Those whose mounting moved come first."""
-    return len(WORDS) if vehicle.compared is None else WORDS.index(vehicle.compared.word)
+def _by_need(vehicle: VehicleHistory) -> int:
+    """Those whose mounting moved come first, then those that nothing is known of."""
+    if vehicle.compared is None:
+        return WORDS.index("same") if vehicle.days else WORDS.index("suspicious")
+    return WORDS.index(vehicle.compared.word) + (vehicle.compared.word == "same")
 
 
 def now(vehicle: VehicleHistory) -> Extrinsics | None:
@@ -130,6 +132,14 @@ class VehicleNow(NamedTuple):
         return "not compared" if self.history.compared is None else self.history.compared.word
 
     @property
+    def why(self) -> str:
+        """Why its days are not compared; '' where they are."""
+        if self.history.compared is not None:
+            return ""
+        days = len(self.history.days)
+        return {0: "No recording is usable.", 1: "One day alone."}.get(days, "No two days show the same angle.")
+
+    @property
     def moved(self) -> int:
         """How many times its mounting moved."""
         return 0 if self.history.compared is None else len(self.history.compared.moved)
@@ -142,7 +152,7 @@ VEHICLES: Columns[VehicleNow] = {
     "recordings": lambda each: str(each.history.recordings),
     "days": lambda each: str(len(each.history.days)),
     "mounting": lambda each: Cell(
-        each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text")
+        each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text"), each.why
     ),
     **columns_for(
         {f"{each.name}, {each.unit}": each for each in _ANGLES_AND_SCALE},
@@ -180,15 +190,11 @@ COMPASS: Columns[tuple[str, CompassDeviation]] = {
 }
 
 
-def _trend(vehicle: VehicleHistory) -> Section:
-    if vehicle.compared is None:
-        days = len(vehicle.days)
-        why = {0: "no recording is usable", 1: "all are of one day"}.get(days, "no two days show the same angle")
-        return Section(vehicle.name, [Sentence(f"There is nothing to compare: {why}.", soft=True)], Where.PAGE)
-    shown: list[Item] = [Sentence(each.full_sentence) for each in reasons(vehicle.compared)]
+def _trend(name: str, compared: Comparison) -> Section:
+    shown: list[Item] = [Sentence(each.full_sentence) for each in reasons(compared)]
     components = tuple(each.component for each in _ANGLES_AND_SCALE)
-    shown.append(figures("comparison_figures.trend", vehicle.compared, components))
-    return Section(vehicle.name, shown, Where.PAGE)
+    shown.append(figures("comparison_figures.trend", compared, components))
+    return Section(name, shown, Where.PAGE)
 
 
 SPEED_NOTE = (

@@ -266,6 +266,7 @@ def _axes_of_dvl(axes: Axes, ends: Array, at: tuple[float, float], length: float
         axes.annotate("", tip, at, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.8})
         if colour == AFTER:
             axes.text(at[0] + 1.15 * along[0], at[1] + 1.15 * along[1], axis, color=colour, ha="center", va="center")
+            axes.update_datalim([(at[0] + 1.3 * along[0], at[1] + 1.3 * along[1])])  # no letter on a title
     axes.plot([], [], color=colour, label=label)
     axes.plot(*at, "o", color=colour, markersize=4.0)
 

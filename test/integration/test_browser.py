@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fleet_fixtures import write_dive
 from io_fixtures import run
@@ -105,16 +107,28 @@ def test_the_summary_is_on_the_first_screen_of_a_phone(browser, report):
     page.close()
 
 
-def test_a_wide_table_can_be_read_on_a_phone_by_scrolling_it(browser, reports):
-    page, _ = opened(browser, reports["replay"], PHONE)
-    scrolled = page.evaluate(
-        """() => { const wide = [...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth);
-             wide.forEach(e => e.scrollLeft = 1e6);
-             return wide.map(e => [e.scrollLeft, e.querySelector('tbody th').getBoundingClientRect().left]); }"""
+def test_on_a_phone_every_table_is_whole_and_every_value_has_its_heading(browser, any_report):
+    page, _ = opened(browser, any_report, PHONE)
+    tables = page.evaluate(
+        """() => [...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth <= e.clientWidth,
+             [...e.querySelectorAll('td')].every(td => td.dataset.heading !== undefined)])"""
     )
-    assert scrolled
-    for scroll_left, row_name_left in scrolled:
-        assert scroll_left > 0 and row_name_left >= 0  # the row's name stays in sight
+    assert tables and all(whole and headed for whole, headed in tables)
+    page.close()
+
+
+def test_a_page_is_dark_where_the_reader_wants_that_and_white_on_paper(browser, any_report):
+    page, _ = opened(browser, any_report, DESKTOP)
+
+    def lightness(of: str = "body", what: str = "backgroundColor") -> float:
+        colour = page.evaluate(f"getComputedStyle(document.querySelector('{of}')).{what}")
+        return float(np.mean([int(each) for each in re.findall(r"\d+", colour)[:3]]))
+
+    assert lightness() > 250
+    page.emulate_media(color_scheme="dark")
+    assert lightness() < 40 and lightness(what="color") > 200
+    page.emulate_media(color_scheme="dark", media="print")
+    assert lightness() > 250 and lightness(what="color") < 60
     page.close()
 
 
@@ -129,7 +143,7 @@ def test_on_a_phone_no_table_of_a_fleet_is_scrolled_and_every_value_has_its_head
     page, _ = opened(browser, found.page, PHONE)
     tables = page.evaluate(
         """() => [...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth <= e.clientWidth,
-             [...e.querySelectorAll('.folded td')].map(
+             [...e.querySelectorAll('.scroll td')].map(
                td => getComputedStyle(td, '::before').content.replaceAll('"', '') || '-')])"""
     )
     assert len(tables) >= 2 and all(fits for fits, _ in tables)

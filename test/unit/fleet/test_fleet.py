@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -23,10 +24,15 @@ from water_fixtures import SALINITY, TEMPERATURE, USED, with_water
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.checks.speed_of_sound import speed_of_sound
+from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
 from dvl_calib_ros.fleet_catalogue import update as running
 from dvl_calib_ros.fleet_catalogue.parquet_parts import Catalogue
 from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
+from dvl_calib_ros.present.comparison import QUANTITIES
+from dvl_calib_ros.present.comparison_figures import _draw
+from dvl_calib_ros.present.figure_style import new_figure
+from dvl_calib_ros.present.fleet import fleet
 
 pa = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
@@ -102,6 +108,22 @@ def test_the_day_on_which_a_mounting_moved_is_said(made):
     page = result.page.read_text()
     assert page.count("<img") >= 3 and "no.mcap" in page
     assert '<td class="text word">Damaged' in page  # a sentence, which wraps
+
+
+def test_the_page_begins_with_who_needs_a_person_and_draws_an_inverted_dvl_without_a_jump(made):
+    found = made[0]
+    moved = found.vehicles[0]
+    alone = replace(moved, name="a_first", days=moved.days[:1], compared=None)
+    table = fleet(replace(found, vehicles=(alone, moved))).tables["Vehicles"]
+    assert [row[0] for row in table.rows] == [moved.name, "a_first"] and table.rows[1][3].below == "One day alone."
+    for angles in ((179.9, -179.8), (-179.9, 179.7)):
+        turned = [
+            replace(each, rotation_body_from_dvl=rotation_from_rpy(np.radians([roll, 0.0, 0.0])))
+            for each, roll in zip(moved.compared.calibrations, angles, strict=False)
+        ]
+        axes = new_figure()[1]
+        _draw(axes, replace(moved.compared, calibrations=tuple(turned)), QUANTITIES[0])
+        assert np.ptp(axes.get_ylim()) < 20.0
 
 
 @pytest.mark.slow
