@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from dataclasses import replace as with_values
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +14,7 @@ from ..calibration.models.parameters import Parameters
 from ..diagnosis.answer.results import Diagnosis
 from ..errors import InputError
 from ..simulation.scenario import Scenario
+from ..simulation.trajectories import TRAJECTORIES, Waves
 from .arguments import Bags, StrPath, as_paths, discovered_in
 
 if TYPE_CHECKING:
@@ -110,7 +113,7 @@ def simulate(
     Raises
     ------
     InputError
-        If the bag exists, or cannot be written; for an effect or parameter that there is not.
+        If the bag exists, or cannot be written; for an effect, parameter or field that there is not.
     """
     from ..bags.writer import Compression, Storage
     from ..simulation.injection import injection_of
@@ -118,13 +121,30 @@ def simulate(
 
     if scenario is not None and scenario_fields:
         raise InputError("simulate: give a scenario or fields of one, not both")
-    target, made = Path(bag), scenario or Scenario(**scenario_fields)
+    target, made = Path(bag), scenario or _scenario(scenario_fields)
     if effects is not None:
         if not isinstance(effects, Mapping):
             raise InputError("simulate: effects are by name, such as {'lever_arm': {'x_m': 0.5}}")
         made = with_values(made, effects=tuple(injection_of(name, given) for name, given in effects.items()))
     write_bag(made, target, Storage.MCAP, Compression.NONE, with_truth=True)
     return target
+
+
+def _scenario(given: Mapping[str, Any]) -> Scenario:
+    """Return a scenario by its fields. Raises InputError for a field or a value that is none."""
+    known = [each.name for each in fields(Scenario)]
+    for name, value in given.items():
+        if name not in known:
+            near = ["seconds"] if name == "duration" else difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+            raise InputError(f"simulate: no such field {name!r}, {hint}")
+        if name == "waves" and value is not None and not isinstance(value, Waves):
+            raise InputError(f"simulate: waves={value!r}; expected Waves(height=0.5, period=6.0) (m, s)")
+        if name == "trajectory" and value not in TRAJECTORIES:
+            raise InputError(f"simulate: trajectory={value!r}; there are {', '.join(TRAJECTORIES)}")
+        if (name == "seconds" or name.endswith(("_rate", "_std"))) and not isinstance(value, int | float | None):
+            raise InputError(f"simulate: {name}={value!r}; expected a number")
+    return Scenario(**given)
 
 
 def evaluate(

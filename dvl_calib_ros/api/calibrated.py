@@ -76,7 +76,13 @@ class Mounting:
             f"{name} {angle:.2f}° ± {std:.2f}°"
             for name, angle, std in zip(("roll", "pitch", "yaw"), self.rpy_deg, self.std_deg, strict=True)
         )
-        return printable(f"{self.dvl_frame} in {self.base_frame}: {', '.join(angles)}")
+        said = [*angles]
+        if not all(map(math.isnan, self.xyz_std_m)):
+            arm = zip("xyz", self.xyz_m, self.xyz_std_m, strict=True)
+            said.append("lever arm " + ", ".join(f"{axis} {value:.2f} ± {std:.2f} m" for axis, value, std in arm))
+        if not math.isnan(self.time_offset_std_s):
+            said.append(f"stamps late {self.time_offset_s:.3f} ± {self.time_offset_std_s:.3f} s")
+        return printable(f"{self.dvl_frame} in {self.base_frame}: {', '.join(said)}")
 
     __repr__ = __str__
 
@@ -135,8 +141,9 @@ class Calibration:
 
     @property
     def findings(self) -> tuple[Reason, ...]:
-        """What is wrong with the data, each with its code and remedy."""
-        return self.replayed.findings
+        """What is wrong with the data for the selected model, each with its code and remedy."""
+        others = tuple(f"{name}: " for name in self.replayed.result.estimates if name != self.model)
+        return tuple(each for each in self.replayed.findings if not each.says.startswith(others))
 
     @property
     def mounting(self) -> Mounting:
@@ -178,12 +185,21 @@ class Calibration:
         ndarray
             Velocities (..., 3), m/s, in the body's axes: of the reference point with angular_velocity, else of the
             DVL's own place. They are of ``mounting.time_offset_s`` before their stamps.
+
+        Raises
+        ------
+        InputError
+            For arrays of another shape.
         """
+        measured = _vectors("velocity_dvl", velocity_dvl)
         rotation = self.discovery.parameters.rotation_dvl_from_body
-        velocity = self.replayed.result.estimate.corrected_velocity(np.asarray(velocity_dvl, dtype=float), rotation)
+        velocity = self.replayed.result.estimate.corrected_velocity(measured, rotation)
         if angular_velocity is None:
             return velocity
-        return velocity - np.cross(np.asarray(angular_velocity, dtype=float), self.mounting.xyz_m)
+        turning = _vectors("angular_velocity", angular_velocity)
+        if turning.shape not in ((3,), measured.shape):
+            raise InputError(f"angular_velocity: shape {turning.shape}; expected {measured.shape}, as of velocity_dvl")
+        return velocity - np.cross(turning, self.mounting.xyz_m)
 
     def tables(self) -> dict[str, pandas.DataFrame]:
         """Give the tables of its page as data frames.
@@ -191,18 +207,26 @@ class Calibration:
         Returns
         -------
         dict of str to pandas.DataFrame
-            By the heading that each stands below. Columns of numbers hold floats, in the unit of their heading, those
-            with a σ have it beside them as ``... ±1σ``; others hold texts.
+            ``mounting``, a row for each quantity in its unit; ``held_out``, ``models`` and ``streams``. Columns of
+            numbers end with their unit (``_deg``, ``_percent``, ``_mps``) and with ``_std`` for a σ (1σ).
 
         Raises
         ------
         InputError
             Without pandas.
         """
+        from ..files.result_file import mounting_found
         from ..present.replay import replayed
         from .output import frames_of
 
-        return frames_of(replayed(self.replayed, self.bags, tuple(MODELS)))
+        frames = frames_of(replayed(self.replayed, self.bags, tuple(MODELS)))
+        import pandas
+
+        mounting = pandas.DataFrame(mounting_found(self.replayed.result)).set_index("name")
+        mounting.insert(2, "change", mounting["value"] - mounting["nominal"])
+        mounting = mounting.rename(columns={"nominal": "configured", "value": "corrected"})
+        named = {key: frames[heading] for key, heading in TABLES.items() if heading in frames}
+        return {"mounting": mounting} | {key: each.rename(columns=_column) for key, each in named.items()}
 
     def to_pandas(self) -> pandas.DataFrame:
         """Give the selected model over time.
@@ -210,7 +234,8 @@ class Calibration:
         Returns
         -------
         pandas.DataFrame
-            ``time_s`` since the first DVL sample, and the states in SI units with their σ as ``*_std``.
+            By ``time_s`` since the first DVL sample: the states in SI units, which their names end with, and their σ as
+            ``*_std``.
 
         Raises
         ------
@@ -225,11 +250,15 @@ class Calibration:
         if history is None:
             raise InputError("this replay kept no history; replay with history=True")
         model, estimate = history.models[self.model], self.replayed.result.estimate
+        units = {each.name: each.unit for each in MODELS[self.model].nuisance}
         first_ns = self.replayed.result.first_ns or 0
-        columns: dict[str, Array] = {"time_s": 1e-9 * (history.stamps_ns - first_ns)}
+        time = pandas.Index(1e-9 * (history.stamps_ns - first_ns), name="time_s")
+        columns: dict[str, Array] = {}
         for index, name in enumerate(estimate.state_names):
-            columns[name], columns[f"{name}_std"] = model.state[:, index], model.std[:, index]
-        return pandas.DataFrame(columns)
+            unit = units.get(name, "rad" if name.startswith("phi") else "")
+            label = "_".join(filter(None, (name, SUFFIXES.get(unit, unit))))
+            columns[label], columns[f"{label}_std"] = model.state[:, index], model.std[:, index]
+        return pandas.DataFrame(columns, index=time)
 
     def plot(self) -> Figure:
         """Draw the mounting over time with its ±1σ, and the velocity error before and after.
@@ -316,6 +345,32 @@ class Calibration:
         from ..bag_replay.replay import replay_document
 
         return replay_document(self.replayed, models) | {"discovery": self.discovery.document()}
+
+
+# Tables of a replay: key, and the heading on its page
+TABLES = {"held_out": "Held-out verification", "models": "Estimates", "streams": "Data"}
+SUFFIXES = {"°": "deg", "%": "percent", "m/s": "mps"}
+_MPS = ("uncorrected", "corrected", "predicted")
+
+
+def _column(heading: str) -> str:
+    """Return the heading of a table as a name, such as ``phi_x_deg_std``."""
+    name, _, unit = heading.removesuffix(" ±1σ").removesuffix(" shown").partition(", ")
+    name = name.replace("φ", "phi_").replace("δk", "scale").replace("NIS/m", "nis_per_component").replace(" ", "_")
+    words = [name or "stream", SUFFIXES.get(unit, unit) or ("mps" if name in _MPS else "")]
+    words += ["std"] * heading.endswith(" ±1σ") + ["shown"] * heading.endswith(" shown")
+    return "_".join(filter(None, words))
+
+
+def _vectors(name: str, given: Array) -> Array:
+    """Return an argument as vectors (..., 3). Raises InputError naming it."""
+    try:
+        found = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: no numbers; expected an array of shape (..., 3)") from None
+    if found.shape[-1:] != (3,):
+        raise InputError(f"{name}: shape {found.shape}; expected (..., 3)")
+    return found
 
 
 def _none(value: float) -> Quantity:

@@ -58,6 +58,11 @@ class Fleet(Answering):
         return self.out / PAGE
 
     @property
+    def verdict(self) -> str:
+        """The answer, by the name that every result has it by."""
+        return self.word
+
+    @property
     def word(self) -> str:
         """The answer: whether the mounting of one moved."""
         words = [each.compared.word for each in self.vehicles if each.compared is not None]

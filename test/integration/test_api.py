@@ -85,8 +85,44 @@ def test_a_corrected_velocity_of_a_turning_vehicle_is_that_of_the_reference_poin
 
 def test_the_run_over_time_is_a_data_frame_on_demand(calibration):
     frame = pytest.importorskip("pandas") and calibration.to_pandas()
-    assert list(frame.columns[:3]) == ["time_s", "phi_x", "phi_x_std"]
-    assert frame["phi_z_std"].iloc[-1] < frame["phi_z_std"].iloc[0]
+    assert frame.index.name == "time_s" and list(frame.columns[:2]) == ["phi_x_rad", "phi_x_rad_std"]
+    assert {"lever_arm_x_m", "time_offset_s_std", "delta_k_x"} <= set(frame.columns)
+    assert frame["phi_z_rad_std"].iloc[-1] < frame["phi_z_rad_std"].iloc[0]
+
+
+def test_a_user_finds_tables_by_short_names_with_units(calibration):
+    pytest.importorskip("pandas")
+    tables = calibration.tables()
+    assert list(tables) == ["mounting", "held_out", "models", "streams"]
+    yaw = tables["mounting"].loc["yaw"]
+    assert yaw["corrected"] == calibration.mounting.rpy_deg[2] and yaw["unit"] == "°"
+    assert yaw["change"] == pytest.approx(yaw["corrected"] - yaw["configured"])
+    assert {"phi_z_deg", "phi_z_deg_std", "scale_x_percent"} <= set(tables["models"].columns)
+    assert list(tables["held_out"].columns[1:4]) == ["uncorrected_mps", "corrected_mps", "predicted_mps"]
+
+
+def test_the_mounting_is_printed_with_arm_and_delay_and_findings_are_of_the_selected_model(calibration):
+    said = str(calibration.mounting)
+    assert "lever arm x " in said and "stamps late " in said
+    assert not any(each.says.startswith(("M1: ", "M7: ", "F1: ")) for each in calibration.findings)
+
+
+@pytest.mark.parametrize(
+    ("call", "expected"),
+    [
+        (lambda run, to: dc.simulate(to, duration=30.0), "'seconds'"),
+        (lambda run, to: dc.simulate(to, waves=0.3), "Waves(height="),
+        (lambda run, to: dc.simulate(to, trajectory="foo"), "box"),
+        (lambda run, to: dc.simulate(to, seconds="long"), "expected a number"),
+        (lambda run, to: run.correct([1.0, 2.0]), "expected (..., 3)"),
+        (lambda run, to: run.correct("abc"), "velocity_dvl"),
+        (lambda run, to: run.correct(np.zeros((2, 3)), np.zeros((4, 3))), "(4, 3); expected (2, 3)"),
+    ],
+)  # fmt: skip
+def test_a_wrong_argument_is_refused_with_what_is_expected(calibration, tmp_path, call, expected):
+    with pytest.raises(dc.InputError) as refused:
+        call(calibration, tmp_path / "bag")
+    assert expected in str(refused.value) and not (tmp_path / "bag").exists()
 
 
 def test_without_history_what_needs_it_says_so(bag):
