@@ -119,7 +119,10 @@ def cross_check(
         uncorrected=uncorrected,
         corrected=corrected,
         notes=tuple(
-            f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in (*each.failed, *each.notes)
+            f"{bag}: {note}"
+            for bag, each in zip(bags, found, strict=True)
+            for note in (*each.failed, *each.notes)
+            if not note.startswith(tuple(f"{name}: " for name in MODELS if name not in models))
         ),
         parameters=parameters.as_dict(),
         selected=tuple(each.selected[0] for each in found),
