@@ -92,7 +92,9 @@ def _cpu(sides: Sequence[Sequence[str]], rounds: int) -> list[float]:
         for _ in range(1 + rounds):
             for arguments, own in zip(sides, times, strict=True):
                 before = resource.getrusage(resource.RUSAGE_CHILDREN)
-                subprocess.run([sys.executable, *arguments], check=True, capture_output=True, env=environment)
+                done = subprocess.run([sys.executable, *arguments], capture_output=True, env=environment)
+                if done.returncode not in (0, 1):  # 1: rejected, which is an answer
+                    raise RuntimeError(done.stderr.decode())
                 after = resource.getrusage(resource.RUSAGE_CHILDREN)
                 own.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     return [min(own) for own in times]

@@ -83,8 +83,8 @@ def dvl_calib(*arguments: object) -> str:
         code = end.code
     finally:
         os.chdir(before)
-    if code:
-        number = code if isinstance(code, int) else 1
+    if code not in (None, 0, 1):  # 1: what was asked is rejected, which is an answer
+        number = code if isinstance(code, int) else 2
         raise subprocess.CalledProcessError(number, command, said.getvalue().decode(), warned.getvalue().decode())
     return said.getvalue().decode()
 
@@ -102,8 +102,10 @@ def validation(*arguments: object) -> str:
 def _run(module: Sequence[str]) -> str:
     command = [sys.executable, "-m", *module]
     done = subprocess.run(
-        command, capture_output=True, text=True, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True
+        command, capture_output=True, text=True, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}
     )
+    if done.returncode not in (0, 1):
+        raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr)
     return done.stdout
 
 
