@@ -72,7 +72,7 @@ AGAINST_IMU = (
     "Angles are relative to the IMU: a constant error of its heading is in the yaw, one of its level in roll and "
     "pitch. Both are harmless as long as the same IMU is used."
 )
-STRAIGHT = "A straight kilometre of dead reckoning ends {0.before} m off as mounted, {0.after} m (1σ) corrected."
+STRAIGHT = "A straight kilometre of dead reckoning ends {0.before} m off as mounted, {0.after} m corrected (1σ)."
 NO_RESIDUALS = ". No reference is beside enough of them for residuals."
 RESIDUALS = (
     "; residuals are at the reference point, corrected by estimates that had not seen the data, with all that was "
@@ -223,12 +223,16 @@ def replayed(
 
 
 def straight_kilometre(result: Result) -> tuple[float, float]:
-    """Return how far dead reckoning ends beside a straight kilometre, m: as mounted, and 1σ with the correction."""
+    """Return how far dead reckoning ends beside a straight kilometre, m (1σ): as mounted, and with the correction.
+
+    What is not known of the correction is not known of the mounting as it is either.
+    """
     parameters = Parameters.from_mapping(result.parameters)
     ahead, nominal = np.eye(3)[0], parameters.rotation_dvl_from_body
     measured = (1.0 + result.estimate.scale) * (result.estimate.rotation_body_from_dvl(nominal).T @ ahead)
     off = 1000.0 * float(np.linalg.norm((nominal.T @ measured - ahead)[:2]))
-    return off, drift_left_open(result.estimate, parameters)
+    left_open = drift_left_open(result.estimate, parameters)
+    return math.hypot(off, left_open), left_open
 
 
 def _answer(verification: Verification | None) -> Answer:

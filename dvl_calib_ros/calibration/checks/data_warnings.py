@@ -24,7 +24,7 @@ OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
 # It is not told apart from the mounting where yaw takes this share of it.
 NOT_SHOWN = 0.6
 # Of a lever arm (m) and a delay (s) that a clock leaves open, what is worth a word.
-SAID_FROM_M, SAID_FROM_S = 0.05, 0.05
+SAID_FROM_M, SAID_FROM_S, SAID_FROM_DEG = 0.05, 0.05, 0.1
 # So many losses of GNSS are flapping.
 FLAPPING = 3
 
@@ -137,10 +137,10 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
         metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
-        if metres < SAID_FROM_M and seconds < SAID_FROM_S:  # the arm was told
-            said.append(finding("CLOCK_ON_TURN", degrees=turn))
-        else:
+        if metres >= SAID_FROM_M or seconds >= SAID_FROM_S:
             said.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
+        elif turn >= SAID_FROM_DEG:  # the arm was told
+            said.append(finding("CLOCK_ON_TURN", degrees=turn))
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
         for day in days

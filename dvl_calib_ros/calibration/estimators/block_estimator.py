@@ -167,7 +167,7 @@ class FullEstimator(Estimator):
             own = np.eye(len(_OPEN))
             own[:3, :3] = -self._parameters.rotation_dvl_from_body  # a turn is a misalignment the other way round
             if any(self._parameters.lever_arm):
-                own[3:6] = 0.0
+                own[3:] = 0.0
             found[np.ix_(_OPEN, _OPEN)] = own @ registration.left_open @ own.T
         return found
 

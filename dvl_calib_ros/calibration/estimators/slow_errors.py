@@ -25,6 +25,8 @@ WIDTH = 2 * SLOW + N_STATE + 1
 _DELAY, _REFERENCE_DELAY = 2 * SLOW + DELAY, 2 * SLOW + REFERENCE_DELAY
 # So many times what noise tells of a delay is taken for that: what it tells scatters.
 NOISE_TWICE = 2.0
+# Steps are too long by 1 / √share of the acceleration that is no noise: with a smaller share it tells nothing.
+LEAST_SHARE = 0.4
 
 
 class SlowErrors(NamedTuple):
@@ -118,22 +120,13 @@ def gram_of(bins: Bins, variance: Array, x: Array, slope_variance: float) -> Arr
     rows = rows.reshape(-1, WIDTH)
     delay = rows[:, _DELAY].copy()
     by_noise = NOISE_TWICE * slope_variance * float((bins.weight / variance).sum())
-    share = max(1.0 - by_noise / max(float(delay @ delay), 1e-300), 0.0)
+    share = 1.0 - by_noise / max(float(delay @ delay), 1e-300)
     # the reference's delay has the same acceleration the other way round, beside what turns
-    less = (1.0 - math.sqrt(share)) * delay
+    less = (1.0 - (math.sqrt(share) if share > LEAST_SHARE else 0.0)) * delay
     rows[:, _DELAY] -= less
     rows[:, _REFERENCE_DELAY] += less
+    rows[:, -1] += rows[:, 2 * SLOW : -1] @ x
     gram: Array = rows.T @ rows
-    # ... and no step is longer than the delay that is left
-    short = (math.sqrt(share) - share) * float(delay @ rows[:, -1])
-    for place, way in ((_DELAY, -1.0), (_REFERENCE_DELAY, 1.0)):
-        gram[place, -1] += way * short
-        gram[-1, place] = gram[place, -1]
-    states = slice(2 * SLOW, WIDTH - 1)
-    by_state = gram[:, states] @ x
-    gram[-1, -1] += x @ (2.0 * gram[states, -1] + gram[states, states] @ x)
-    gram[:-1, -1] += by_state[:-1]
-    gram[-1, :-1] = gram[:-1, -1]
     return gram
 
 

@@ -313,7 +313,7 @@ def test_salvage_of_a_bag_without_definitions_writes_none(tmp_path):
 def test_a_definition_that_contains_itself_is_told_of_its_topic(tmp_path, capsys, text, which):
     samples = raw(write_bag(tmp_path / "bag", run(6.0)))
     (tmp_path / "round.mcap").write_bytes(mcap_bytes(samples, {"dvl/twist": (TWIST_TYPE, text)}))
-    assert main(["doctor", str(tmp_path / "round.mcap")]) == 0
+    assert main(["doctor", str(tmp_path / "round.mcap")]) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert f"dvl/twist: 30 of 30 messages cannot be decoded: the definition of {which} contains itself" in said
 

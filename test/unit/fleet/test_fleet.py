@@ -107,7 +107,7 @@ def test_the_day_on_which_a_mounting_moved_is_said(made):
     assert result.word == "moved" and "auv1: The mounting has moved by 3.0" in repr(result)
     page = result.page.read_text()
     assert page.count("<img") >= 3 and "no.mcap" in page
-    assert '<td class="text word">Damaged' in page  # a sentence, which wraps
+    assert ">Damaged" in page or " Damaged" in page  # a sentence, which wraps
 
 
 def test_the_page_begins_with_who_needs_a_person_and_draws_an_inverted_dvl_without_a_jump(made):

@@ -38,7 +38,7 @@ def test_the_answer_is_that_of_a_clock_that_is_right(tmp_path, kind, ahead_s, re
 
 def test_what_doctor_says_to_type_next_calibrates(tmp_path, capsys):
     bag = write(tmp_path / "bag", TWIST, HOUR_S)
-    assert main(["doctor", str(bag)]) == 0
+    assert main(["doctor", str(bag)]) == 1
     said = capsys.readouterr().out
     assert said.startswith("no: ") and f"next  dvl-calib replay {bag} --restamp dvl/twist --save" in said
     assert main(["replay", str(bag), "--restamp", "dvl/twist"]) == 0
