@@ -166,7 +166,7 @@ def evaluate(
     models
         Names; all by default.
     dvl_topic, gnss_topic, imu_topic
-        Of bags, as of `replay`.
+        Of bags; those of `dvl-calib simulate` where not named.
     **parameters
         Any of the node's parameters, in SI units.
 
@@ -188,14 +188,16 @@ def evaluate(
     from ..evaluation.validation_study import DEFAULTS, EVALUATED
     from ..evaluation.validation_study import evaluate as run
     from ..parallel import Workers
+    from ..recordings.topics import Topics
 
     found = [] if paths is None else as_paths(paths)
+    named = {"dvl": dvl_topic, "gnss": gnss_topic, "imu": imu_topic}
+    topics = Topics(**{stream: topic for stream, topic in named.items() if topic is not None})
     known = BY_VELOCITY if len(found) > 1 else EVALUATED
     names = known if models is None else tuple(models)
     for name in names:
         if name not in known:
             raise InputError(f"models: {name!r} is none of {', '.join(known)}")
     if len(found) > 1:
-        discovery = discovered_in(found, (dvl_topic, gnss_topic, imu_topic), None, parameters)[1]
-        return cross_check(found, discovery.parameters, names, discovery.topics, Workers())
+        return cross_check(found, Parameters.from_mapping(parameters), names, topics, Workers())
     return run(found[0] if found else None, Parameters.from_mapping({**DEFAULTS, **parameters}), models=names)

@@ -119,10 +119,7 @@ def cross_check(
         uncorrected=uncorrected,
         corrected=corrected,
         notes=tuple(
-            f"{bag}: {note}"
-            for bag, each in zip(bags, found, strict=True)
-            for note in (*each.failed, *each.notes)
-            if not note.startswith(tuple(f"{name}: " for name in MODELS if name not in models))
+            f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in (*each.failed, *each.notes)
         ),
         parameters=parameters.as_dict(),
         selected=tuple(each.selected[0] for each in found),

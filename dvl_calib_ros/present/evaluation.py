@@ -16,11 +16,10 @@ from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.protocol import MANOEUVRING
 from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
-from ..verdict.kinds import VERDICT_WORDS, Severity
+from ..verdict.kinds import VERDICT_WORDS
 from .document import (
     CELL_KINDS,
     HELD_OUT_KINDS,
-    Answer,
     Cell,
     Document,
     Item,
@@ -433,25 +432,6 @@ DRIFT_NOTE = (
 )
 
 
-def _cross_answer(check: CrossCheck) -> Answer:
-    """Whether a calibration of one bag makes the velocities of the others better, by the best of the models."""
-    error = {}
-    for name, of_model in zip(check.models, check.corrected.transpose(1, 0, 2), strict=True):
-        both = np.isfinite(of_model) & np.isfinite(check.uncorrected)
-        if both.any():
-            before = np.broadcast_to(check.uncorrected, both.shape)[both]
-            error[name] = float(of_model[both].mean()), float(before.mean())
-    if not error:
-        return Answer(
-            "not known", Severity.MARGINAL, ["No bag could be calibrated and another one be checked with it."]
-        )
-    best = min(error, key=lambda name: error[name][0] - error[name][1])
-    after, before = error[best]
-    said = f"Corrected by {best} of another bag, the velocity error is {after:.3f} m/s rms; without, {before:.3f}."
-    word, severity = ("better", Severity.ACCEPT) if after < before else ("not better", Severity.REJECT)
-    return Answer(word, severity, [said])
-
-
 def cross_check(check: CrossCheck) -> Document:
     """What the calibration of each bag is worth on every other one."""
     pictures: list[Item] = []
@@ -480,7 +460,7 @@ def cross_check(check: CrossCheck) -> Document:
     return Document(
         title="Bags checked against each other",
         subtitle=", ".join(check.names),
-        answer=_cross_answer(check),
+        answer=None,
         warnings=check.notes,
         sections=[
             section(

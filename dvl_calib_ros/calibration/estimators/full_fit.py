@@ -568,6 +568,8 @@ def _masked_median(values: Array) -> Array:
 def _bin_s(block: FitBlock) -> float:
     """References closer together than the DVL's samples share these, and go into one bin."""
     times = block.reference.times
+    if len(times) < 2 or len(block.dvl.times) < 2:
+        return BIN_S
     apart = (times[-1] - times[0]) / max(len(times) - 1, 1)
     return max(BIN_S, BIN_INTERVALS * block.interval_s) if apart < DENSER * block.interval_s else BIN_S
 

@@ -362,7 +362,7 @@ def scale_and_delay(model: Model, state: GaussianState, parameters: Parameters) 
 
 ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 # So many σ are no chance, and so many metres no tape measure's error.
-SIGMAS, MEASURED_TO = 10.0, 0.05
+SIGMAS, MEASURED_TO = 5.0, 0.05
 # Data that know an arm so many times worse than a tape measure do not improve on it.
 WORSE_THAN_TOLD = 2.0
 
