@@ -204,18 +204,6 @@ class Selection:
         return finding("MODEL_CHOSEN_AS", **chosen, why=finding(seen.code, model=parameters.gnss_model, **seen.numbers))
 
 
-def eligible(parameters: Parameters) -> frozenset[str]:
-    """The models that may be selected, and those that extend them."""
-    if parameters.model == IAC:
-        own = set(published_models(parameters))
-    elif parameters.model == AUTO:
-        unaided = parameters.gnss_free_model
-        own = {parameters.gnss_model, unaided, WITH_HEADINGS.get(unaided, unaided), *filter(None, [WITH_POSITIONS])}
-    else:
-        own = {parameters.model}
-    return frozenset(own | {EXTENDED_BY[name] for name in own if name in EXTENDED_BY})
-
-
 def published_models(parameters: Parameters) -> tuple[str, str]:
     """What `iac` runs: IAC-G with GNSS, IAC-GF without, of Yampolsky and Klein (see the table of models).
 

@@ -161,9 +161,10 @@ class FullEstimator(Estimator):
     def left_open(self) -> Array:
         """As `Estimator`: attitudes of another time look like an arm at one speed, and like a yaw in a steady turn."""
         found: Array = np.zeros((N_STATE, N_STATE))
-        settled = self._is_settled and self.claims
-        registration = self._solver.registration() if settled else self._told.looked.registration
-        if self.claims and registration is not None:
+        if not self.claims:
+            return found
+        registration = self._solver.registration() if self._is_settled else self._told.looked.registration
+        if registration is not None:
             own = np.eye(len(_OPEN))
             own[:3, :3] = -self._parameters.rotation_dvl_from_body  # a turn is a misalignment the other way round
             if any(self._parameters.lever_arm):

@@ -32,16 +32,15 @@ LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
 class Cleaned(NamedTuple):
     """A block's samples.
 
-    raw: its own references (J,) as the messages had them, thinned; own: places of them in the block. good: (J,) those
-    that are no outliers, which are in reference. dvl: without outliers; binned_dvl: as a curve is read from it.
+    raw: its own references (J,) as the messages had them, thinned; own: places of them in the block. reference: without
+    outliers. dvl: without outliers; binned_dvl: as a curve is read from it.
     dvl_ns, reference_ns: stamps. noise_dvl: (3, 3) (m/s)², the DVL's mean covariance. own_dvl, own_imu: places of the
-    block's own samples. are_compared: whether it has references, and the others there are for them. is_slow: the DVL.
+    block's own samples. are_compared: whether it has references, and the others there are for them.
     """
 
     block: Block
     raw: ReferenceSamples
     own: Index
-    good: Mask
     reference: ReferenceColumns
     reference_ns: Stamps
     reference_spikes: int
@@ -54,12 +53,6 @@ class Cleaned(NamedTuple):
     own_dvl: slice
     own_imu: slice
     are_compared: bool
-    is_slow: bool
-
-    @property
-    def has_rows(self) -> bool:
-        """Whether DVL and IMU are enough for curves."""
-        return len(self.dvl.times) >= 6 and len(self.imu.times) >= 2
 
 
 def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
@@ -80,7 +73,6 @@ def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
         block=block,
         raw=raw,
         own=own,
-        good=good,
         reference=reference,
         reference_ns=raw.stamps_ns[good],
         reference_spikes=int(np.count_nonzero(~good)),
@@ -93,7 +85,6 @@ def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
         own_dvl=slice(*np.searchsorted(dvl.times, (from_s, to_s)).tolist()),
         own_imu=slice(*np.searchsorted(imu.times, (from_s, to_s)).tolist()),
         are_compared=are_compared,
-        is_slow=is_slow(dvl.times),
     )
 
 

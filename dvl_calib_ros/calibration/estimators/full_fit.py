@@ -570,7 +570,7 @@ def _bin_s(block: FitBlock) -> float:
     times = block.reference.times
     if len(times) < 2 or len(block.dvl.times) < 2:
         return BIN_S
-    apart = (times[-1] - times[0]) / max(len(times) - 1, 1)
+    apart = (times[-1] - times[0]) / (len(times) - 1)
     return max(BIN_S, BIN_INTERVALS * block.interval_s) if apart < DENSER * block.interval_s else BIN_S
 
 

@@ -74,11 +74,6 @@ class FoldSums:
         self._each[number] = np.zeros_like(sums)
         return sums
 
-    def chosen(self, source: NDArray[np.intp]) -> None:
-        """Let each of K have its sums (FOLDS, K, ...) from others. source: (K,) from which of those there are."""
-        self._total = None
-        self._each = [each[:, source].copy() if each.ndim > 2 else each for each in self._each]
-
     def clear(self) -> None:
         """Begin anew."""
         self._total = None
@@ -112,11 +107,6 @@ class FoldInformation:
             weighted = some * weight[:, None, None, at]
             flat = (*some.shape[:2], -1)
             self.add_told(fold, weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2))
-
-    def narrow(self, kept: NDArray[np.intp]) -> None:
-        """Forget all of the K but some."""
-        self._told.chosen(kept)
-        self._begin = [(information[kept], vector[kept]) for information, vector in self._begin]
 
     def add_told(self, fold: int | slice, told: Array) -> None:
         """Add what rows (H, z) of one fold told (K, n+1, n+1), or of several (F, ...)."""

@@ -531,10 +531,6 @@ class BiasCovariance(NamedTuple):
         """Of some of several."""
         return BiasCovariance(self.columns[index])
 
-    def mixed(self, share: Array) -> BiasCovariance:
-        """Of the mean of M, each with a share (M,)."""
-        return BiasCovariance(np.tensordot(share, self.columns, axes=1))
-
     def where(self, known: Mask) -> BiasCovariance:
         """Of those states (n,) alone that are known from data."""
         return BiasCovariance(np.where(known[:, None], self.columns, 0.0))

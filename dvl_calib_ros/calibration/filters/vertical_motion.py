@@ -191,12 +191,6 @@ class HeaveRows:
         self._folds.taken(_MEAN)
         return rows, self._folds.taken(_TOLD)
 
-    def learn_from(self, source: Index) -> None:
-        """Let each of K take what was told from others. source: (K,) from which of those there are."""
-        self._sums.clear()
-        self._folds.chosen(source)
-        self._sum = self._sum[source]
-
 
 def with_heave(state: GaussianState, sums: HeaveSums, motion_std: float) -> tuple[GaussianState, Array]:
     """States x (..., K, n), P (..., K, n, n) with the rows of heave, and σ² (..., K) (m/s)² as learnt with them.

@@ -206,10 +206,6 @@ class SampleBlock:
             self.stream, stamps_ns, values, covariances, arrival, frames, np.concatenate(refused), reasons
         )
 
-    def shifted(self, offset_ns: int) -> SampleBlock:
-        """The same with other stamps."""
-        return replace(self, stamps_ns=self.stamps_ns + offset_ns)
-
     def samples(self) -> Iterator[Sample | str]:
         """Row by row as live: the sample, or why a message is none."""
         covariances: list[Array | None] = [*self.covariances.distinct, None]  # -1 is the last one

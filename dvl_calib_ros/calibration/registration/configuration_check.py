@@ -44,8 +44,6 @@ MISALIGNED, SCALED = math.radians(10.0), 0.1
 BY_CHANCE = 3.0
 # From where the DVL's delay is looked for, s: within what a calibration finds, at a step that is short beside waves.
 LATE_S = (-2.4, -1.2, 0.0, 1.2, 2.4)
-# A clock that was held in time is so to this, s.
-HELD_TO_S = 1e-3
 # Whatever else is tried than what is configured is tried without another lever arm.
 WITHOUT_ARM: Sequence[Array] = (REFERENCE, *np.eye(N)[ARM])
 _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)

@@ -196,9 +196,7 @@ class Readings:
             if motion.in_earth:
                 body = np.einsum("nji,nj->ni", attitude_at(motion.imu, self._at, GAP_S)[0], body)
             if self._position.any():
-                body = body + np.nan_to_num(
-                    cross(angular_velocity_at(motion.turns, self._at, GAP_S)[0], self._position)
-                )
+                body = body + np.nan_to_num(cross(angular_velocity_at(motion.turns, self._at, GAP_S), self._position))
             dvl = self._dvl @ FLU_FROM_FRD if reading.turned else self._dvl
             speed = _rms(dvl)
             best = best_rotation(dvl, body, likely)
@@ -288,7 +286,7 @@ def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> b
 
     times, own: (N,) s, (N, 3) rad/s.
     """
-    rates = angular_velocity_at(TurnRates.of(frame.read(imu)), times, GAP_S)[0]
+    rates = angular_velocity_at(TurnRates.of(frame.read(imu)), times, GAP_S)
     use = np.isfinite(rates).all(axis=1) & np.isfinite(own).all(axis=1)
     rates, own = rates[use], own[use]
     if len(own) < ENOUGH_SAMPLES or _rms(own) < TURNS or _rms(rates) < TURNS:

@@ -65,10 +65,6 @@ class MotionStreams:
         imu = ImuColumns(*(column[first:end] for column in self.imu))
         return replace(self, reference_times=times, reference=self.reference[at], dvl=dvl, imu=imu)
 
-    def in_the_body(self) -> MotionStreams:
-        """The same as if the reference were in the body."""
-        return replace(self, in_earth=False)
-
 
 def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     """What samples say, each stream's clock corrected as the parameters have it; None where two have too little."""
@@ -176,7 +172,7 @@ class Curves:
         if len(own) > 1:
             grid = np.arange(own[0], own[-1] + self._step, self._step)
             self._turns_start = float(grid[0])
-            rates = [angular_velocity_at(motion.turns, grid[at], GAP_S)[0] for at in _parts(len(grid))]
+            rates = [angular_velocity_at(motion.turns, grid[at], GAP_S) for at in _parts(len(grid))]
             self._turns = np.nan_to_num(np.concatenate(rates))
 
     def signed(self, signs: Array) -> Curves:

@@ -87,10 +87,7 @@ class Compared(NamedTuple):
 
     error (N, 3): reference less what the DVL says it is, body, m/s; nan where there is none, 0 along what the reference
     does not measure. measured (N, 3, 3): onto what it does measure, body. body (N, 3): the reference velocity.
-    rotation_enu_from_body (N, 3, 3), oriented (N,): whether that is known. variance (N,): of the reference, over the
-    axes that it measures; interpolated (N,): what is left of that between two samples if their noise is white;
-    claimed (N,): its message says so, and the DVL's is to be added. acceleration (N, 3): of the
-    reference, body. rates (N, 3): rad/s.
+    rotation_enu_from_body (N, 3, 3), oriented (N,): whether that is known. rates (N, 3): rad/s.
     """
 
     error: Array
@@ -98,10 +95,6 @@ class Compared(NamedTuple):
     body: Array
     rotation_enu_from_body: Array
     oriented: Mask
-    variance: Array
-    interpolated: Array
-    claimed: Mask
-    acceleration: Array
     rates: Array
 
 
@@ -158,11 +151,7 @@ class ThinnedRecording(NamedTuple):
         measured = (body_from_reference * axes[:, None]) @ body_from_reference.swapaxes(1, 2)
         error = np.matmul(measured, error[..., None])[..., 0]
         error[~found] = np.nan
-        acceleration = np.matmul(body_from_reference, ((g1 - g0) / gap[:, None])[..., None])[..., 0]
-        total = (variance[after] * axes).sum(axis=1)
-        blended = (((1.0 - part) ** 2 * variance[after - 1] + part**2 * variance[after]) * axes).sum(axis=1)
-        claimed = self.reference.claimed[after]
-        return Compared(error, measured, body, rotation, oriented, total, blended, claimed, acceleration, rates)
+        return Compared(error, measured, body, rotation, oriented, rates)
 
 
 def thinned(stamps_ns: Stamps) -> Index:

@@ -5,16 +5,11 @@ neighbours is a filter that depends on where between them the time lies: half as
 blind to what curves. Delays would then be told apart by the interpolation, not by the vehicle. A quadratic through the
 five or six samples around, weighted by their distance (local regression: Cleveland, "Robust locally weighted
 regression", 1979), is the same filter everywhere, and has a slope.
-
-A block is a copy of a stretch with margins, so neighbours hold the same samples twice: one call of numpy for many
-blocks must not let one see what another one holds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence, Sized
-from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +19,6 @@ from ..numerics.robust import median, steps
 from ..numerics.samples import Index, Mask
 
 LONGEST_DELAY_S = 3.2
-# Samples at least as dense as this tell their noise apart from the vehicle's motion, s.
-NOISE_FROM_S = 0.15
 # Samples faster than this are averaged over bins of so long: none the worse for it, and the work stays the same.
 BIN_S = 0.1
 FASTER_THAN_S = 0.07
@@ -70,37 +63,17 @@ class ImuColumns(NamedTuple):
     angular_velocity: Array
 
 
-C = TypeVar("C", DvlColumns, ImuColumns, ReferenceColumns)
-
-
-def joined(columns: Sequence[C]) -> C:
-    """Columns of several blocks, one after the other."""
-    return columns[0] if len(columns) == 1 else type(columns[0])(*map(np.concatenate, zip(*columns, strict=True)))
-
-
 class TurnRates(NamedTuple):
-    """Angular velocity where it is known, averaged over bins: times (M,) s, rates (M, 3) rad/s, body; variance (B, 3)
-    of its noise in each of the parts that they are of."""
+    """Angular velocity where it is known, averaged over bins: times (M,) s, rates (M, 3) rad/s, body."""
 
     times: Array
     rates: Array
-    variance: Array
-    parts: Parts
 
     @staticmethod
     def of(imu: ImuColumns) -> TurnRates:
-        """Those of an IMU, all of one part."""
+        """Those of an IMU."""
         known = ~np.isnan(imu.angular_velocity).any(axis=1)
-        times, rates = binned(imu.times[known], imu.angular_velocity[known])
-        return TurnRates(times, rates, _noise_of(times, rates)[None], Parts.of([times]))
-
-    @staticmethod
-    def joined(each: Sequence[TurnRates]) -> TurnRates:
-        """Of several blocks."""
-        if len(each) == 1:
-            return each[0]
-        times, rates, variance, _ = zip(*each, strict=True)
-        return TurnRates(np.concatenate(times), np.concatenate(rates), np.concatenate(variance), Parts.of(times))
+        return TurnRates(*binned(imu.times[known], imu.angular_velocity[known]))
 
 
 def shortened(pauses: Array, most: float) -> Array:
@@ -127,21 +100,13 @@ def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
     )
 
 
-def angular_velocity_at(
-    turns: TurnRates, times: Array, gap_s: float, parts: Parts | None = None
-) -> tuple[Array, Array]:
-    """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known. And its variance (B, 3).
-
-    parts: by which block's rates each is to be known; None where all are of one.
-    """
-    stamps, rates, variance, turn_parts = turns
+def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> Array:
+    """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known."""
+    stamps, rates = turns
     if len(stamps) < 2:
-        return np.full((len(times), 3), np.nan), np.zeros_like(variance)
-    parts = Parts.of([times]) if parts is None else parts
-    place = places(stamps, times, turn_parts, parts)
-    reach = reach_at(spacing_at(stamps, times, place), LEAST_REACH_S, MOST_REACH_S)
-    smooth = local_fit(stamps, rates, times, reach, place)
-    after, before, outside = _beside(stamps, times, place)
+        return np.full((len(times), 3), np.nan)
+    smooth = local_fit(stamps, rates, times, reach_at(spacing_at(stamps, times), LEAST_REACH_S, MOST_REACH_S))
+    after, before, outside = _beside(stamps, times)
     outside |= stamps[after] - stamps[before] > gap_s
     value = smooth.value
     if not smooth.found.all():
@@ -149,33 +114,13 @@ def angular_velocity_at(
         share = np.clip((times - stamps[before]) / gap, 0.0, 1.0)[:, None]
         value = np.where(smooth.found[:, None], value, rates[before] + (rates[after] - rates[before]) * share)
     value[outside] = np.nan
-    noise = [
-        own * gain[found].mean() if found.any() else np.zeros(3)
-        for own, gain, found in (
-            (own, smooth.value_gain[at], smooth.found[at]) for own, at in zip(variance, parts, strict=True)
-        )
-    ]
-    return value, np.array(noise)
+    return value
 
 
-def _beside(stamps: Array, times: Array, place: Near) -> tuple[Index, Index, Mask]:
+def _beside(stamps: Array, times: Array) -> tuple[Index, Index, Mask]:
     """Places of the samples after and before each of J times, and where there are none (J,). stamps: (N > 1,) s."""
-    after, first, end = place
-    after = np.minimum(np.maximum(np.minimum(np.maximum(after, first + 1), end - 1), 1), len(stamps) - 1)
-    last = np.maximum(end - 1, 0)
-    outside = (end - first < 2) | (times < stamps[np.minimum(first, len(stamps) - 1)]) | (times > stamps[last])
-    return after, after - 1, outside
-
-
-def _noise_of(times: Array, values: Array) -> Array:
-    """Variance (c,) of white noise on samples at times (N,) s, by their second differences; zero for slow ones.
-
-    A vehicle that rolls in waves has second differences of its own if it is looked at once a second.
-    """
-    if len(times) < 8 or median(steps(times)) > NOISE_FROM_S:
-        return np.zeros(values.shape[1])
-    bent = values[2:] - 2.0 * values[1:-1] + values[:-2]
-    return median(bent**2) / (6.0 * 0.455)  # 0.455: median of chi-square
+    after = np.minimum(np.maximum(np.searchsorted(stamps, times), 1), len(stamps) - 1)
+    return after, after - 1, (times < stamps[0]) | (times > stamps[-1])
 
 
 class InBody(NamedTuple):
@@ -185,10 +130,6 @@ class InBody(NamedTuple):
     noise: Array
     known: Mask
     earth_in_body: Array
-
-    def part(self, at: Index | slice) -> InBody:
-        """Some of them."""
-        return InBody(self.velocity[at], self.noise[at], self.known[at], self.earth_in_body[at])
 
 
 def in_body(reference: ReferenceColumns, rotation: Array, known: Mask) -> InBody:
@@ -204,21 +145,18 @@ def in_body(reference: ReferenceColumns, rotation: Array, known: Mask) -> InBody
     return InBody(velocity, noise, known | in_body, earth)
 
 
-def attitude_at(
-    imu: ImuColumns, times: Array, gap_s: float, imu_parts: Parts | None = None, parts: Parts | None = None
-) -> tuple[Array, Mask]:
+def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:
     """``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and where that is possible (J,).
 
-    gap_s: longest gap that is interpolated across. imu_parts, parts: of which block samples and times are.
+    gap_s: longest gap that is interpolated across.
     """
     given = ~np.isnan(imu.orientation[:, 0])
     stamps, quaternions = imu.times, imu.orientation
     if not given.all():
         stamps, quaternions = stamps[given], quaternions[given]
-        imu_parts = None if imu_parts is None else imu_parts.where(given)
     if len(stamps) < 2:
         return np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros(len(times), dtype=bool)
-    after, before, outside = _beside(stamps, times, places(stamps, times, imu_parts, parts))
+    after, before, outside = _beside(stamps, times)
     gap = np.maximum(stamps[after] - stamps[before], 1e-12)
     fraction = np.minimum(np.maximum((times - stamps[before]) / gap, 0.0), 1.0)
     between = slerps(quaternions.take(before, axis=0), quaternions.take(after, axis=0), fraction)
@@ -235,29 +173,21 @@ REACH_INTERVALS = 2.6
 class LocalFit(NamedTuple):
     """At M times: value (M, c), slope (M, c) per s, and whether there is one (M,).
 
-    value_gain, slope_gain: (M,) variance of value and slope for samples with white noise of variance 1.
+    slope_gain: (M,) variance of the slope for samples with white noise of variance 1.
     """
 
     value: Array
     slope: Array
-    value_gain: Array
     slope_gain: Array
     found: NDArray[np.bool_]
 
-    def part(self, at: slice) -> LocalFit:
-        """Those at some of the times."""
-        return LocalFit(self.value[at], self.slope[at], self.value_gain[at], self.slope_gain[at], self.found[at])
 
-
-def spacing_at(times: Array, at: Array, place: Near | None = None) -> Array:
-    """Mean interval of the six samples of times (N,) s around each time (...); nan near an end.
-
-    place: of these times, where it is known, or where not all samples may be looked at.
-    """
+def spacing_at(times: Array, at: Array) -> Array:
+    """Mean interval of the six samples of times (N,) s around each time (...); nan near an end."""
     if len(times) < 6:
         return np.full(at.shape, np.nan)
-    after, begin, end = places(times, at) if place is None else place
-    inside = (after - begin >= 3) & (after + 2 < end)
+    after = np.searchsorted(times, at)
+    inside = (after >= 3) & (after + 2 < len(times))
     last, first = np.minimum(after + 2, len(times) - 1), np.maximum(after - 3, 0)
     return np.where(inside, (times[last] - times[first]) / 5.0, np.nan)
 
@@ -268,20 +198,20 @@ def reach_at(spacing: Array, least: float, most: float) -> Array:
     return np.where(reach <= most, reach, np.nan)  # nan stays nan
 
 
-def local_fit(times: Array, values: Array, at: Array, reach: Array, place: Near | None = None) -> LocalFit:
+def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     """Fit a quadratic to the samples within `reach` of each time, weighted by (1 - |u|³)³ with u = distance / reach.
 
-    times: (N,) s, increasing. values: (N, c). at, reach: (M,) s, nan for no fit. place: as for `spacing_at`.
+    times: (N,) s, increasing. values: (N, c). at, reach: (M,) s, nan for no fit.
     """
     found = ~np.isnan(reach)
     if not found.any():
         nothing = np.full((len(at), values.shape[1]), np.nan)
-        return LocalFit(nothing, nothing, nothing[:, 0], nothing[:, 0], found)
-    after, begin, end = places(times, at) if place is None else place
+        return LocalFit(nothing, nothing, nothing[:, 0], found)
+    after = np.searchsorted(times, at)
     around = _within(times, float(np.nanmax(reach)))
     # samples of a window first: sums over them are then those of whole rows
     index = after + np.arange(-around, around)[:, None]
-    there = (index >= begin) & (index < end)
+    there = (index >= 0) & (index < len(times))
     index = np.clip(index, 0, len(times) - 1)
     u = (times.take(index) - at) / np.where(found, reach, 1.0)
     near = np.abs(u)
@@ -306,14 +236,13 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array, place: Near 
     for_slope = (c01 * scale) * weight + (c11 * scale) * first + (c12 * scale) * second
     near_by = values.take(index, axis=0)
     value, slope = np.einsum("wm,wmc->mc", for_value, near_by), np.einsum("wm,wmc->mc", for_slope, near_by)
-    value_gain, slope_gain = (np.einsum("wm,wm->m", each, each) for each in (for_value, for_slope))
-    return LocalFit(value, slope, value_gain, slope_gain, found)
+    return LocalFit(value, slope, np.einsum("wm,wm->m", for_slope, for_slope), found)
 
 
 def _within(times: Array, seconds: float) -> int:
     """How many samples follow each other within so many seconds at most, and no fewer than one.
 
-    times: (N,) s, which increase but where another block begins.
+    times: (N,) s, increasing.
     """
 
     def some(n: int) -> bool:
@@ -327,63 +256,3 @@ def _within(times: Array, seconds: float) -> int:
         middle = (low + high) // 2
         low, high = (middle, high) if some(middle) else (low, middle)
     return high
-
-
-@dataclass(frozen=True)
-class Parts:
-    """Of N samples those of each of B blocks. bounds: (B+1,) where each begins, and where the last one ends."""
-
-    bounds: Index
-
-    @staticmethod
-    def of(columns: Sequence[Sized]) -> Parts:
-        """Of columns that are joined in this order."""
-        return Parts(np.cumsum([0, *map(len, columns)]))
-
-    def __iter__(self) -> Iterator[slice]:
-        bounds = self.bounds.tolist()
-        return map(slice, bounds[:-1], bounds[1:])
-
-    def __len__(self) -> int:
-        return len(self.bounds) - 1
-
-    @property
-    def number(self) -> Index:
-        """(N,) of which block each sample is."""
-        return np.repeat(np.arange(len(self)), np.diff(self.bounds))
-
-    def where(self, kept: Mask) -> Parts:
-        """Those of the samples that are kept (N,)."""
-        return Parts(np.concatenate([[0], np.cumsum(kept)])[self.bounds])
-
-    def at(self, index: Index) -> Parts:
-        """Those of samples taken from them, by ascending numbers (M,)."""
-        return Parts(np.searchsorted(index, self.bounds))
-
-
-class Near(NamedTuple):
-    """Of M times the place of the first sample that is not before each, and of the first and the last but one sample
-    that may be looked at: (M,) each, or for all the same."""
-
-    after: Index
-    first: Index | int
-    end: Index | int
-
-    def twice(self) -> Near:
-        """Of the same times, one after the other twice."""
-        after, first, end = self
-        if isinstance(first, int) or isinstance(end, int):
-            return Near(np.tile(after, 2), first, end)
-        return Near(np.tile(after, 2), np.tile(first, 2), np.tile(end, 2))
-
-
-def places(times: Array, at: Array, parts: Parts | None = None, at_parts: Parts | None = None) -> Near:
-    """Places of times `at` (M,) among times (N,) s that increase in every one of some parts, by default in all of it.
-
-    at_parts: which of `at` are looked for in which part.
-    """
-    if parts is None or at_parts is None or len(parts) == 1:
-        return Near(np.searchsorted(times, at), 0, len(times))
-    found = [np.searchsorted(times[own], at[of]) for own, of in zip(parts, at_parts, strict=True)]
-    first, end = (np.repeat(bound, np.diff(at_parts.bounds)) for bound in (parts.bounds[:-1], parts.bounds[1:]))
-    return Near(np.concatenate(found) + first, first, end)
