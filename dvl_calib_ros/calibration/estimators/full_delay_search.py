@@ -21,8 +21,10 @@ SEARCHED_BLOCKS, CLEARLY, ALIKE_ROWS, FEWEST_ROWS = 64, 30.0, 5.0, 40
 
 def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameters) -> float:
     """Return the DVL's delay (s) that fits clearly better than this one, or this one."""
+    if len(blocks) > SEARCHED_BLOCKS:
+        return delay
     rows = [own for block in blocks if (own := _beside(block, parameters)) is not None]
-    squares = _left_by_delay(rows) if rows and len(blocks) <= SEARCHED_BLOCKS else None
+    squares = _left_by_delay(rows) if rows else None
     if squares is None:
         return delay
     best = int(np.argmin(squares))

@@ -133,6 +133,7 @@ class JointFit:
         """prior: x (20,), P (20, 20) of the states on the first day. unknown: of another day's own states."""
         self._parameters, self._prior, self._unknown = parameters, prior, unknown
         self._priors = priors or Priors()
+        self._arm_is_given = any(parameters.lever_arm)
         self._days = [_Day()]
         self._x = prior.x.copy()  # of vehicle and days
         self._linear = self._x.copy()  # the point of linearisation
@@ -460,8 +461,9 @@ class JointFit:
 
     def _mixture(self, ended: Sequence[Eliminated | None], points: slice) -> JointEstimate:
         """Mean and covariance over some points of the slow errors, with the lever arm as given and as wrong."""
-        as_given, as_wrong = self._by_prior(points, TAPE_STD_M), self._by_prior(points, math.inf)
-        information, vector, log_det = (np.stack(each) for each in zip(as_given, as_wrong, strict=True))
+        likely = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
+        priors = [self._by_prior(points, std) for std in likely]
+        information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
         square = np.zeros(information.shape[:2])
         for number, each in enumerate(ended):
             if each is not None:
@@ -474,7 +476,7 @@ class JointFit:
         covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
         x = (covariance @ vector[..., None])[..., 0]
         left = square - (x * vector).sum(axis=-1)
-        odds = np.log([[1.0 - WRONG_TAPE], [WRONG_TAPE]]) + self._log_prior[points]
+        odds = np.log([*likely.values()])[:, None] + self._log_prior[points]
         evidence = odds - 0.5 * (left + log_det + np.linalg.slogdet(information)[1])
         weights = np.exp(evidence - evidence.max())
         weights /= weights.sum()
@@ -500,7 +502,7 @@ class JointFit:
             vector[:, at[places]] += of_state[places]
         scale = np.ones((len(deviation), n))
         scale[:, HEADING] = 1.0 / deviation[:, None]
-        if any(self._parameters.lever_arm):
+        if self._arm_is_given:
             scale[:, LEVER_ARM] = np.maximum(np.sqrt(np.diag(self._prior.p)[LEVER_ARM]) / tape_std, 1.0)
         information *= scale[:, :, None] * scale[:, None]
         return information, vector * scale, -2.0 * np.log(scale).sum(axis=1)

@@ -92,6 +92,11 @@ class FitBlock:
         return replace(self, dvl=dvl, slope=spline_slopes(*dvl))
 
     @cached_property
+    def imu_values(self) -> Array:
+        """(M, 7) of the IMU, quaternion and angular velocity, as `imu_slope` has their slopes."""
+        return np.hstack([self.imu.orientation, self.imu.angular_velocity])
+
+    @cached_property
     def slope_reach_s(self) -> float:
         """How far to either side the DVL's acceleration is read: one of less is its noise."""
         return max(SLOPE_REACH_S, SLOPE_INTERVALS * self.interval_s)
@@ -165,15 +170,16 @@ def spline_at(stamps: Array, values: Array, slope: Array, times: Array, gap_s: f
 
     stamps (N,) s; values, slope (N, k), see `spline_slopes`.
     """
-    after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    after = np.minimum(np.maximum(stamps.searchsorted(times), 1), len(stamps) - 1)
     before = after - 1
-    step = stamps[after] - stamps[before]
-    part = ((times - stamps[before]) / step)[:, None]
+    begin = stamps.take(before)
+    step = stamps.take(after) - begin
+    part = ((times - begin) / step)[:, None]
     rest = 1.0 - part
     value = (
-        values[before] * (rest * rest * (1.0 + 2.0 * part))
-        + values[after] * (part * part * (1.0 + 2.0 * rest))
-        + step[:, None] * part * rest * (slope[before] * rest - slope[after] * part)
+        values.take(before, axis=0) * (rest * rest * (1.0 + 2.0 * part))
+        + values.take(after, axis=0) * (part * part * (1.0 + 2.0 * rest))
+        + step[:, None] * part * rest * (slope.take(before, axis=0) * rest - slope.take(after, axis=0) * part)
     )
     return AtTimes(value, (times >= stamps[0]) & (times <= stamps[-1]) & (step <= gap_s))
 
@@ -198,12 +204,12 @@ def attitude_of(block: FitBlock, times: Array, gap_s: float) -> Attitude:
     By a spline as well: at 1 Hz the shortest turn between two attitudes is off by a degree where a turn begins.
     """
     imu, n = block.imu, len(times)
-    rates = spline_at(imu.times, imu.angular_velocity, block.imu_slope[:, 4:], times, gap_s)
     if np.isnan(imu.orientation).any():  # no attitude, of which a body's own reference needs none
+        rates = spline_at(imu.times, imu.angular_velocity, block.imu_slope[:, 4:], times, gap_s)
         return Attitude(np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros(n, dtype=bool), *rates)
-    between = spline_at(imu.times, imu.orientation, block.imu_slope[:, :4], times, gap_s)
-    q = between.value / np.sqrt(squared(between.value))[:, None]
-    return Attitude(rotation_from_quaternion(q), between.known, *rates)
+    both, known = spline_at(imu.times, block.imu_values, block.imu_slope, times, gap_s)
+    q = both[:, :4] / np.sqrt(squared(both[:, :4]))[:, None]
+    return Attitude(rotation_from_quaternion(q), known, both[:, 4:], known)
 
 
 def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRows | None:
@@ -221,10 +227,9 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     if not use.any():
         return None
     at, rotation, rates, in_body = at[use], rotation[use], rates[use], reference.in_body[use]
-    before, after = (
-        spline_at(block.imu.times, block.imu.angular_velocity, block.imu_slope[:, 4:], at + way, np.inf).value
-        for way in (-TURNING_S, TURNING_S)
-    )
+    around = np.concatenate([at - TURNING_S, at + TURNING_S])
+    turns = spline_at(block.imu.times, block.imu.angular_velocity, block.imu_slope[:, 4:], around, np.inf).value
+    before, after = np.split(turns, 2)
     turning = (after - before) / (2.0 * TURNING_S)
     t = parameters.rotation_dvl_from_body
     inverse = np.linalg.inv(np.eye(3) + skew(x[PHI]))
@@ -234,8 +239,8 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     in_dvl = scaled @ inverse.T
     through = t.T @ inverse * gain
     reach, stamps = block.slope_reach_s, at + x[DELAY]
-    rise = dvl_at(block, stamps + reach).value - dvl_at(block, stamps - reach).value
-    accelerating = rise / (2.0 * reach) @ through.T
+    later, earlier = np.split(dvl_at(block, np.concatenate([stamps + reach, stamps - reach])).value, 2)
+    accelerating = (later - earlier) / (2.0 * reach) @ through.T
     body = in_dvl @ t - cross(rates, arm)
     n = len(at)
     own = np.zeros((n, 3, N_STATE))

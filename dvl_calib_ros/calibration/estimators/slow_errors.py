@@ -158,20 +158,22 @@ class Chain(NamedTuple):
 
     def after(self, gram: Array | None, seconds: float, slow: SlowErrors) -> Chain:
         """With another section (WIDTH, WIDTH) of so many seconds; None for one without rows."""
-        own = np.arange(SLOW)
-        kept = np.r_[own, 2 * SLOW : WIDTH]
+        own, first, rest = np.arange(SLOW), slice(SLOW), slice(2 * SLOW, WIDTH)
         memory = np.exp(-seconds / slow.memory_s)
         driven = slow.std**2 * (1.0 - memory**2)
         joint = np.zeros((len(self.gram), WIDTH, WIDTH))
         if gram is not None:
             joint += gram
-        joint[:, kept[:, None], kept] += self.gram
+        joint[:, first, first] += self.gram[:, :SLOW, :SLOW]
+        joint[:, first, rest] += self.gram[:, :SLOW, SLOW:]
+        joint[:, rest, first] += self.gram[:, SLOW:, :SLOW]
+        joint[:, rest, rest] += self.gram[:, SLOW:, SLOW:]
         joint[:, own, own] += memory**2 / driven
         joint[:, own + SLOW, own + SLOW] += 1.0 / driven
         joint[:, own, own + SLOW] -= memory / driven
         joint[:, own + SLOW, own] -= memory / driven
-        rest, more = _without_first(joint)
-        return Chain(rest, self.log_determinant + np.log(driven).sum(axis=1) + more)
+        without, more = _without_first(joint)
+        return Chain(without, self.log_determinant + np.log(driven).sum(axis=1) + more)
 
     def ended(self) -> Eliminated:
         """Without the slow errors at its end."""
