@@ -163,7 +163,6 @@ def residual_trend(
     before, after = _at(time, earth, -BEND_S), _at(time, earth, BEND_S)
     moving, slope = _turned(body_from_enu, earth), _turned(body_from_enu, (after - before) / (2.0 * BEND_S))
     n = len(time)
-    known = _known(moving, rates, slope, body_from_enu)
     yaw = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
     around = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)])
     quick = np.zeros((n, 3, 3))
@@ -180,18 +179,19 @@ def residual_trend(
     bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
     # a straight line between two samples is short of the bend by so much in the mean
     bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
-    both = np.concatenate([known, quick], axis=2)
+    both = np.concatenate([_known(moving, rates, slope, body_from_enu), quick], axis=2)
     fast = _fitted(time, both, bent, np.concatenate([KNOWN, QUICK]))
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # of a mean its own noise is what the reference is further on: that alone would be a scale, and a bias against it
     beside = _known(_beside(time, moving, starts), rates, slope, body_from_enu)
     by_heading = beside[:, :, -1, None] * around[:, None]
-    means = [_means(each, starts) for each in (time, np.concatenate([beside, by_heading, constant], axis=2), error)]
+    columns = np.concatenate([_means(each, starts) for each in (beside, by_heading, constant)], axis=2)
     likely = np.concatenate([KNOWN, BY_HEADING, CONSTANT])
-    slow = _fitted(means[0], means[1], means[2], likely)
+    means = _means(time, starts), columns, _means(error, starts)
+    slow = _fitted(*means, likely)
     likely[OVER_GROUND] = BED_STD_MPS
-    over_bed = _fitted(means[0], means[1], means[2], likely)
+    over_bed = _fitted(*means, likely)
     if fast is None or slow is None or over_bed is None:
         return None
     over_ground = over_bed.x[OVER_GROUND]
@@ -367,7 +367,8 @@ def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> _Fit | 
         x = p @ (weighted.reshape(-1, n).T @ z)
         rest = error - columns @ x
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
-    told = np.add.reduceat(np.square(weighted @ p).sum(axis=1), starts, axis=0)
+    # an axis at a time: of hours of data all of it at once is a tenth of a gigabyte
+    told = sum(np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3))
     # what is not looked for may be there as far as it is likely, and the data do not say that it is not
     beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
     std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T)
@@ -400,10 +401,10 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
     new[1:][np.abs(np.diff(time) - step) > 0.5 * step] = 0.0
     noise = np.clip(new, -most, most)
     weight = fit.weight * ((new == noise) & (new != 0.0)).all(axis=1)  # neither clipped, nor at an end
-    weighted = columns * fit.weight[:, None, None]
 
     def without_columns(values: Array) -> Array:
-        return np.asarray(values - columns @ (fit.p @ np.einsum("nij,ni->j", weighted, values)))
+        weighted = fit.weight[:, None] * values
+        return np.asarray(values - columns @ (fit.p @ np.einsum("nij,ni->j", columns, weighted)))
 
     now = without_columns(noise)
     level = np.maximum(np.einsum("n,ni,ni->i", weight, now, now), 1e-18)

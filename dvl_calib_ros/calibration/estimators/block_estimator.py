@@ -170,7 +170,7 @@ class FullEstimator(Estimator):
             if any(self._parameters.lever_arm):
                 own[3:] = 0.0
             found[np.ix_(_OPEN, _OPEN)] = own @ registration.left_open @ own.T
-        return found
+        return 0.5 * (found + found.T)
 
     @property
     def of_bias(self) -> BiasCovariance:

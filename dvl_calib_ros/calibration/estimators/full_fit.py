@@ -483,7 +483,7 @@ class JointFit:
         mean = np.tensordot(weights, x)
         spread = x - mean
         p = np.tensordot(weights, covariance) + np.einsum("ac,aci,acj->ij", weights, spread, spread)
-        return JointEstimate(GaussianState(mean, p), weights.sum(axis=0))
+        return JointEstimate(GaussianState(mean, 0.5 * (p + p.T)), weights.sum(axis=0))
 
     def _by_prior(self, points: slice, tape_std: float) -> tuple[Array, Array, Array]:
         """Information (C, n, n), its product with the state (C, n), minus its log determinant (C,), by the prior.
