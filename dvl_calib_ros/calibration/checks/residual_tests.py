@@ -368,7 +368,8 @@ def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> _Fit | 
         rest = error - columns @ x
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
     # an axis at a time: of hours of data all of it at once is a tenth of a gigabyte
-    told = sum(np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3))
+    each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
+    told = np.sum(each_axis, axis=0)
     # what is not looked for may be there as far as it is likely, and the data do not say that it is not
     beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
     std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T)
