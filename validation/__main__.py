@@ -21,6 +21,7 @@ COMMANDS = {
     "late_clocks": "late references and late DVLs: that doctor, replay and diagnose name one cause, by its size",
     "mutants": "faults put into ten rules, each of which the tests must see",
     "peers": "the diagnosis beside four other ways to answer, on the same bags: right, intervals, error, CPU",
+    "second_trial": "the diagnosis on recordings of a second generator, written without a look at its code",
     "size": "lines of code, modules, arrows between the rooms of the package",
     "stacks": "bags as real stacks record them, each with its truth, judged through the command line",
     "surveys": "surveys drawn at random, by physics of their own: usable and wrong, right and rejected",
