@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .registry import LONG, Found, measurement, snapir_ins, validation
 
-CASES, PAIRS, SEED = 120, 30, 20261122
+CASES, PAIRS, SECOND, SEED = 120, 30, 48, 20261122
 
 
 @measurement(cost=LONG, command=f"python -m validation trial --cases {CASES} --seed {SEED} --page FILE", tolerances={})
@@ -28,3 +28,10 @@ def pairs(folder: Path) -> Found:
     validation("trial", "--pairs", PAIRS, "--seed", SEED, "--out", folder / "pairs")
     lines = (folder / "pairs" / "pairs.txt").read_text().splitlines()
     return {"table": "\n".join(line for line in lines if line.endswith(" right") or "wanted" in line)}
+
+
+@measurement(cost=LONG, command=f"python -m validation second_trial --count {SECOND} --seed {SEED}", tolerances={})
+def second_trial(folder: Path) -> Found:
+    """The shares that the trial with the second generator prints."""
+    printed = validation("second_trial", "--count", SECOND, "--seed", SEED).splitlines()
+    return {"table": "\n".join(line for line in printed if "bounds" in line)}
