@@ -32,7 +32,7 @@ from ..calibration.numerics import kalman
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import DvlSample, VelocityFrame
 from ..calibration.results.results import mounting_pose
-from ..calibration.results.velocity_correction import NOT_ESTIMATED, Correction, lever_arm, twist_terms
+from ..calibration.results.velocity_correction import Correction, lever_arm
 from ..calibration.streams.position_velocities import check_model
 from ..discovery.gravity import believed_heading
 from ..discovery.transforms import Frames, not_default, placement
@@ -60,6 +60,7 @@ from .live_discovery import Discovering
 from .message_queue import Arrived, in_order_of_arrival, take
 from .message_types import velocity_class
 from .operator_card import Card
+from .output_messages import empty_twist, fill_errors, set_stamp
 from .ros_parameters import declare_parameters
 from .services import AnsweringNode
 from .status import status_name
@@ -108,12 +109,12 @@ class CalibrationNode(AnsweringNode):
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
         self._correction: Correction | None = None
         self._corrected_by = ""
-        self._published = self._mounting_published = ("", 0)
+        self._published = self._mounting_published = self._paper_published = ("", 0)
         self._pauses = Pauses(steady_s())
         self._save_problem: Reason | None = None
 
-        self._estimate = self._output_message()
-        self._corrected = self._output_message()
+        self._estimate = empty_twist()
+        self._corrected = empty_twist()
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         latched = QoSProfile(
             history=HistoryPolicy.KEEP_LAST,
@@ -122,6 +123,7 @@ class CalibrationNode(AnsweringNode):
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
         self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", latched)
+        self._paper_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", latched)
         self._mounting_publisher = self._publisher(PoseWithCovarianceStamped, "~/mounting", latched)
         self._mounting = MountingOutput(self, self._mounting_publisher, parameters.publish_tf, self._warn)
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
@@ -256,7 +258,8 @@ class CalibrationNode(AnsweringNode):
         """As `_begin`, with nothing of what has been published."""
         self._begin(parameters, None, feed)
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
-        self._recent, self._correction, self._mounting_published = RecentCounts(), None, ("", 0)
+        self._recent, self._correction = RecentCounts(), None
+        self._mounting_published = self._paper_published = ("", 0)
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Any:
         # every event callback is one more thing that the executor looks at for every message
@@ -357,13 +360,6 @@ class CalibrationNode(AnsweringNode):
 
     # ------------------------------------------------------------------ output
 
-    @staticmethod
-    def _output_message() -> TwistWithCovarianceStamped:
-        """A message to be filled again and again; what never changes in it is set here."""
-        message = TwistWithCovarianceStamped()
-        message.twist.covariance[[21, 28, 35]] = NOT_ESTIMATED  # calibrated_twist has no angular velocity
-        return message
-
     def _publish_if_updated(self) -> None:
         name = self._calibrator.selected
         if self._published != (name, self._calibrator.n_given(name)):
@@ -375,15 +371,19 @@ class CalibrationNode(AnsweringNode):
         self._published = (model.name, calibrator.n_given(model.name))
         state = calibrator.published(model.name)
         self._set_correction(model, state)
-        terms, covariance = twist_terms(model, state)
-        message = self._estimate
-        if calibrator.last_ns is not None:
-            _set_stamp(message.header.stamp, calibrator.last_ns)
-        message.header.frame_id = self._feed.decoder.dvl_frame or "dvl_link"
-        linear, angular = message.twist.twist.linear, message.twist.twist.angular
-        linear.x, linear.y, linear.z, angular.x, angular.y, angular.z = terms.tolist()
-        message.twist.covariance = covariance.ravel()
-        self._estimate_publisher.publish(message)
+        fill_errors(self._estimate, model, state, calibrator.last_ns, self._feed.decoder.dvl_frame)
+        self._estimate_publisher.publish(self._estimate)
+
+    def _publish_paper(self) -> None:
+        """Once a second at most, what the paper's own selection says, with the covariance of its filter."""
+        calibrator = self._calibrator
+        name = calibrator.selection.of_paper(calibrator.parameters)
+        state_of = (name, calibrator.n_given(name))
+        if state_of != self._paper_published and calibrator.last_ns is not None:
+            self._paper_published = state_of
+            message, state = empty_twist(), calibrator.state(name)
+            fill_errors(message, MODELS[name], state, calibrator.last_ns, self._feed.decoder.dvl_frame)
+            self._paper_publisher.publish(message)
 
     def _set_correction(self, model: Model, state: GaussianState) -> Correction:
         """Correct by this state from now on; its correction."""
@@ -407,7 +407,7 @@ class CalibrationNode(AnsweringNode):
             if rate is not None:
                 velocity = velocity - np.cross(rate, self._lever_arm)
         message = self._corrected
-        _set_stamp(message.header.stamp, sample.stamp_ns)
+        set_stamp(message.header.stamp, sample.stamp_ns)
         linear = message.twist.twist.linear
         linear.x, linear.y, linear.z = velocity.tolist()
         message.twist.covariance.reshape(6, 6)[:3, :3] = covariance
@@ -425,7 +425,7 @@ class CalibrationNode(AnsweringNode):
             return
         self._mounting_published = state_of
         stamp = Time()
-        _set_stamp(stamp, calibrator.last_ns)
+        set_stamp(stamp, calibrator.last_ns)
         parameters, decoder = calibrator.parameters, self._feed.decoder
         pose = mounting_pose(model, calibrator.next_recording(model.name), parameters, decoder.turns_dvl)
         self._mounting.publish(pose, stamp, parameters.base_frame, decoder.dvl_frame or "dvl_link", self._transforms)
@@ -442,6 +442,7 @@ class CalibrationNode(AnsweringNode):
     def _publish_diagnostics(self) -> None:
         self._discover()
         self._publish_mounting()
+        self._publish_paper()
         decoder = self._feed.decoder
         problems = [*self._found, *decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
         problems += self._gravity.problems(self._inputs["imu/data"].topic_name, self._calibrator.parameters)
@@ -576,10 +577,6 @@ class CalibrationNode(AnsweringNode):
             self._discovering.close()
         self._worker.shutdown(cancel_futures=True)
         super().destroy_node()
-
-
-def _set_stamp(stamp: Any, nanoseconds: int) -> None:
-    stamp.sec, stamp.nanosec = divmod(nanoseconds, 1_000_000_000)
 
 
 def _check_distinct(topics: Mapping[str, str]) -> None:

@@ -104,6 +104,27 @@ def test_the_node_and_the_replay_of_one_bag_agree_in_every_model(scenario, world
         assert len(offline.segments) == 4
 
 
+@pytest.mark.parametrize("model", ["auto", "F1"])
+def test_the_papers_own_selection_is_published_whatever_is_selected(model, world, bag):
+    with world.calibration_node(f"model:={model}", *as_arguments(PATIENT)):
+        diagnostics = world.received(DiagnosticArray, "/diagnostics")
+        got = world.received(TwistWithCovarianceStamped, f"{NODE}/iac/estimate", LATCHED)
+        sent = play(world, bag)
+        until(lambda: diagnosed(diagnostics, "dvl received") == str(sent["dvl/twist"]), "all DVL samples")
+        offline = replay([bag], Parameters()).result
+        assert offline.of_paper == "M3"
+        x = offline.estimates["M3"].state
+
+        def angles():
+            angular = got[-1].twist.twist.angular
+            return np.array([angular.x, angular.y, angular.z])
+
+        until(lambda: got and np.abs(angles() - x[:3]).max() < 1e-12, "the estimate of M3")
+        assert diagnosed(diagnostics, "model of the paper") == "M3 (iac: GNSS is available)"
+        covariance = got[-1].twist.covariance.reshape(6, 6)
+        np.testing.assert_allclose(covariance[3:, 3:], offline.estimates["M3"].filter_covariance[:3, :3], atol=1e-12)
+
+
 @pytest.mark.spread(1)
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_result_is_saved_whichever_way_the_node_is_stopped(stop, world, tmp_path):

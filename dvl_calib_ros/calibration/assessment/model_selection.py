@@ -188,6 +188,11 @@ class Selection:
             return EXTENDED_BY.get(aided, aided)
         return aided
 
+    def of_paper(self, parameters: Parameters) -> str:
+        """Name of the model that the paper's own selection runs now, whatever is selected."""
+        aided, unaided = published_models(parameters)
+        return aided if self.gnss.available else unaided
+
     def reason(self, parameters: Parameters, evidence: Evidence | None = None) -> Reason:
         """Why it is that model. evidence: as it is now, for a model that extends another; None: as it was noted."""
         if parameters.model not in (AUTO, IAC):
