@@ -17,7 +17,6 @@ from dvl_calib_ros.calibration.assessment.dead_reckoning import Drift, Navigatio
 from dvl_calib_ros.calibration.comparison.mounting_change import Comparison, compare
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.frames import rotation_of
 from dvl_calib_ros.calibration.results.extrinsics import Extrinsics
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.answer.gap_location import GapPlace
@@ -220,7 +219,7 @@ def comparison(name: str, apart_s: int = 86_400) -> Comparison:
             Extrinsics(
                 name=each, model="full", first_ns=day * apart_s * 1_000_000_000,
                 last_ns=(day * apart_s + 600) * 1_000_000_000,
-                rotation_body_from_dvl=rotation_of((0.0, 0.0, yaw)), lever_arm=np.zeros(3), scale=0.0, time_offset=0.0,
+                value=np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0, 0.0, 0.0]),
                 covariance=np.diag(std**2), shown=np.ones(8, dtype=bool), used=100, remarks=("as it is",),
             )
             for day, (each, yaw) in enumerate(((name, 0.0), ("tuesday.yaml", 0.0), ("wednesday.yaml", 0.012)))

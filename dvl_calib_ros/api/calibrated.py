@@ -215,14 +215,13 @@ class Calibration:
         InputError
             Without pandas.
         """
-        from ..files.result_file import mounting_found
         from ..present.replay import replayed
         from .output import frames_of
 
         frames = frames_of(replayed(self.replayed, self.bags, tuple(MODELS)))
         import pandas
 
-        mounting = pandas.DataFrame(mounting_found(self.replayed.result)).set_index("name")
+        mounting = pandas.DataFrame(quantities(self.replayed.result)).set_index("name")
         mounting.insert(2, "change", mounting["value"] - mounting["nominal"])
         mounting = mounting.rename(columns={"nominal": "configured", "value": "corrected"})
         named = {key: frames[heading] for key, heading in TABLES.items() if heading in frames}

@@ -319,7 +319,7 @@ def calibrated(
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> Calibrated:
     """Calibrate with a recording, which `name` names in what is said of it. Raises InputError."""
-    replayed = replay(recording, parameters, topics, on_progress, judged=False)
+    replayed = replay(recording, parameters, topics, on_progress)
     found = extrinsics_of_replay(replayed, name)
     if found is None:
         raise InputError(f"{name}: no sample of it could be used to calibrate; ask dvl-calib doctor")

@@ -23,7 +23,7 @@ from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion
 from ..calibration.numerics.samples import FRAME_CODES, AlignedBlock, SampleBlock, Stream, VelocityFrame, no_samples
-from ..calibration.results.extrinsics import Extrinsics, dvl_in_words, extrinsics_of
+from ..calibration.results.extrinsics import Extrinsics, dvl_in_words, extrinsics_of, rejection
 from ..calibration.results.held_out_verification import verification_document
 from ..calibration.results.results import Day, Result
 from ..calibration.streams.screening import are_valid_velocities, unit_quaternions
@@ -211,9 +211,10 @@ def _named(days: Sequence[Day], recording: Recording) -> tuple[Day, ...]:
 def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
     """What the selected model found, to be compared; None if it used no sample."""
     result = replayed.result
-    estimate = result.estimate
+    estimate, judged = result.estimate, result.verifications.get(result.selected)
     if not estimate.used or result.first_ns is None or result.last_ns is None:
         return None
+    rejected = "" if judged is None else rejection(each.as_dict() for each in judged.reasons)
     return extrinsics_of(
         name,
         MODELS[estimate.model],
@@ -223,6 +224,8 @@ def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
         estimate.used,
         dvl=dvl_in_words(result.parameters["dvl_frame"] or replayed.dvl_frame, replayed.turned),
         by_bias=estimate.of_bias.columns,
+        remarks=[f"its verdict is reject: {rejected}"] if rejected else (),
+        rejected=rejected,
     )
 
 

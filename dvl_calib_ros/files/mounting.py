@@ -25,7 +25,7 @@ from ..calibration.numerics.frames import (
     rpy_from_rotation,
 )
 from ..calibration.numerics.kalman import GaussianState
-from ..calibration.results.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of
+from ..calibration.results.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of, rejection
 from ..calibration.results.results import position_in_body, scale_and_delay
 from ..calibration.results.velocity_correction import lever_arm
 from ..errors import InputError, printable
@@ -404,6 +404,7 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
         span = content["time_span"]["first_ns"], content["time_span"]["last_ns"]
         first_ns, last_ns = (0, 0) if used == 0 else map(int, span)
         none = np.zeros((model.n_state, N_AXES))
+        rejected = rejection(content.get("verification", {}).get("findings", ()))
         # of before it was kept: what a bias makes of two files is then as of two DVLs
         by_bias = np.array(content["models"][model.name].get("by_dvl_bias", none), dtype=float).reshape(none.shape)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -429,4 +430,5 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
         remarks,
         dvl=dvl_in_words(calibrated.dvl_frame, calibrated.turned),
         by_bias=by_bias,
+        rejected=rejected,
     )

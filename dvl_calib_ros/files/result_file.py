@@ -34,7 +34,14 @@ from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.tests import chi2_sf
 from ..calibration.results.held_out_verification import verification_document
 from ..calibration.results.mounting_quantities import Quantity, quantities
-from ..calibration.results.results import Estimate, Result, mounting_pose, position_in_body, scale_and_delay
+from ..calibration.results.results import (
+    Estimate,
+    Result,
+    corrected_rpy,
+    mounting_pose,
+    position_in_body,
+    scale_and_delay,
+)
 from ..disk.atomic import own_stream, save_bytes
 from ..disk.yaml_files import load_yaml
 from ..errors import InputError, printable
@@ -95,7 +102,7 @@ def result_document(
         "used": estimate.used,
         "gated": estimate.gated,
         "convergence": estimate.convergence.value,
-        "found": {each.name: _in_words(each) for each in mounting_found(result)},
+        "found": {each.name: _in_words(each) for each in quantities(result)},
         "mounting": {
             "static_transform_publisher": None if arguments is None else f"{_PUBLISHER} {arguments}",
             "urdf_origin": origin_tag(position, rpy_from_rotation(of_frame)),
@@ -103,7 +110,7 @@ def result_document(
             "child_frame_id": child,
             "dvl_data_axes": FRD if turned else FLU,
             "nominal_rpy": list(parameters["mounting_rpy"]),
-            "corrected_rpy": rpy_from_rotation(corrected).tolist(),
+            "corrected_rpy": corrected_rpy(estimate.misalignment, checked).tolist(),
             "corrected_quaternion_xyzw": list(quaternion_from_rotation(corrected)),
             "scale_error_xyz": estimate.scale.tolist(),
             "lever_arm": estimate.lever_arm(parameters["lever_arm"]).tolist(),
@@ -149,16 +156,6 @@ def days_document(result: Result) -> dict[str, Any]:
             for day in result.own_days
         ]
     }
-
-
-def mounting_found(result: Result) -> list[Quantity]:
-    """Return the quantities found, angles within half a turn of those configured."""
-    return [
-        each
-        if each.unit != "°"
-        else each._replace(value=each.nominal + math.remainder(each.value - each.nominal, 360.0))
-        for each in quantities(result)
-    ]
 
 
 def _in_words(found: Quantity) -> str:

@@ -24,7 +24,7 @@ from .recording_entry import Entry, Row
 # What is set aside lies in a folder of its own: readers take every file of rows/
 ROWS, PAGE, ASIDE = "rows", "index.html", "set_aside"
 # Version of the schema: part of what says whether a recording is done
-SCHEMA = 3
+SCHEMA = 4
 _KEY, _CHECKSUM_KEY = b"dvl_calib", b"dvl_calib checksum"
 # Before the checksum, in the file's metadata
 _CHECKSUM = b"sha256 of this file with zeros here: "

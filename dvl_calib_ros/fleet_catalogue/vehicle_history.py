@@ -44,7 +44,7 @@ class Catalogued:
         if told is None:
             return Catalogued(recording, vehicle, tuple(rows))
         own = {field.name: told[field.name] for field in fields(Extrinsics) if field.name in told}
-        for name in own.keys() & {"rotation_body_from_dvl", "lever_arm", "covariance", "by_bias"}:
+        for name in own.keys() & {"value", "covariance", "by_bias"}:
             own[name] = np.array(own[name])
         own["shown"] = np.array(own["shown"], dtype=bool)
         covariance, cause = np.array(told["covariance_of_recording"]), str(told.get("cause_of_scale", ""))
@@ -57,8 +57,8 @@ class Catalogued:
 
     @property
     def is_usable(self) -> bool:
-        """Whether its numbers are those of the mounting."""
-        return self.extrinsics is not None and self.rows[0]["verdict"] != "reject"
+        """Whether its numbers and σ are to be believed."""
+        return self.extrinsics is not None and not self.extrinsics.rejected
 
 
 class CompassDeviation(NamedTuple):
@@ -156,9 +156,16 @@ def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
 
 def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
     usable = [each for each in entries if each.is_usable]
-    aided = [each for each in usable if each.extrinsics is not None and MODELS[each.extrinsics.model].aided]
-    days = _days(aided or usable)  # what a model without GNSS assumes of currents is no measure of one with
-    return VehicleHistory(name, len(entries), tuple(days), _compared(days), _heading(usable), _water(usable))
+    # what a model without GNSS assumes of currents is no measure of one with
+    aided = [each for each in entries if each.extrinsics is not None and MODELS[each.extrinsics.model].aided]
+    days = _days([each for each in aided if each.is_usable] or usable)
+    rejected = [
+        replace(each.extrinsics, name=each.recording.rpartition("/")[2])
+        for each in aided
+        if each.extrinsics is not None and not each.is_usable
+    ]
+    compared = _compared([*days, *rejected]) if days else None
+    return VehicleHistory(name, len(entries), tuple(days), compared, _heading(usable), _water(usable))
 
 
 def _compared(several: Sequence[Extrinsics]) -> Comparison | None:

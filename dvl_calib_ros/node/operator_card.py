@@ -23,9 +23,8 @@ from ..calibration.assessment.manoeuvre_planner import (
 )
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import MODELS
-from ..calibration.numerics.frames import rpy_from_rotation
 from ..calibration.numerics.kalman import GaussianState
-from ..calibration.results.results import Estimate, rpy_std, scale_and_delay
+from ..calibration.results.results import Estimate, corrected_rpy, rpy_std, scale_and_delay
 from ..verdict.reasons import Reason, finding
 
 # What to drive next is thought of anew so often, s: it takes a few milliseconds.
@@ -211,8 +210,7 @@ def _done(drift: float, unknown: float, target: float) -> float:
 def _mounting(calibrator: Calibrator, estimate: Estimate) -> dict[str, str]:
     """The DVL's mounting as a URDF has it, and what a pose does not hold; of what the model does not know, no σ."""
     parameters, model = calibrator.parameters, MODELS[estimate.model]
-    rotation = estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
-    angles = np.degrees(rpy_from_rotation(rotation))
+    angles = np.degrees(corrected_rpy(estimate.misalignment, parameters))
     stds = np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))
     found = {name: (a, s, "deg") for name, a, s in zip(("roll", "pitch", "yaw"), angles, stds, strict=True)}
     arm = estimate.lever_arm(parameters.lever_arm)

@@ -8,11 +8,8 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
-import numpy as np
-
-from ..calibration.comparison.mounting_change import ChiSquare, Comparison, Difference
+from ..calibration.comparison.mounting_change import Comparison, Difference
 from ..calibration.comparison.mounting_change_reasons import reasons, remarks
-from ..calibration.numerics.frames import Array, rpy_from_rotation
 from ..calibration.results.extrinsics import MOUNTING, Extrinsics
 from ..calibration.results.mounting_quantities import date
 from .document import Answer, Columns, Document, Section, Sentence, Table, Where, columns_for, figures, table_by
@@ -25,34 +22,30 @@ _DEGREE = math.degrees(1.0)
 
 
 class ComparedQuantity(NamedTuple):
-    """What is compared. component: its index in `COMPONENTS`. turn: what a difference of it is called.
-
-    factor: from SI. changes: of `Comparison`.
-    """
+    """Quantity of a comparison. component: its index in `COMPONENTS`. factor: from SI. changes: of `Comparison`."""
 
     component: int
     name: str
-    turn: str
     unit: str
     factor: float
     changes: str
 
 
 QUANTITIES = (
-    ComparedQuantity(0, "roll", "about x", "°", _DEGREE, "moved"),
-    ComparedQuantity(1, "pitch", "about y", "°", _DEGREE, "moved"),
-    ComparedQuantity(2, "yaw", "about z", "°", _DEGREE, "moved"),
-    ComparedQuantity(3, "lever arm x", "lever arm x", "m", 1.0, "moved"),
-    ComparedQuantity(4, "lever arm y", "lever arm y", "m", 1.0, "moved"),
-    ComparedQuantity(5, "lever arm z", "lever arm z", "m", 1.0, "moved"),
-    ComparedQuantity(6, "scale", "scale", "%", 100.0, "scale_changed"),
-    ComparedQuantity(7, "stamps late", "stamps late", "s", 1.0, "clock_changed"),
+    ComparedQuantity(0, "roll", "°", _DEGREE, "moved"),
+    ComparedQuantity(1, "pitch", "°", _DEGREE, "moved"),
+    ComparedQuantity(2, "yaw", "°", _DEGREE, "moved"),
+    ComparedQuantity(3, "lever arm x", "m", 1.0, "moved"),
+    ComparedQuantity(4, "lever arm y", "m", 1.0, "moved"),
+    ComparedQuantity(5, "lever arm z", "m", 1.0, "moved"),
+    ComparedQuantity(6, "scale", "%", 100.0, "scale_changed"),
+    ComparedQuantity(7, "stamps late", "s", 1.0, "clock_changed"),
 )
 
 
 def comparison(result: Comparison) -> Document:
     """Whether the mounting moved, by how much, and each calibration and difference with its σ."""
-    pairs, rest, ordered = result.pairs, result.against_rest, result.calibrations
+    pairs, ordered = result.pairs, result.calibrations
     by_name = [f"{each.first.name} → {each.second.name}" for each in pairs]
     neighbours = {(id(one), id(other)) for one, other in pairwise(ordered)}
     near = [k for k, each in enumerate(pairs) if (id(each.first), id(each.second)) in neighbours]
@@ -65,7 +58,7 @@ def comparison(result: Comparison) -> Document:
         **columns_for(
             {f"{each.name}, {each.unit}": each for each in shown_quantities(result)},
             lambda each, quantity: with_std(
-                quantity.factor * values_of(each)[quantity.component], quantity.factor * each.std[quantity.component]
+                quantity.factor * each.value[quantity.component], quantity.factor * each.std[quantity.component]
             ),
         ),
     }
@@ -95,10 +88,6 @@ def comparison(result: Comparison) -> Document:
                 [] if few else [_differences([pairs[k] for k in near], [by_name[k] for k in near])],
                 Where.TERMINAL,
             ),
-            Section(
-                "Each minus all the others together",
-                [_differences(rest, [each.second.name for each in rest])] if rest else [],
-            ),
         ],
     )
 
@@ -108,31 +97,25 @@ def shown_quantities(result: Comparison) -> list[ComparedQuantity]:
     return [each for each in QUANTITIES if sum(own.shown[each.component] for own in result.calibrations) > 1]
 
 
-def values_of(each: Extrinsics) -> Array:
-    """(8,) in SI: roll, pitch, yaw, lever arm, scale, delay."""
-    return np.array([*rpy_from_rotation(each.rotation_body_from_dvl), *each.lever_arm, each.scale, each.time_offset])
-
-
 DIFFERENCES_NOTE = (
-    "Angles are the turn of the mounting about the body's axes. χ² (of so many components) of angles and lever arm "
-    "together; p: how often chance alone makes it as large."
+    "Angles as in a URDF. p: how often chance alone makes the most significant of angles and lever arm as large, "
+    "corrected for the number of tests."
 )
 
 
 def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Table:
     shown = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
-    columns: Columns[tuple[str, Difference, ChiSquare]] = {
+    columns: Columns[tuple[str, Difference, float]] = {
         "": lambda each: each[0],
         **columns_for(
-            {f"{each.turn}, {each.unit}": each for each in shown},
+            {f"{each.name}, {each.unit}": each for each in shown},
             lambda each, quantity: with_std(
                 quantity.factor * each[1].value[quantity.component],
                 quantity.factor * each[1].std[quantity.component],
                 signed=True,
             ),
         ),
-        "mounting: χ²": lambda each: f"{each[2].value:.1f} of {each[2].freedom}" if each[2].freedom else "–",
-        "p": lambda each: "–" if not each[2].freedom else f"{each[2].p:.{'2f' if each[2].p >= 0.01 else '0e'}}",
+        "mounting: p": lambda each: f"{each[2]:.{'2f' if each[2] >= 0.01 else '0e'}}",
     }
-    rows = [(name, each, each.test(MOUNTING)) for name, each in zip(names, differences, strict=True)]
+    rows = [(name, each, each.chance(MOUNTING)) for name, each in zip(names, differences, strict=True)]
     return replace(table_by(columns, rows, (DIFFERENCES_NOTE,)), dense=True)

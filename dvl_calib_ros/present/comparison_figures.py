@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from ..calibration.comparison.mounting_change import Change, Comparison
 from ..calibration.results.extrinsics import N_COMPONENTS, Extrinsics
 from ..fleet_catalogue.vehicle_history import CompassDeviation
-from .comparison import ComparedQuantity, shown_quantities, values_of
+from .comparison import ComparedQuantity, shown_quantities
 from .figure_style import INK, Picture, drawing, legend_above, new_figure, picture
 from .fleet import deviation
 
@@ -36,7 +36,7 @@ def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONEN
         at = quantity.component
         known = [each for each in comparison.calibrations if each.shown[at]]
         told = ", ".join(
-            f"{each.name} {quantity.factor * values_of(each)[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
+            f"{each.name} {quantity.factor * each.value[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
             for each in (known if len(known) <= TOLD else (known[0], known[-1]))
         )
         told += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
@@ -73,8 +73,7 @@ def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> Non
     known = [each for each in comparison.calibrations if each.shown[quantity.component]]
     dated = _dated(comparison.calibrations)
     order = {id(each): index for index, each in enumerate(comparison.calibrations)}
-    value = quantity.factor * np.array([values_of(each)[quantity.component] for each in known])
-    value = np.unwrap(value, period=360.0) if quantity.unit == "°" else value  # a DVL mounted upside down
+    value = quantity.factor * np.array([each.value[quantity.component] for each in known])
     std = quantity.factor * np.array([each.std[quantity.component] for each in known])
     at = [_middle(each) if dated else float(order[id(each)]) for each in known]
     axes.errorbar(at, value, std, fmt="o", color=_POINT, markersize=4.0, capsize=2.5, elinewidth=1.2)

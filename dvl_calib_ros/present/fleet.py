@@ -9,15 +9,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison.mounting_change import ANSWERS, Comparison, fused
-from ..calibration.comparison.mounting_change_reasons import moved, reasons, suspicious
+from ..calibration.comparison.mounting_change import ANSWERS, POWER, Comparison, fused
+from ..calibration.comparison.mounting_change_reasons import reasons
 from ..calibration.results.extrinsics import SCALE, Extrinsics
 from ..calibration.results.mounting_quantities import date
 from ..fleet_catalogue.update import WORDS, Fleet
 from ..fleet_catalogue.vehicle_history import CompassDeviation, NeedsPerson, VehicleHistory
 from ..verdict.kinds import Severity
 from ..verdict.reasons import full
-from .comparison import QUANTITIES, values_of
+from .comparison import QUANTITIES
 from .document import (
     Answer,
     Cell,
@@ -39,6 +39,7 @@ from .numbers import counted, number, with_std
 SET_SPEED = 1500.0
 # Recordings that are named of those that need a person for one reason
 NAMED = 4
+MOVEMENTS = ("MOUNTING_MOVED", "MOUNTING_SUSPICIOUS", "MOUNTING_SUSPECTED")
 _ANGLES_AND_SCALE = tuple(each for each in QUANTITIES if each.component in (0, 1, 2, SCALE))
 
 
@@ -52,17 +53,18 @@ def fleet(result: Fleet) -> Document:
         f"{each.name}: {reason.full_sentence}"
         for each in vehicles
         if each.compared is not None
-        for reason in (*map(moved, each.compared.moved), *map(suspicious, each.compared.suspicious))
+        for reason in reasons(each.compared)
+        if each.compared.verdict != "same" and reason.code in MOVEMENTS
     ]
     if not said and result.word == "same":
-        said = ["No mounting moved."]
+        said = ["No movement found; the table says how small a movement could not be seen."]
     if not said:
         said = ["No vehicle has two days that show the same angle, so nothing can be compared."]
     said.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
     sitting = [VehicleNow(each, now(each)) for each in sorted(vehicles, key=_by_need)]
     speeds = [
-        VehicleSpeeds(each, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.scale))
+        VehicleSpeeds(each, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.value[SCALE]))
         for each in vehicles
     ]
     waters = [
@@ -120,6 +122,11 @@ def now(vehicle: VehicleHistory) -> Extrinsics | None:
     return fused(days)
 
 
+def _smallest(compared: Comparison) -> str:
+    """Word the movement in degrees that is found of the angle that is known worst."""
+    return f"{math.degrees(float(np.nanmax(compared.smallest, initial=0.0))):.1f}"
+
+
 class VehicleNow(NamedTuple):
     """A vehicle with its mounting as it is, None where no recording is usable."""
 
@@ -145,7 +152,10 @@ class VehicleNow(NamedTuple):
         return 0 if self.history.compared is None else len(self.history.compared.moved)
 
 
-MOUNTING_NOTE = "Angles and scale since the mounting last moved, ±1σ. Rejected recordings are in none of them."
+MOUNTING_NOTE = (
+    "Angles and scale since the mounting last moved, ±1σ, without rejected recordings. Of movements of roll, pitch or "
+    f"yaw as large as 'seen from', {100.0 * POWER:.0f} of 100 are found."
+)
 KINDS = {"moved": "text bad", "suspicious": "text off", "same": "text good"}
 VEHICLES: Columns[VehicleNow] = {
     "": lambda each: each.history.name,
@@ -154,13 +164,14 @@ VEHICLES: Columns[VehicleNow] = {
     "mounting": lambda each: Cell(
         each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text"), each.why
     ),
+    "seen from, °": lambda each: "–" if each.history.compared is None else _smallest(each.history.compared),
     **columns_for(
         {f"{each.name}, {each.unit}": each for each in _ANGLES_AND_SCALE},
         lambda each, quantity: (
             "–"
             if each.mounting is None
             else with_std(
-                quantity.factor * values_of(each.mounting)[quantity.component],
+                quantity.factor * each.mounting.value[quantity.component],
                 quantity.factor * each.mounting.std[quantity.component],
             )
         ),
@@ -223,9 +234,9 @@ SPEEDS: Columns[VehicleSpeeds] = {
     **columns_for(
         {"lowest": -1, "highest": 0},
         lambda each, at: Cell(
-            f"{number(each.set_to / (1.0 + each.days[at].scale), 0)} m/s",
+            f"{number(each.set_to / (1.0 + each.days[at].value[SCALE]), 0)} m/s",
             "",
-            f"{with_std(100.0 * each.days[at].scale, 100.0 * each.days[at].std[SCALE])} %, "
+            f"{with_std(100.0 * each.days[at].value[SCALE], 100.0 * each.days[at].std[SCALE])} %, "
             f"{date(each.days[at].first_ns)[:10]}",
         ),
     ),

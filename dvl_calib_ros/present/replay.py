@@ -19,7 +19,7 @@ from ..calibration.numerics.frames import rpy_from_rotation
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.results.mounting_quantities import not_shown, quantities
 from ..calibration.results.results import Result, Verification
-from ..files.result_file import mounting_found, result_document
+from ..files.result_file import result_document
 from ..files.urdf import origin_tag
 from ..verdict.kinds import Severity
 from .document import (
@@ -272,7 +272,7 @@ def _mounting(run: Replayed) -> Iterator[Item]:
             "" if each.shown else "not shown by this data",
             each.shown,
         )
-        for each in mounting_found(run.result)
+        for each in quantities(run.result)
     ]
     yield Numbers(numbers)
     if not MODELS[run.result.selected].aided:

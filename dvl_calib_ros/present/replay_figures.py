@@ -24,10 +24,9 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from ..bag_replay.replay import Replayed
 from ..calibration.assessment.dead_reckoning import Navigation
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.error_model import corrected_mounting
-from ..calibration.numerics.frames import Array, rotation_from_rpy, rotation_of, rpy_from_rotation, turn_between
+from ..calibration.numerics.frames import Array, rotation_from_rpy, rotation_of, turn_between
 from ..calibration.results.mounting_quantities import quantities
-from ..calibration.results.results import Result, rpy_std
+from ..calibration.results.results import Result, corrected_rpy, rpy_std
 from .figure_data import MapTrack, TimeAxis, running_mean, thin
 from .figure_style import (
     FAINT,
@@ -380,16 +379,13 @@ def calibration_figure(replayed: Replayed) -> Figure:
     if history is None:
         raise ValueError("a replay without history has nothing to draw")
     parameters = Parameters.from_mapping(result.parameters)
-    rotation = parameters.rotation_dvl_from_body
     first_ns = result.first_ns or 0
     model = history.models[result.selected]
     figure = NotebookFigure(figsize=(8.0, 5.6), layout="constrained")
     angles, errors = figure.subplots(2, 1, sharex=True)
     time = 1e-9 * (history.stamps_ns - first_ns)
     phi = model.state[:, :3]
-    turned = np.degrees([rpy_from_rotation(corrected_mounting(each, rotation)) for each in phi])
-    turned -= np.degrees(parameters.mounting_rpy)
-    turned = (turned + 180.0) % 360.0 - 180.0
+    turned = np.degrees([corrected_rpy(each, parameters) for each in phi]) - np.degrees(parameters.mounting_rpy)
     std = np.degrees([rpy_std(*each, parameters) for each in zip(phi, model.misalignment_covariance, strict=True)])
     settled = slice(int(_SETTLING * len(time)), None)
     for axis, found in enumerate(quantities(result)[:3]):  # whose σ is also of the next recording

@@ -7,20 +7,19 @@ from functools import partial
 
 from .kinds import Kind, Severity
 
-_SAME = (
-    "{count} calibrations differ by at most {apart:.2f}° about any axis (χ² {chi_square:.1f} of {freedom}, p {p:.2g})"
-)
 _COMPARISONS = (
     Kind(
         "MOUNTING_SAME",
-        "the same mounting within σ: " + _SAME,
-        "No pair differs by more than 2 σ.",
+        "no movement found; smaller than {smallest:.1f}° could not be seen ({angles}; {power:.0f} of 100 such "
+        "movements are found){unseen}",
+        "No quantity differs at 2 σ, corrected for the number of tests.",
         "",
         Severity.ACCEPT,
     ),
     Kind(
         "MOUNTING_SCATTERS",
-        "the calibrations differ, but no single date explains it: " + _SAME,
+        "the calibrations differ, but no single date explains it: {count} calibrations differ by at most {apart:.2f}° "
+        "in any angle (χ² {chi_square:.1f} of {freedom}, p {p:.2g})",
         "They scatter by more than their σ says; σ is too small, or the mounting moves all the time.",
         "",
         Severity.ACCEPT,
@@ -33,9 +32,16 @@ _COMPARISONS = (
         Severity.REJECT,
     ),
     Kind(
+        "MOUNTING_SUSPECTED",
+        "suspected move: {name} is rejected ({why}), and differs from {other} {moved}",
+        "A mounting that moved far is often rejected; σ of a rejected calibration does not hold.",
+        "inspect the mounting, and calibrate once more",
+        Severity.MARGINAL,
+    ),
+    Kind(
         "MOUNTING_SUSPICIOUS",
         "the mounting may have moved {moved} {between}; by chance alone so large a difference comes up in 1 of "
-        "{often:.0f} comparisons",
+        "{often:.3g} comparisons",
         "Between 2 and 4 σ.",
         "calibrate once more before you rely on either",
         Severity.MARGINAL,

@@ -1,17 +1,18 @@
-"""Calibrations of one DVL compared: what differs by more than its σ, and between which of them it changed.
+"""Test of whether the mounting moved between calibrations of one DVL.
 
-Every calibration is an estimate with a covariance, of other data than the others'. The difference of two has the sum of
-their covariances; d'S⁻¹d of it is chi-square distributed if nothing changed. Of a series in time the instant is looked
-for that parts it best into before and after, then within either part ("binary segmentation"; Scott and Knott, "A
-cluster analysis method for grouping means in the analysis of variance", 1974).
+Each quantity is tested by itself, in the axes of a URDF: the difference of two calibrations is normally distributed
+with the sum of their covariances. The p-values are corrected for the number of quantities by Holm, and for the number
+of instants by Bonferroni. A series in time is split at the most significant instant, and either part again ("binary
+segmentation"; Scott and Knott, "A cluster analysis method for grouping means in the analysis of variance", 1974).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from functools import cache, cached_property
+from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -20,49 +21,32 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...verdict.answering import Answering
 from ...verdict.kinds import Severity
-from ..numerics.frames import Array, rotation_of, rotation_vector
-from ..numerics.tests import chi2_sf
-from ..results.extrinsics import (
-    GROUPS,
-    LEVER_ARM,
-    MOUNTING,
-    N_AXES,
-    N_COMPONENTS,
-    ONLY_CLOCK,
-    ONLY_SCALE,
-    SCALE,
-    TIME_OFFSET,
-    TURN,
-    Extrinsics,
-)
+from ..numerics.frames import Array, near_angles
+from ..numerics.tests import chi2_sf, holm, normal_sf, smallest_found
+from ..results.extrinsics import ANGLES, GROUPS, MOUNTING, N_AXES, N_COMPONENTS, ONLY_CLOCK, ONLY_SCALE, Extrinsics
 
-# A difference that chance brings more seldom than this is none of chance, over all that is looked at together.
-CHANCE = 0.01
-# Of a mounting: as seldom as a normal error is beyond 4 σ it has moved, beyond 2 σ that is suspicious.
-MOVED, SUSPICIOUS = chi2_sf(16.0, 1), chi2_sf(4.0, 1)
+# False-alarm rates of one comparison, whatever its numbers of quantities and instants: a mounting has moved at the two-
+# sided 4 σ of a normal error and is suspicious at 2 σ; scale and delay have changed at 1 %.
+MOVED, SUSPICIOUS, CHANCE = normal_sf(4.0), normal_sf(2.0), 0.01
+# Share of movements as large as `Comparison.smallest` that are found
+POWER = 0.9
 
 _ALL = np.arange(N_COMPONENTS)
 
 
 class ChiSquare(NamedTuple):
-    """d'S⁻¹d, how many components it is of, and how often chance makes it as large; nan if there are none."""
+    """d'S⁻¹d, its degrees of freedom and its p-value; p is nan without any degree."""
 
     value: float
     freedom: int
     p: float
 
-    @staticmethod
-    def of(value: float, freedom: int) -> ChiSquare:
-        """With the probability."""
-        return ChiSquare(value, freedom, chi2_sf(value, freedom) if freedom else math.nan)
-
 
 @dataclass(frozen=True)
 class Difference:
-    """Second less first of two calibrations, each of one or of several together.
+    """Second less first of two calibrations, each of one recording or of several together.
 
-    value (8,), covariance (8, 8): of `extrinsics.COMPONENTS`; the turn (rad, body axes) takes the first mounting to the
-    second. compared (8,): what both have shown.
+    value (8,), covariance (8, 8): of `extrinsics.COMPONENTS`. compared (8,): observable in both.
     """
 
     first: Extrinsics
@@ -73,13 +57,13 @@ class Difference:
 
     @staticmethod
     def between(first: Extrinsics, second: Extrinsics) -> Difference:
-        """What takes the first to the second."""
-        (value,) = _values([second], first) - _values([first], first)
+        """Subtract the first from the second; the bias of one DVL cancels."""
         compared = first.shown & second.shown
         both = first.covariance + second.covariance
         if first.dvl and first.dvl == second.dvl:
             common = first.by_bias @ second.by_bias.T
             both = both - common - common.T
+        value = _near(second.value, first.value) - first.value
         covariance = np.where(np.outer(compared, compared), both, 0.0)
         return Difference(first, second, np.where(compared, value, np.nan), covariance, compared)
 
@@ -88,34 +72,32 @@ class Difference:
         """(8,), nan for what is not compared."""
         return np.where(self.compared, np.sqrt(np.diag(self.covariance)), np.nan)
 
-    def test(self, components: NDArray[np.intp] = _ALL) -> ChiSquare:
-        """Chi-square of some components together."""
+    @cached_property
+    def p(self) -> Array:
+        """(8,) two-sided p-values corrected for their number by Holm, nan for what is not compared."""
+        found = np.full(N_COMPONENTS, np.nan)
+        found[self.compared] = holm([normal_sf(each) for each in (self.value / self.std)[self.compared]])
+        return found
+
+    def chance(self, components: NDArray[np.intp] = _ALL) -> float:
+        """Return the smallest p-value of some components; 1 if none of them is compared."""
         at = components[self.compared[components]]
-        if not len(at):
-            return ChiSquare.of(0.0, 0)
+        return float(self.p[at].min()) if len(at) else 1.0
+
+    def chi_square(self, components: NDArray[np.intp]) -> ChiSquare:
+        """Test some components together."""
+        at = components[self.compared[components]]
         d = self.value[at]
-        return ChiSquare.of(float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d)), len(at))
-
-    def chance(self, components: NDArray[np.intp] = _ALL, together: ChiSquare | None = None) -> float:
-        """How often chance makes as much of some components: of all together, or of the one that stands out most.
-
-        Both, as one angle that moved is little among five that did not; by Bonferroni. 1 if there are none.
-        together: their `test`, where that is known.
-        """
-        at = components[self.compared[components]]
-        if not len(at):
-            return 1.0
-        p = (together or self.test(at)).p
-        if len(at) == 1:
-            return p
-        one = chi2_sf(float(((self.value / self.std)[at] ** 2).max()), 1)
-        return min(1.0, 2.0 * min(p, len(at) * one))
+        value = float(d @ np.linalg.solve(self.covariance[np.ix_(at, at)], d))
+        return ChiSquare(value, len(at), chi2_sf(value, len(at)) if len(at) else math.nan)
 
 
 @dataclass(frozen=True)
 class Change:
-    """Between two neighbours in time. before, after: all up to the next change, taken together, whose difference it is.
-    last_before, first_after: the neighbours."""
+    """Difference between the calibrations before and after an instant, each taken together up to the next change.
+
+    last_before, first_after: the neighbours of the instant.
+    """
 
     difference: Difference
     last_before: Extrinsics
@@ -123,7 +105,7 @@ class Change:
 
 
 class ComparisonAnswer(NamedTuple):
-    """What comes of a comparison's word. severity: as of a verdict, which colours it. exit_code: of the command."""
+    """Consequences of a comparison's word: the severity that colours it, the exit code of the command."""
 
     severity: Severity
     exit_code: int
@@ -140,48 +122,60 @@ ANSWERS = {
 class Comparison(Answering):
     """Several calibrations of one DVL.
 
-    calibrations: in order of time. pairs: every two. against_rest: each against all others taken together; empty for
-    two. moved, suspicious: where the mounting (turn and lever arm) changed by more than 4 σ, and by 2 to 4 σ.
-    scale_changed, clock_changed: where scale and delay did. scatter: of all about what is common between the changes of
-    the mounting.
+    Parameters
+    ----------
+    calibrations
+        In order of time.
+    pairs
+        Every two.
+    moved, suspicious
+        Changes of angles or lever arm at 4 σ, and at 2 to 4 σ.
+    suspected
+        Rejected calibrations that differ from the accepted one next to them.
+    scale_changed, clock_changed
+        Changes of scale and delay.
+    scatter
+        Of the mountings about the mean of each stretch between changes.
+    smallest
+        (3,) rad: movement of roll, pitch and yaw that is found with `POWER` at any instant; nan if not compared.
     """
 
     calibrations: tuple[Extrinsics, ...]
     pairs: tuple[Difference, ...]
-    against_rest: tuple[Difference, ...]
     moved: tuple[Change, ...]
     suspicious: tuple[Change, ...]
+    suspected: tuple[Change, ...]
     scale_changed: tuple[Change, ...]
     clock_changed: tuple[Change, ...]
     scatter: ChiSquare
+    smallest: Array
 
     @property
-    def word(self) -> str:
+    def verdict(self) -> str:
         """The answer: moved, suspicious or same."""
-        return "moved" if self.moved else "suspicious" if self.suspicious else "same"
+        return "moved" if self.moved else "suspicious" if self.suspicious or self.suspected else "same"
+
+    word = verdict
 
     @property
     def answer(self) -> ComparisonAnswer:
-        """What comes of the word."""
-        return ANSWERS[self.word]
+        """Severity and exit code of the verdict."""
+        return ANSWERS[self.verdict]
 
     @property
     def contradicting(self) -> tuple[Change, ...]:
-        """Changes of the mounting by which one average of all is the mounting of none: by a limit of its own, as an
-        average of two mountings does more harm than a warning."""
-        surely = CHANCE / (len(self.calibrations) - 1)
-        return tuple(each for each in (*self.moved, *self.suspicious) if each.difference.chance(MOUNTING) < surely)
+        """Changes of the mounting at 1 %: averaging across one gives the mounting of none, worse than a warning."""
+        level = CHANCE / (len(self.calibrations) - 1)
+        return tuple(each for each in (*self.moved, *self.suspicious) if each.difference.chance(MOUNTING) < level)
 
     @property
     def same_mounting(self) -> bool:
-        """Whether nothing says that the mounting moved, nor makes it suspicious."""
-        return self.word == "same"
+        """Whether no movement is found or suspected."""
+        return self.verdict == "same"
 
 
 def contradicts(found: Extrinsics, initial: Extrinsics) -> Difference | None:
-    """What takes an initial calibration to one of other data, where that is no chance; None where they agree."""
-    if not (initial.shown[MOUNTING] & found.shown[MOUNTING]).any():
-        return None
+    """Return the difference of an initial calibration from one of other data at 1 %; None where they agree."""
     difference = Difference.between(initial, found)
     return difference if difference.chance(MOUNTING) < CHANCE else None
 
@@ -197,40 +191,48 @@ def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
 
 
 def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
-    """Compare two calibrations and more. Raises InputError if there is nothing that two of them have shown."""
+    """Compare two calibrations and more. Raises InputError without an angle that is observable in two of them.
+
+    Rejected calibrations take no part in the tests of accepted ones, and alone are suspicious at most: their σ does not
+    hold.
+    """
     if len(calibrations) < 2:
         name = calibrations[0].name if calibrations else "nothing"
         raise InputError(f"{name}: one alone cannot be compared; name two")
     ordered = sorted(calibrations, key=lambda each: each.first_ns)  # stable: of equal ones as they are given
-    n = len(ordered)
-    pairs = [Difference.between(ordered[i], ordered[j]) for i in range(n) for j in range(i + 1, n)]
+    ordered = [replace(each, value=_near(each.value, ordered[0].value)) for each in ordered]
+    pairs = [Difference.between(*two) for two in combinations(ordered, 2)]
     if not any(pair.compared[MOUNTING].any() for pair in pairs):
         raise InputError(
             f"{', '.join(each.name for each in ordered)}: no angle that two of them have shown, so there is nothing to "
             "compare; calibrate on more data (dvl-calib doctor says what is missing)"
         )
-    rest = [Difference.between(fused(ordered[:i] + ordered[i + 1 :]), ordered[i]) for i in range(n)] if n > 2 else []
-    together, chance = _Together(), CHANCE / (n - 1)
-    changes = _changes(ordered, MOUNTING, SUSPICIOUS / (n - 1), together)
-    moved = [change for change in changes if change.difference.chance(MOUNTING) < MOVED / (n - 1)]
+    accepted = [each for each in ordered if not each.rejected]
+    series = accepted or ordered
+    instants = max(len(series) - 1, 1)
+    together = cache(fused)
+    changes = _changes(series, MOUNTING, SUSPICIOUS / instants, together)
+    sure = [change for change in changes if change.difference.chance(MOUNTING) < MOVED / instants]
+    moved = sure if accepted else []
     return Comparison(
         calibrations=tuple(ordered),
         pairs=tuple(pairs),
-        against_rest=tuple(rest),
         moved=tuple(moved),
         suspicious=tuple(change for change in changes if change not in moved),
-        scale_changed=tuple(_changes(ordered, ONLY_SCALE, chance, together)),
-        clock_changed=tuple(_changes(ordered, ONLY_CLOCK, chance, together)),
-        scatter=_scatter(ordered, [change.first_after for change in moved], together),
+        suspected=tuple(_suspected(series, [each for each in ordered if each not in series])),
+        scale_changed=tuple(_changes(series, ONLY_SCALE, CHANCE / instants, together)),
+        clock_changed=tuple(_changes(series, ONLY_CLOCK, CHANCE / instants, together)),
+        scatter=_scatter(series, [change.first_after for change in sure], together),
+        smallest=_smallest([change.difference for change in _splits(series, together)] or pairs),
     )
 
 
 def fused(several: Sequence[Extrinsics]) -> Extrinsics:
-    """What several calibrations of one and the same say together: weighted by their information.
+    """Average calibrations of one mounting, weighted by their information.
 
     Mounting, scale and delay each for themselves, by their marginal covariances: speed of sound and clocks change from
     day to day, and what is forced to be common where it is not would bend the others. The bias of one DVL is common to
-    all, so it does not average out: it is a state beside the others, and what is left of it is left in the result.
+    all and does not average out: it is a state, and its remaining σ is part of the result.
     """
     if len(several) == 1:
         return several[0]
@@ -238,37 +240,28 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     if any(not each.dvl or each.dvl != base.dvl for each in several):
         several = [replace(each, dvl="", by_bias=np.zeros_like(each.by_bias)) for each in several]
     shown = np.any([each.shown for each in several], axis=0)
-    found, by_bias = np.zeros(N_COMPONENTS), np.zeros((N_COMPONENTS, N_AXES))
-    of_groups: list[Array] = []
-    values = _values(several, base)
+    values = np.array([_near(each.value, base.value) for each in several])
+    found, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: as the first assumes it
+    covariance = np.zeros((N_COMPONENTS, N_COMPONENTS))
     own, columns = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
     information, vector = own.sum(axis=0), np.einsum("nij,nj->i", own, values)
     turned = own @ columns
-    groups = [group[shown[group]] for group in GROUPS]
-    for index in groups:
-        # with a bias of σ 1 as a state beside them
+    for index in (group[shown[group]] for group in GROUPS):
+        # with a bias of σ 1 as a further state
         across = turned[:, index].sum(axis=0)
         of_bias = np.eye(N_AXES) + np.einsum("nia,nib->ab", columns[:, index], turned[:, index])
         of_vector = np.einsum("nia,ni->a", turned[:, index], values[:, index])
         share = across @ np.linalg.inv(of_bias)
         p = np.linalg.inv(information[np.ix_(index, index)] - share @ across.T)
         found[index], by_bias[index] = p @ (vector[index] - share @ of_vector), p @ share
-        of_groups.append(p)
-    covariance = by_bias @ by_bias.T
-    for index, p in zip(groups, of_groups, strict=True):
-        covariance[np.ix_(index, index)] = p
-    # what nobody has shown stays as the first assumes it
-    found = np.where(shown, found, values[0])
+        covariance[np.ix_(index, index)] = p - by_bias[index] @ by_bias[index].T
     return replace(
         base,
         name=f"{len(several)} together",
         model=" ".join(dict.fromkeys(each.model for each in several)),
         last_ns=max(each.last_ns for each in several),
-        rotation_body_from_dvl=rotation_of(found[TURN]) @ base.rotation_body_from_dvl,
-        lever_arm=found[LEVER_ARM],
-        scale=float(found[SCALE]),
-        time_offset=float(found[TIME_OFFSET]),
-        covariance=covariance,
+        value=found,
+        covariance=covariance + by_bias @ by_bias.T,
         shown=shown,
         dvl=several[0].dvl,
         by_bias=by_bias,
@@ -277,59 +270,63 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     )
 
 
-class _Together:
-    """`fused`, remembering what several gave: stretches of one series are asked for again and again."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[int, ...], Extrinsics] = {}
-
-    def __call__(self, several: Sequence[Extrinsics]) -> Extrinsics:
-        """Of some of one series, which lives as long as this."""
-        key = tuple(map(id, several))
-        if key not in self._known:
-            self._known[key] = fused(several)
-        return self._known[key]
+_Together = Callable[[tuple[Extrinsics, ...]], Extrinsics]
 
 
-def _values(several: Sequence[Extrinsics], base: Extrinsics) -> Array:
-    """(N, 8) components, the turn being that from the mounting of `base`."""
-    values = np.array([each.components for each in several])
-    x, y, z, w = base.components[:4].tolist()
-    # quaternions times the conjugate of that of base
-    back = np.array([[w, -z, y, -x], [z, w, -x, -y], [-y, x, w, -z], [x, y, z, w]])
-    return np.concatenate([rotation_vector(values[:, :4] @ back.T), values[:, 4:]], axis=1)
+def _near(value: Array, base: Array) -> Array:
+    """Return components (8,) with angles within half a turn of those of `base`."""
+    return np.concatenate([near_angles(value[ANGLES], base[ANGLES]), value[ANGLES.stop :]])
+
+
+def _splits(series: Sequence[Extrinsics], together: _Together) -> list[Change]:
+    """Return the difference at every instant of a series in time."""
+    parts = ((together(tuple(series[:k])), together(tuple(series[k:]))) for k in range(1, len(series)))
+    return [Change(Difference.between(*two), *ends) for two, ends in zip(parts, pairwise(series), strict=True)]
 
 
 def _changes(
-    series: list[Extrinsics], components: NDArray[np.intp], chance: float, together: _Together
+    series: Sequence[Extrinsics], components: NDArray[np.intp], level: float, together: _Together
 ) -> list[Change]:
-    """Where some components of a series in time change, in order of time."""
-    best, at = None, 0
-    for k in range(1, len(series)):
-        difference = Difference.between(together(series[:k]), together(series[k:]))
-        # by how surprising it is: where few components are compared, a smaller sum is as much. Beyond what a double
-        # holds as a probability the sum itself decides
-        test = difference.test(components)
-        surprise = difference.chance(components, test), -test.value
-        if surprise[0] < chance and (best is None or surprise < best):
-            best, found, at = surprise, difference, k
-    if best is None:
+    """Find changes of some components of a series, in order of time."""
+
+    def surprise(change: Change) -> tuple[float, float]:  # beyond what a double holds as a probability by the ratio
+        ratio = np.abs(change.difference.value / change.difference.std)[components]
+        return change.difference.chance(components), -float(np.nan_to_num(ratio).max())
+
+    splits = _splits(series, together)
+    best = min(splits, key=surprise, default=None)
+    if best is None or best.difference.chance(components) >= level:
         return []
-    change = Change(found, series[at - 1], series[at])
-    before, after = (_changes(part, components, chance, together) for part in (series[:at], series[at:]))
-    return [*before, change, *after]
+    at = series.index(best.first_after)
+    before, after = (_changes(part, components, level, together) for part in (series[:at], series[at:]))
+    return [*before, best, *after]
 
 
-def _scatter(series: list[Extrinsics], starts: list[Extrinsics], together: _Together) -> ChiSquare:
-    """Of the mountings about what is common to each stretch between changes."""
-    total, freedom = 0.0, 0
-    stretches: list[list[Extrinsics]] = [[]]
-    for each in series:
-        if any(each is start for start in starts):
-            stretches.append([])
-        stretches[-1].append(each)
-    for stretch in stretches:
-        for k in range(1, len(stretch)):  # each against those before it: independent terms, the same sum
-            test = Difference.between(together(stretch[:k]), stretch[k]).test(MOUNTING)
+def _suspected(series: Sequence[Extrinsics], rejected: Sequence[Extrinsics]) -> list[Change]:
+    """Hold each rejected calibration against the accepted one next to it in time."""
+    found = []
+    for each in rejected:
+        nearest = min(series, key=lambda other: abs(other.first_ns - each.first_ns))
+        first, second = sorted((nearest, each), key=lambda one: one.first_ns)
+        found.append(Change(Difference.between(first, second), first, second))
+    return [each for each in found if each.difference.chance(MOUNTING) < SUSPICIOUS / len(rejected)]
+
+
+def _smallest(differences: Sequence[Difference]) -> Array:
+    """Return the movement (3,) rad of each angle that is found with `POWER` in the least certain difference."""
+    found = np.full(N_AXES, np.nan)
+    for each in differences:
+        level = SUSPICIOUS / (len(differences) * max(int(each.compared.sum()), 1))
+        found = np.fmax(found, smallest_found(level, POWER) * each.std[ANGLES])
+    return found
+
+
+def _scatter(series: Sequence[Extrinsics], starts: Sequence[Extrinsics], together: _Together) -> ChiSquare:
+    """Test the mountings about the mean of each stretch that begins at one of `starts`."""
+    total, freedom, begin = 0.0, 0, 0
+    for k, each in enumerate(series):
+        begin = k if each in starts else begin
+        if k > begin:  # each against those before it: independent terms, the same sum
+            test = Difference.between(together(tuple(series[begin:k])), each).chi_square(MOUNTING)
             total, freedom = total + test.value, freedom + test.freedom
-    return ChiSquare.of(total, freedom)
+    return ChiSquare(total, freedom, chi2_sf(total, freedom) if freedom else math.nan)

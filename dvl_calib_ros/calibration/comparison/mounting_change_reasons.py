@@ -1,4 +1,4 @@
-"""What there is to say of calibrations compared: reasons, remarks, and plain data."""
+"""Wording of a comparison of calibrations: reasons, remarks, and plain data."""
 
 from __future__ import annotations
 
@@ -8,23 +8,22 @@ from typing import Any
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..numerics.frames import rpy_from_rotation
-from ..results.extrinsics import COMPONENTS, LEVER_ARM, MOUNTING, ONLY_CLOCK, ONLY_SCALE, SCALE, TIME_OFFSET, TURN
+from ..numerics.frames import Array
+from ..results.extrinsics import ANGLES, COMPONENTS, LEVER_ARM, MOUNTING, SCALE, TIME_OFFSET
 from ..results.mounting_quantities import date
-from .mounting_change import CHANCE, Change, Comparison, Difference
+from .mounting_change import CHANCE, POWER, SUSPICIOUS, Change, Comparison, Difference
 
-# An axis that takes more than this share of a turn is the one that it is about.
-ABOUT = 0.9
-# What a vehicle's builder would not have let pass unseen, m: a lever arm taken as known that is off by more turns the
+# A vehicle's builder would see a lever arm that is off by more, m. One that is configured wrongly by as much turns the
 # yaw by tenths of a degree.
-ARM_MATTERS = 0.3
+ARM_MATTERS_M = 0.3
+_ANGLE_NAMES = COMPONENTS[ANGLES]
 
 
 def reasons(comparison: Comparison) -> list[Reason]:
-    """What there is to say, the mounting first."""
-    said = [moved(change) for change in comparison.moved]
-    said = said + [suspicious(change) for change in comparison.suspicious] or [_same(comparison)]
-    said += [scale_changed(change) for change in comparison.scale_changed]
+    """Say what is found, the mounting first."""
+    said = [*map(moved, comparison.moved), *map(suspicious, comparison.suspicious)]
+    said = [*said, *map(suspected, comparison.suspected)] or [_same(comparison)]
+    said += map(scale_changed, comparison.scale_changed)
     for change in comparison.clock_changed:
         seconds, std = float(change.difference.value[TIME_OFFSET]), float(change.difference.std[TIME_OFFSET])
         way = "later" if seconds > 0.0 else "earlier"
@@ -37,39 +36,52 @@ def reasons(comparison: Comparison) -> list[Reason]:
 
 
 def _same(comparison: Comparison) -> Reason:
-    pairs = [pair for pair in comparison.pairs if pair.compared[TURN].any()]
-    apart = max((float(np.nanmax(np.abs(pair.value[TURN]))) for pair in pairs), default=0.0)
+    """Say how small a movement could not be seen, or that no single date explains the differences."""
     scatter = comparison.scatter
+    if scatter.freedom and scatter.p < CHANCE:
+        apart = max(float(np.nanmax(np.abs(pair.value[ANGLES]), initial=0.0)) for pair in comparison.pairs)
+        numbers = {"chi_square": scatter.value, "freedom": scatter.freedom, "p": scatter.p}
+        return finding("MOUNTING_SCATTERS", count=len(comparison.calibrations), apart=math.degrees(apart), **numbers)
+    smallest = np.degrees(comparison.smallest)
+    seen = [f"{name} {each:.1f}°" for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if not math.isnan(each)]
+    unseen = [name for name, each in zip(_ANGLE_NAMES, smallest, strict=True) if math.isnan(each)]
     return finding(
-        "MOUNTING_SCATTERS" if scatter.freedom and scatter.p < CHANCE else "MOUNTING_SAME",
-        count=len(comparison.calibrations),
-        apart=math.degrees(apart),
-        chi_square=scatter.value,
-        freedom=scatter.freedom,
-        p=scatter.p,
+        "MOUNTING_SAME",
+        smallest=float(np.nanmax(smallest, initial=0.0)),
+        angles=", ".join(seen),
+        power=100.0 * POWER,
+        unseen=f"; {' and '.join(unseen)} cannot be compared" if unseen else "",
     )
 
 
 def moved(change: Change) -> Reason:
-    """Of a mounting that moved."""
+    """Word a movement."""
     return finding("MOUNTING_MOVED", moved=moved_in_words(change.difference), between=between(change))
 
 
 def suspicious(change: Change) -> Reason:
-    """Of a mounting that may have moved."""
+    """Word a possible movement."""
     often = 1.0 / change.difference.chance(MOUNTING)
     words = moved_in_words(change.difference)
     return finding("MOUNTING_SUSPICIOUS", moved=words, between=between(change), often=often)
 
 
+def suspected(change: Change) -> Reason:
+    """Word a rejected calibration that differs from an accepted one."""
+    rejected = change.first_after if change.first_after.rejected else change.last_before
+    other = change.last_before if rejected is change.first_after else change.first_after
+    words = moved_in_words(change.difference)
+    return finding("MOUNTING_SUSPECTED", name=rejected.name, other=other.name, moved=words, why=rejected.rejected)
+
+
 def scale_changed(change: Change) -> Reason:
-    """Of a scale that changed."""
+    """Word a change of scale."""
     percent, std = (100.0 * float(each[SCALE]) for each in (change.difference.value, change.difference.std))
     return finding("SCALE_CHANGED", percent=percent, std=std, between=between(change))
 
 
 def remarks(comparison: Comparison) -> list[Reason]:
-    """What makes the differences worth less than they look."""
+    """Say what makes differences less reliable than their σ."""
     found = [
         finding("CALIBRATION_DOUBTED", name=each.name, remark=remark)
         for each in comparison.calibrations
@@ -82,9 +94,11 @@ def remarks(comparison: Comparison) -> list[Reason]:
     known = [each for each in comparison.calibrations if each.shown[LEVER_ARM].any()]
     for each in assumed:
         for other in (*known, *assumed):
-            off = np.where(other.shown[LEVER_ARM] | (other not in known), other.lever_arm - each.lever_arm, 0.0)
-            if float(np.linalg.norm(off)) > ARM_MATTERS:
-                arm = ", ".join(f"{value:.2f}" for value in other.lever_arm)
+            off = np.where(
+                other.shown[LEVER_ARM] | (other not in known), other.value[LEVER_ARM] - each.value[LEVER_ARM], 0.0
+            )
+            if float(np.linalg.norm(off)) > ARM_MATTERS_M:
+                arm = ", ".join(f"{value:.2f}" for value in other.value[LEVER_ARM])
                 verb = "finds" if other in known else "assumes"
                 found.append(finding("ARMS_DIFFER", name=each.name, other=other.name, verb=verb, arm=arm))
                 break
@@ -92,40 +106,18 @@ def remarks(comparison: Comparison) -> list[Reason]:
 
 
 def moved_in_words(difference: Difference) -> str:
-    """By how much a mounting moved, such as ``by 0.70° ± 0.05° about z``."""
-    turn, arm = difference.test(MOUNTING[TURN]), difference.test(MOUNTING[LEVER_ARM])
+    """Word the significant parts of a movement, such as ``in yaw by +0.70° ± 0.05°``; else the most significant one."""
+    p = np.where(difference.compared, difference.p, 1.0)[MOUNTING]
     parts = []
-    if turn.freedom and (turn.p < CHANCE or not arm.p < CHANCE):
-        parts.append(f"by {turn_in_words(difference)}")
-    if arm.freedom and (arm.p < CHANCE or not parts):
-        found = ((axis, difference.value[LEVER_ARM][i], difference.std[LEVER_ARM][i]) for i, axis in enumerate("xyz"))
-        shown = (f"{axis} {value:+.2f} m ± {std:.2f} m" for axis, value, std in found if std == std)
-        parts.append(f"in its place (lever arm {', '.join(shown)})")
-    return " and ".join(parts)
-
-
-def turn_in_words(difference: Difference) -> str:
-    """Size, σ and axis of a turn, such as ``0.70° ± 0.05° about z``."""
-    turn = np.where(difference.compared[TURN], difference.value[TURN], 0.0)
-    angle = float(np.linalg.norm(turn))
-    if angle == 0.0:
-        return "0.00°"
-    axis = turn / angle
-    std = math.sqrt(float(axis @ difference.covariance[TURN, TURN] @ axis))
-    size = f"{math.degrees(angle):.2f}° ± {math.degrees(std):.2f}°"
-    most = int(np.argmax(np.abs(axis)))
-    if abs(axis[most]) > ABOUT:
-        return f"{'-' if axis[most] < 0.0 else ''}{size} about {'xyz'[most]}"
-    each = (
-        f"{name} {math.degrees(value):+.2f}°"
-        for name, value, known in zip("xyz", turn, difference.compared[TURN], strict=True)
-        if known
-    )
-    return f"{size} ({', '.join(each)})"
+    for at in np.flatnonzero((p < SUSPICIOUS) | (np.arange(len(p)) == p.argmin())):
+        unit, factor = ("°", math.degrees(1.0)) if at < ANGLES.stop else (" m", 1.0)
+        value, std = factor * difference.value[at], factor * difference.std[at]
+        parts.append(f"{COMPONENTS[at].replace('_', ' ')} by {value:+.2f}{unit} ± {std:.2f}{unit}")
+    return f"in {' and '.join(parts)}"
 
 
 def between(change: Change) -> str:
-    """Between which calibrations, such as ``between 2025-06-16 16:06 (a) and 2025-06-17 15:06 (b)``."""
+    """Name the calibrations around a change, such as ``between 2025-06-16 16:06 (a) and 2025-06-17 15:06 (b)``."""
     before, after = change.last_before, change.first_after
     if before.last_ns > after.first_ns:  # simulated, or stamped from a start of their own
         return f"between {before.name} and {after.name}"
@@ -133,7 +125,7 @@ def between(change: Change) -> str:
 
 
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
-    """`compare --json`: SI units, turns about the body's axes."""
+    """Return plain data for `compare --json`, in SI units."""
     said, remarked = reasons(comparison), remarks(comparison)
     return {
         "verdict": comparison.word,
@@ -142,34 +134,21 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
         "remarks": [str(each) for each in remarked],
         "findings": [each.as_dict() for each in (*said, *remarked)],
         "calibrations": [
-            {
-                "name": each.name,
-                "model": each.model,
-                "first_ns": each.first_ns,
-                "last_ns": each.last_ns,
-                "used": each.used,
-                "mounting_rpy": rpy_from_rotation(each.rotation_body_from_dvl).tolist(),
-                "lever_arm": each.lever_arm.tolist(),
-                "scale": each.scale,
-                "dvl_time_offset": each.time_offset,
-                "std": dict(zip(COMPONENTS, each.std.tolist(), strict=True)),
-            }
+            {name: getattr(each, name) for name in ("name", "model", "first_ns", "last_ns", "used", "rejected")}
+            | {"value": _named(each.value), "std": _named(each.std)}
             for each in comparison.calibrations
         ],
         "pairs": [_difference_document(each) for each in comparison.pairs],
-        "against_rest": [_difference_document(each) for each in comparison.against_rest],
         **{
             name: [
-                {
-                    "last_before": change.last_before.name,
-                    "first_after": change.first_after.name,
-                    **_difference_document(change.difference),
-                }
+                {"last_before": change.last_before.name, "first_after": change.first_after.name}
+                | _difference_document(change.difference)
                 for change in getattr(comparison, name)
             ]
-            for name in ("moved", "suspicious", "scale_changed", "clock_changed")
+            for name in ("moved", "suspicious", "suspected", "scale_changed", "clock_changed")
         },
         "scatter": comparison.scatter._asdict(),
+        "smallest_seen": {"power": POWER} | dict(zip(_ANGLE_NAMES, comparison.smallest.tolist(), strict=True)),
     }
 
 
@@ -177,12 +156,11 @@ def _difference_document(difference: Difference) -> dict[str, Any]:
     return {
         "first": difference.first.name,
         "second": difference.second.name,
-        "value": dict(zip(COMPONENTS, difference.value.tolist(), strict=True)),
-        "std": dict(zip(COMPONENTS, difference.std.tolist(), strict=True)),
-        "chi_square": {
-            "mounting": difference.test(MOUNTING)._asdict(),
-            "scale": difference.test(ONLY_SCALE)._asdict(),
-            "clock": difference.test(ONLY_CLOCK)._asdict(),
-            "all": difference.test()._asdict(),
-        },
+        "value": _named(difference.value),
+        "std": _named(difference.std),
+        "p": _named(difference.p),
     }
+
+
+def _named(values: Array) -> dict[str, float]:
+    return dict(zip(COMPONENTS, values.tolist(), strict=True))

@@ -99,6 +99,12 @@ def rpy_from_rotation(rotation: ArrayLike) -> Array:
     return np.array([math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
 
 
+def near_angles(angles: ArrayLike, nominal: ArrayLike) -> Array:
+    """Unwrap angles (...) rad to within half a turn of nominal ones."""
+    angles = np.asarray(angles, dtype=float)
+    return angles - 2.0 * np.pi * np.round((angles - nominal) / (2.0 * np.pi))
+
+
 def over_ground(speed: ArrayLike, course: ArrayLike) -> Array:
     """East, north, up (..., 3) m/s of a speed (...) and a course (...) rad, from true north, clockwise.
 

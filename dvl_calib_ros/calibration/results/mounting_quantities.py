@@ -10,9 +10,8 @@ import numpy as np
 from ..filters.observability import OBSERVED_SHARE
 from ..models import MODELS
 from ..models.parameters import Parameters
-from ..numerics.frames import rpy_from_rotation
 from ..numerics.kalman import GaussianState
-from .results import Result, rpy_std, scale_and_delay
+from .results import Result, corrected_rpy, rpy_std, scale_and_delay
 
 
 class Quantity(NamedTuple):
@@ -33,11 +32,12 @@ class Quantity(NamedTuple):
 def quantities(result: Result) -> list[Quantity]:
     """Roll, pitch, yaw of the DVL (°); of models that have them scale of motion ahead (%), lever arm (m), delay (s).
 
-    Angles are those of a URDF's origin. One that no motion has told from what is known without data is not shown.
+    Angles are those of a URDF's origin, within half a turn of the configured ones. One that no motion has told from
+    what is known without data is not shown.
     """
     estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
     nominal = np.degrees(parameters.mounting_rpy)
-    corrected = np.degrees(rpy_from_rotation(estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)))
+    corrected = np.degrees(corrected_rpy(estimate.misalignment, parameters))
     std = np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))
     unknown = OBSERVED_SHARE * np.degrees(parameters.initial_std_misalignment)
     unseen = {entry.axis for entry in estimate.observability if not entry.observed}

@@ -17,7 +17,7 @@ from ..filters.observability import Convergence, Observability, observability, s
 from ..models import MODELS, Model
 from ..models.parameters import FROM_REFERENCE, TOLD, UNKNOWN, Parameters
 from ..numerics.error_model import correct, corrected_mounting
-from ..numerics.frames import FLU_FROM_FRD, Array, rpy_from_rotation
+from ..numerics.frames import FLU_FROM_FRD, Array, near_angles, rpy_from_rotation
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Mask
 from .velocity_correction import NOT_ESTIMATED, lever_arm
@@ -321,23 +321,31 @@ def mounting_pose(model: Model, state: GaussianState, parameters: Parameters, tu
 _SMALL_TURN = 1e-5
 
 
+def corrected_rpy(misalignment: Array, parameters: Parameters) -> Array:
+    """Return roll, pitch, yaw (3,) rad of the corrected mounting, within half a turn of the configured ones.
+
+    misalignment: φ (3,) rad, DVL frame.
+    """
+    corrected = corrected_mounting(misalignment, parameters.rotation_dvl_from_body)
+    return near_angles(rpy_from_rotation(corrected), parameters.mounting_rpy)
+
+
+def rpy_jacobian(misalignment: Array, parameters: Parameters) -> Array:
+    """Differentiate roll, pitch, yaw of the corrected mounting by the misalignment φ (3,): (3, 3)."""
+    up, down = (
+        np.array([corrected_rpy(misalignment + way * each, parameters) for each in _SMALL_TURN * np.eye(3)])
+        for way in (1.0, -1.0)
+    )
+    return near_angles(up - down, 0.0).T / (2.0 * _SMALL_TURN)
+
+
 def rpy_std(misalignment: Array, covariance: Array, parameters: Parameters) -> Array:
-    """Standard deviations (3,) rad of roll, pitch, yaw of the corrected mounting, as a URDF's origin has them.
+    """Return standard deviations (3,) rad of roll, pitch, yaw of the corrected mounting, as a URDF's origin has them.
 
     Not those of turns about the body's axes: of a DVL at 45 degrees, a roll of the body that the motion does not show
-    is as much pitch as roll.
-
-    Parameters
-    ----------
-    misalignment: φ (3,) rad, DVL frame.
-    covariance: (n, n) of a model's state, which begins with φ.
-    parameters: Nominal mounting.
-
+    is as much pitch as roll. covariance: (n, n) of a model's state, which begins with φ.
     """
-    t = parameters.rotation_dvl_from_body
-    rpy = rpy_from_rotation(corrected_mounting(misalignment, t))
-    turned = [rpy_from_rotation(corrected_mounting(misalignment + each, t)) for each in _SMALL_TURN * np.eye(3)]
-    jacobian = np.array([(each - rpy + np.pi) % (2.0 * np.pi) - np.pi for each in turned]).T / _SMALL_TURN
+    jacobian = rpy_jacobian(misalignment, parameters)
     return np.sqrt(np.diag(jacobian @ covariance[:3, :3] @ jacobian.T))
 
 

@@ -24,10 +24,10 @@ from water_fixtures import SALINITY, TEMPERATURE, USED, with_water
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.checks.speed_of_sound import speed_of_sound
-from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.comparison.mounting_change import compare
 from dvl_calib_ros.fleet_catalogue import update as running
 from dvl_calib_ros.fleet_catalogue.parquet_parts import Catalogue
-from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued
+from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued, histories
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
 from dvl_calib_ros.present.comparison import QUANTITIES
 from dvl_calib_ros.present.comparison_figures import _draw
@@ -104,7 +104,7 @@ def test_the_day_on_which_a_mounting_moved_is_said(made):
     (change,) = by_name["auv1"].compared.moved
     assert (change.last_before.name, change.first_after.name) == ("dive1", "dive2")
     assert by_name["auv2"].compared is None
-    assert result.word == "moved" and "auv1: The mounting has moved by 3.0" in repr(result)
+    assert result.word == "moved" and "auv1: The mounting has moved in yaw by +3." in repr(result)
     page = result.page.read_text()
     assert page.count("<img") >= 3 and "no.mcap" in page
     assert ">Damaged" in page or " Damaged" in page  # a sentence, which wraps
@@ -117,13 +117,35 @@ def test_the_page_begins_with_who_needs_a_person_and_draws_an_inverted_dvl_witho
     table = fleet(replace(found, vehicles=(alone, moved))).tables["Vehicles"]
     assert [row[0] for row in table.rows] == [moved.name, "a_first"] and table.rows[1][3].below == "One day alone."
     for angles in ((179.9, -179.8), (-179.9, 179.7)):
-        turned = [
-            replace(each, rotation_body_from_dvl=rotation_from_rpy(np.radians([roll, 0.0, 0.0])))
-            for each, roll in zip(moved.compared.calibrations, angles, strict=False)
+        turned = [  # as of two DVLs
+            replace(
+                each,
+                dvl="",
+                value=np.radians([roll, *np.zeros(7)]),
+                shown=np.ones(8, dtype=bool),
+                covariance=1e-4 * np.eye(8),
+            )
+            for each, roll in zip(moved.compared.calibrations[:2], angles, strict=True)
         ]
         axes = new_figure()[1]
-        _draw(axes, replace(moved.compared, calibrations=tuple(turned)), QUANTITIES[0])
+        _draw(axes, compare(turned), QUANTITIES[0])
         assert np.ptp(axes.get_ylim()) < 20.0
+
+
+def test_a_rejected_recording_that_differs_from_accepted_ones_is_a_suspected_move(made):
+    (result, out), why = made, "the clock jumps"
+    entries = [Catalogued.of(part.recording, part.vehicle, Catalogue(out).rows_of(part.recording), part.extrinsics)
+               for part in Catalogue(out).parts() if part.vehicle == "auv1"]  # fmt: skip
+    entries = [
+        replace(each, extrinsics=replace(each.extrinsics, rejected=why * each.recording.endswith("dive2")))
+        for each in entries
+    ]
+    (vehicle,) = histories(entries)
+    assert len(vehicle.days) == 2 and vehicle.compared.verdict == "suspicious"
+    said = repr(replace(result, vehicles=(vehicle,)))
+    assert said.startswith("suspicious: auv1: Suspected move: dive2 is rejected (the clock")
+    (alone,) = histories([each for each in entries if not each.recording.endswith("dive1")])
+    assert len(alone.days) == 1 and alone.compared.verdict == "suspicious"  # nor is it "not compared"
 
 
 @pytest.mark.slow
