@@ -36,7 +36,7 @@ from ..recordings.recording import Recording, open_recording
 from ..recordings.requirements import check_topics, missing_imu
 from ..recordings.topics import Topics
 from ..verdict.kinds import Severity
-from ..verdict.reasons import Reason, finding
+from ..verdict.reasons import Reason, finding, of_consequence
 from ..version import __version__
 from .run_history import Recorder, RunHistory
 
@@ -173,14 +173,14 @@ def replay(
     ]
     if chosen.imu not in recording.types and result.counts["reference"]["received"]:
         of_all += [] if result.counts["pairing"]["paired"] else [finding("NOTHING_COMPARED")]
+    verifications = {
+        name: verification.with_objections([*of_all, *(of_drift if name == result.selected else [])])
+        for name, verification in result.verifications.items()
+    }
+    if judged and verifications[result.selected].verdict is Severity.ACCEPT:
+        found = of_consequence(found, calibrator.parameters.target_drift)
     return Replayed(
-        replace(
-            result,
-            verifications={
-                name: verification.with_objections([*of_all, *(of_drift if name == result.selected else [])])
-                for name, verification in result.verifications.items()
-            },
-        ),
+        replace(result, verifications=verifications),
         (*recording.notes, *events, *map(str, found)),
         tuple(found),
         decoder.dvl_frame or "dvl_link",

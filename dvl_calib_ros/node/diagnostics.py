@@ -29,7 +29,7 @@ from ..calibration.results.results import Estimate, scale_and_delay
 from ..calibration.streams.aligner import whereabouts
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
-from ..verdict.reasons import Reason, finding
+from ..verdict.reasons import Reason, finding, of_consequence
 from .operator_card import Card
 
 # A stream that has brought nothing usable for so long is silent, s.
@@ -175,6 +175,8 @@ def diagnose(
     verdict = Severity.REJECT if rejected else calibrator.verdict_so_far
     # what a replay rejects is an error here
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]
+    if verdict is Severity.ACCEPT:
+        found = of_consequence(found, calibrator.parameters.target_drift)
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
     status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
     status.message = "; ".join(map(str, found)) or f"{estimate.model} {estimate.convergence.value}"

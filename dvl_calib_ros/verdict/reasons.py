@@ -6,8 +6,9 @@ speak from them, so a sentence is mended in one place. Codes are stable: users s
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -114,6 +115,31 @@ def finding(code: str, **numbers: object) -> Reason:
 
 
 _CAUSES = ("FRAMES_AMBIGUOUS", "MOUNTING_CONTRADICTED", "TRAVELS_SIDEWAYS", "CONFIGURATION_WRONG", "GRAVITY_")
+
+
+def _clock_cost(numbers: Mapping[str, Any]) -> float:
+    return 1000.0 * math.radians(numbers["degrees"])
+
+
+# Drift on a straight leg, m per km, by ambiguities that σ includes; of deviations within twice their own σ none.
+# A bias of the DVL costs nothing at the speeds driven.
+_COST_OF_AMBIGUITY: Mapping[str, Callable[[Mapping[str, Any]], float]] = {
+    "CLOCK_ON_TURN": _clock_cost,
+    "CLOCK_OR_ARM": _clock_cost,
+    "HEADING_DEVIATION": lambda numbers: numbers["cost"] if numbers["rms"] > 2.0 * numbers["std"] else 0.0,
+    "ONE_SPEED": lambda _: 0.0,
+}
+
+
+def of_consequence(reasons: Iterable[Reason], target_m_per_km: float) -> list[Reason]:
+    """Leave out what an accepted calibration need not be warned of, as it costs less drift than the target."""
+    return [
+        each
+        for each in reasons
+        if each.severity is not Severity.WARNING
+        or each.code not in _COST_OF_AMBIGUITY
+        or _COST_OF_AMBIGUITY[each.code](each.numbers) > target_m_per_km
+    ]
 
 
 def is_cause(reason: Reason) -> bool:

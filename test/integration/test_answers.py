@@ -344,3 +344,21 @@ def test_on_a_circle_sigma_of_yaw_holds_clocks_that_are_late_together(tmp_path):
     off, std = run.mounting.rpy_deg[2] - truth["rpy_deg"][2], run.mounting.std_deg[2]
     assert 0.7 < abs(off) < 2.5 * std and std < 3.0
     assert {"CLOCK_ON_TURN", "CLOCK_OR_ARM"} & {each.code for each in run.findings}
+
+
+# Ten recordings of the random surveys without compass error, lasting noise, outliers and late clocks
+CLEAN = (51000, 51001, 51002, 51003, 51006, 51007, 51009, 51010, 51012, 51013)
+# What σ does not include: a driver that levels its velocities
+OF_CONSEQUENCE = {"TILT_NOT_SHOWN"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", CLEAN)
+def test_on_clean_recordings_nothing_is_warned_of_that_has_no_consequence(seed, tmp_path):
+    """Of these ten six were warned of one speed, which costs nothing at the speed driven and is in sigma."""
+    clean = {"compass": 0.0, "lasting": False, "outliers": 0.0, "transform": True, "dvl_late": 0.0}
+    write_survey(replace(draw(seed), **clean, reference_late=0.0), tmp_path / "bag")
+    run = dc.replay(tmp_path / "bag", history=False)
+    assert run.verdict == "accept"
+    assert {each.code for each in run.findings} - OF_CONSEQUENCE <= set()
+    assert not any("[ONE_SPEED]" in note for note in run.replayed.notes)

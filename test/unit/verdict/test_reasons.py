@@ -13,7 +13,7 @@ from conftest import ROOT
 from documentation import section
 
 from dvl_calib_ros.verdict.kinds import Kind, Severity
-from dvl_calib_ros.verdict.reasons import KINDS, TABLES, by_severity, finding, table
+from dvl_calib_ros.verdict.reasons import KINDS, TABLES, by_severity, finding, of_consequence, table
 
 PACKAGE = ROOT / "dvl_calib_ros"
 MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path.parent.name != "verdict"]
@@ -117,3 +117,20 @@ def test_a_reason_that_holds_another_says_its_sentence_and_gives_both_codes():
     assert written["numbers"] == {"says": late.sentence}
     assert [each["code"] for each in written["causes"]] == ["CLOCK_LATE"]
     assert written["causes"][0]["numbers"]["offset"] == 0.5
+
+
+def test_of_an_accepted_calibration_ambiguities_within_the_target_are_no_warnings():
+    """One of 0.0 degrees was, and a deviation of 0.3 ± 0.2 degrees."""
+    heading = {"course": "with time", "most": 0.3, "most_at": 0.0, "least": -0.3, "least_at": 90.0, "first": ""}
+    said = [
+        finding("CLOCK_ON_TURN", degrees=0.04),
+        finding("CLOCK_ON_TURN", degrees=0.6),
+        finding("CLOCK_OR_ARM", metres=0.1, degrees=0.004, seconds=0.1),
+        finding("HEADING_DEVIATION", rms=0.3, std=0.2, cost=5.2, **heading),
+        finding("HEADING_DEVIATION", rms=0.3, std=0.1, cost=5.2, **heading),
+        finding("HEADING_DEVIATION", rms=0.3, std=0.2, cost=5.2, **heading).weighed(Severity.MARGINAL),
+        finding("ONE_SPEED", off=0.02, degrees=0.8, percent=1.4),
+        finding("IMU_LEVEL"),
+    ]
+    kept = of_consequence(said, 2.0)
+    assert [said.index(each) for each in kept] == [1, 4, 5, 7]
