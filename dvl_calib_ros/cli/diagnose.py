@@ -3,7 +3,7 @@
 With --simulator: what a simulator's DVL lacks beside the vehicle's. One sentence with the answer comes first. Several
 bags must be of one vehicle; whole bags are then held out.
 
-Exit code 0: the data answer. 1: their answer is unknown. 2: bad usage or input.
+Exit code 0: the data answer. 1: their answer is unknown, or they cannot tell. 2: bad usage or input.
 """
 
 from __future__ import annotations
@@ -47,8 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Diagnose, print, save; 1 if the data show no cause."""
     if arguments.simulator:
-        run_against_simulator(arguments, DEFAULTS)
-        return 0
+        return run_against_simulator(arguments, DEFAULTS)
     check_without(arguments)
     from ..diagnosis.answer.compensation import compensated, parameter_file
     from ..diagnosis.answer.results import diagnosis_document
@@ -167,11 +166,11 @@ def check_without(arguments: argparse.Namespace) -> None:
             raise InputError(f"--{option.replace('_', '-')} works only with --simulator")
 
 
-def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> None:
-    """Compare, print, save."""
+def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> int:
+    """Compare, print, save; 1 if the recordings cannot tell."""
     from ..errors import InputError
     from ..present.result_documents import DOCUMENTS
-    from ..unpaired.results import unpaired_document
+    from ..unpaired.results import SimulatorVerdict, unpaired_document
     from ..unpaired.simulator_rounds import ClosedGap, against, check_rounds, closed_gap_document
 
     for option in NOT_WITH:
@@ -198,6 +197,7 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
         (arguments.json, lambda path: common.write_json(path, document)),
         (arguments.report, lambda path: write_report(path, found)),
     )
+    return int(found.verdict is SimulatorVerdict.CANNOT_TELL)
 
 
 def _source(

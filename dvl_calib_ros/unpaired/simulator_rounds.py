@@ -33,7 +33,7 @@ from ..verdict.reasons import Reason, finding
 from .both_sides import RecordedSide, read_log
 from .comparison import compare, compare_logs
 from .gap_ladder import is_of_every_run
-from .results import ComparedEffect, Triple, UnpairedComparison, unpaired_document
+from .results import ComparedEffect, SimulatorVerdict, Triple, UnpairedComparison, unpaired_document
 
 MOST_ROUNDS = 9
 # The simulator's velocity is its truth: no more is taken off it than the corners between its samples
@@ -81,6 +81,11 @@ class ClosedGap(Answering):
             return sum(effect.status.is_claim for effect in each.comparison.effects), each.error_mps
 
         return min(range(len(self.rounds)), key=worth)
+
+    @property
+    def verdict(self) -> SimulatorVerdict:
+        """The verdict on the best round."""
+        return self.rounds[self.best].comparison.verdict
 
     @property
     def reasons(self) -> tuple[Reason, ...]:

@@ -16,6 +16,7 @@ from report_fixtures import Page
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import Stream, VelocityFrame, sample_block
+from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.answer.results import diagnosis_document
 from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording, zeros_while_moving
 from dvl_calib_ros.disk.text_files import write_json
@@ -173,6 +174,13 @@ def test_a_loud_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(bags,
     assert arm.status is ComparisonStatus.CANNOT_TELL and "with the simulator" in arm.needs
 
 
+def test_a_comparison_that_cannot_tell_ends_with_1_as_a_diagnosis_that_is_unknown(tmp_path, capsys):
+    short = [bag(tmp_path / name, seconds=12.0, seed=seed) for seed, name in enumerate(("sea", "sim"))]
+    assert main(["diagnose", str(short[0]), "--simulator", str(short[1]), "--json", str(tmp_path / "x.json")]) == 1
+    assert json.loads((tmp_path / "x.json").read_text())["verdict"] == "cannot_tell"
+    capsys.readouterr()
+
+
 @pytest.mark.parametrize("option", ["--apply", "--twin"])
 def test_what_is_of_one_vehicle_is_refused_beside_a_simulator(bags, tmp_path, capsys, option):
     assert option in fail(capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], option, tmp_path / "x")
@@ -259,6 +267,7 @@ def closed(bags, tmp_path_factory):
 @pytest.mark.slow
 def test_put_right_the_simulator_has_the_arm_and_the_noise_of_the_vehicle(closed):
     found, folder = closed
+    assert found.verdict is found.rounds[1].comparison.verdict is not SimulatorVerdict.DIFFERENT
     assert [each.claims for each in found.rounds] == [("lever_arm", "level_y", "level_z", "level_x"), ()]
     assert found.best == 1 and found.rounds[1].effects == ("lever_arm",)
     assert found.rounds[1].error_mps < 0.5 * found.rounds[0].error_mps
