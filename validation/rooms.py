@@ -68,7 +68,7 @@ ROOMS: Mapping[str, tuple[str, ...]] = {
     "simulator_export": (*_CORE, "disk", "files", "effects"),
     "simulation": (*_READ, "effects", "simulator_export"),
     "unpaired": (*_READ, "disk", "effects", *_DIAGNOSIS, "diagnosis", "simulator_export", "simulation"),
-    "evaluation": (*_READ, "parallel", "logs", "bag_replay", "simulation"),
+    "evaluation": (*_READ, "parallel", "logs", "discovery", "bag_replay", "simulation"),
     "present": (
         *_READ, "disk", "files", "effects", "examination", "bag_replay", "fleet_catalogue", "diagnosis.search",
         "diagnosis.answer", "unpaired", "evaluation",

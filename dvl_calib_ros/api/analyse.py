@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ..calibration.models import BY_VELOCITY
 from ..calibration.models.parameters import Parameters
 from ..diagnosis.answer.results import Diagnosis
+from ..discovery.discovery import Given
 from ..errors import InputError
 from ..simulation.scenario import Scenario
 from ..simulation.trajectories import TRAJECTORIES, Waves
@@ -166,14 +167,15 @@ def evaluate(
     models
         Names; all by default.
     dvl_topic, gnss_topic, imu_topic
-        Of bags; those of `dvl-calib simulate` where not named.
+        Of bags, as of `replay`.
     **parameters
         Any of the node's parameters, in SI units.
 
     Returns
     -------
     Evaluation or CrossCheck
-        Velocity errors by model and set of trajectories; of bags, by the bag that calibrated and the one that verified.
+        ``verdict``: better, not_better or not_known; velocity errors by model and set of trajectories, of bags by the
+        bag that calibrated and the one that verified.
 
     Raises
     ------
@@ -188,16 +190,14 @@ def evaluate(
     from ..evaluation.validation_study import DEFAULTS, EVALUATED
     from ..evaluation.validation_study import evaluate as run
     from ..parallel import Workers
-    from ..recordings.topics import Topics
 
     found = [] if paths is None else as_paths(paths)
-    named = {"dvl": dvl_topic, "gnss": gnss_topic, "imu": imu_topic}
-    topics = Topics(**{stream: topic for stream, topic in named.items() if topic is not None})
     known = BY_VELOCITY if len(found) > 1 else EVALUATED
     names = known if models is None else tuple(models)
     for name in names:
         if name not in known:
             raise InputError(f"models: {name!r} is none of {', '.join(known)}")
     if len(found) > 1:
-        return cross_check(found, Parameters.from_mapping(parameters), names, topics, Workers())
+        given = Given(dvl_topic, gnss_topic, imu_topic, frozenset(parameters))
+        return cross_check(found, Parameters.from_mapping(parameters), names, given, Workers())
     return run(found[0] if found else None, Parameters.from_mapping({**DEFAULTS, **parameters}), models=names)

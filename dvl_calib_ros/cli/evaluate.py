@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
     parser.add_argument("--dask", default="", metavar="ADDRESS", help="scheduler to work on, such as tcp://host:8786")
     common.add_parameter_options(parser)
-    common.add_topic_options(parser)
+    common.add_discovery_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -108,14 +108,14 @@ def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Work
     from ..errors import InputError
     from ..evaluation.cross_check import cross_check, cross_check_document
     from ..present import evaluation as present
-    from ..recordings.topics import Topics
 
     if arguments.csv is not None:
         raise InputError("--csv: only for a folder of trajectories; for bags there is --json")
     write_report = report_writer(arguments)
-    topics = Topics(arguments.dvl_topic, arguments.gnss_topic, arguments.imu_topic)
     with common.progress("replaying") as on_progress:
-        check = cross_check(arguments.paths, common.load(arguments), models, topics, workers, on_progress)
+        check = cross_check(
+            arguments.paths, common.load(arguments), models, common.given(arguments), workers, on_progress
+        )
     common.deliver(
         lambda: common.print_document(present.cross_check(check)),
         (arguments.json, lambda path: common.write_json(path, cross_check_document(check))),

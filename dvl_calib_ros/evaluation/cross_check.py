@@ -22,16 +22,17 @@ from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import AlignedBlock
 from ..calibration.results.results import Estimate
 from ..calibration.results.thinned_recording import Terms, ThinnedRecording
+from ..discovery.discover import discover
+from ..discovery.discovery import Given
 from ..errors import InputError
 from ..parallel import Workers, run_all
 from ..recordings.recording import open_recording
 from ..recordings.requirements import hold_the_same
 from ..recordings.topic_messages import Recorded
-from ..recordings.topics import Topics
 from ..verdict.answering import Answering
 from ..version import __version__
 from .metrics import RunMoments, vrmse
-from .results import Failure
+from .results import Failure, Improvement
 
 
 @dataclass(frozen=True, repr=False)
@@ -42,7 +43,8 @@ class CrossCheck(Answering):
     (L, M, L) calibrated on, model, verified on; nan on the bag itself, without paired samples, and where the model had
     nothing to calibrate with; a model with lever arm and delay has them corrected, the delay being that of the day: as
     the bag verified on shows it, where it does. selected: (L,) model that `navigation` of a bag calibrated on is by.
-    navigation: dead reckoning by (calibrated on, verified on). notes: what the replays said.
+    navigation: dead reckoning by (calibrated on, verified on). notes: what the replays said. found: what the bags say
+    of themselves.
     """
 
     bags: tuple[str, ...]
@@ -54,6 +56,17 @@ class CrossCheck(Answering):
     parameters: Mapping[str, Any]
     selected: tuple[str, ...] = ()
     navigation: Mapping[tuple[str, str], Navigation] = field(default_factory=dict)
+    found: tuple[str, ...] = ()
+
+    @property
+    def improvement(self) -> Improvement:
+        """How much the best of the models improves bags that it was not calibrated on."""
+        return Improvement.of(self.models, self.corrected.transpose(1, 0, 2), self.uncorrected)
+
+    @property
+    def verdict(self) -> str:
+        """The answer: better, not_better or not_known."""
+        return self.improvement.verdict
 
     @property
     def names(self) -> list[str]:
@@ -63,13 +76,16 @@ class CrossCheck(Answering):
 
 @dataclass(frozen=True)
 class _Replayed:
-    """corrections: (M, 3, 3), nan where a model had no sample. moments: of the paired samples, None without.
+    """parameters: with what the bag says of itself; found: that in sentences. corrections: (M, 3, 3), nan where a model
+    had no sample. moments: of the paired samples, None without.
 
     delayed: by model with a lever arm and delay, if it claims any, what it corrects. recording: all streams, thinned.
     selected: model that was selected, and what it corrects; None if it used nothing. dvl: its messages. failed: why
     there is none of this.
     """
 
+    parameters: Parameters
+    found: tuple[str, ...]
     corrections: Array
     moments: RunMoments | None
     n_paired: int
@@ -85,14 +101,14 @@ def cross_check(
     bags: Sequence[Path],
     parameters: Parameters,
     models: Sequence[str],
-    topics: Topics,
+    given: Given,
     workers: Workers,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> CrossCheck:
-    """Replay every bag, verify on all others. Raises InputError."""
+    """Replay every bag, verify on all others. given: what parameters and topics are named. Raises InputError."""
     if len(set(bags)) < len(bags):
         raise InputError(f"{', '.join(map(str, bags))}: a bag is named twice; it cannot be checked against itself")
-    found = run_all(partial(_replay_or_nothing, parameters, tuple(models), topics), bags, workers, on_progress)
+    found = run_all(partial(_replay_or_nothing, parameters, tuple(models), given), bags, workers, on_progress)
     if not any(each.moments for each in found):
         if failed := [f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in each.failed]:
             raise InputError(f"nothing is left to check: {failed[0]}")
@@ -102,13 +118,13 @@ def cross_check(
     for verified, each in enumerate(found):
         if each.moments is None:
             continue
-        uncorrected[verified] = vrmse(each.moments, parameters.rotation_dvl_from_body.T)
+        uncorrected[verified] = vrmse(each.moments, each.parameters.rotation_dvl_from_body.T)
         for calibrated, other in enumerate(found):
             if calibrated != verified:
                 corrected[calibrated, :, verified] = vrmse(each.moments, other.corrections)
                 for name in set(other.delayed) & set(models):
                     terms = other.delayed[name]
-                    corrected[calibrated, models.index(name), verified] = _delayed_rmse(each, terms, parameters)
+                    corrected[calibrated, models.index(name), verified] = _delayed_rmse(each, terms, other.parameters)
     for (first, one), (second, other) in combinations(zip(bags, found, strict=True), 2):
         if one.dvl is not None and other.dvl is not None and hold_the_same(one.dvl, other.dvl):
             raise InputError(f"{first}, {second}: are one bag by two names; name others to check it on")
@@ -119,11 +135,15 @@ def cross_check(
         uncorrected=uncorrected,
         corrected=corrected,
         notes=tuple(
-            f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in (*each.failed, *each.notes)
+            f"{bag}: {note}"
+            for bag, each in zip(bags, found, strict=True)
+            for note in (*each.failed, *each.notes)
+            if not note.startswith(tuple(f"{name}: " for name in MODELS if name not in models))
         ),
         parameters=parameters.as_dict(),
         selected=tuple(each.selected[0] for each in found),
-        navigation=_navigation(bags, found, parameters),
+        navigation=_navigation(bags, found),
+        found=tuple(f"{bag}: {'; '.join(each.found)}" for bag, each in zip(bags, found, strict=True) if each.found),
     )
 
 
@@ -142,9 +162,7 @@ def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> 
     return float(np.sqrt(np.mean((error**2).sum(axis=1)))) if len(error) else float("nan")
 
 
-def _navigation(
-    bags: Sequence[Path], found: Sequence[_Replayed], parameters: Parameters
-) -> Mapping[tuple[str, str], Navigation]:
+def _navigation(bags: Sequence[Path], found: Sequence[_Replayed]) -> Mapping[tuple[str, str], Navigation]:
     """Dead reckoning of every bag, corrected by what every other one says."""
     navigation = {}
     for calibrated, one in zip(bags, found, strict=True):
@@ -154,24 +172,28 @@ def _navigation(
                 continue
             folds = np.zeros(len(other.recording.dvl.times), dtype=np.int64)
             # as mounted, the delay is what it is
-            reckoned = dead_reckoned(other.recording, folds, [_of_the_day(terms, other)], parameters)
+            reckoned = dead_reckoned(other.recording, folds, [_of_the_day(terms, other)], one.parameters)
             if reckoned is not None:
                 navigation[str(calibrated), str(verified)] = reckoned
     return navigation
 
 
-def _replay_or_nothing(parameters: Parameters, models: Sequence[str], topics: Topics, bag: Path) -> _Replayed:
+def _replay_or_nothing(parameters: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
     """What raises costs its own bag, not the others. Raises InputError for one that cannot be read."""
     try:
-        return _replay_one(parameters, models, topics, bag)
+        return _replay_one(parameters, models, given, bag)
     except InputError:
         raise
     except Exception as error:
         failed = f"failed, and is in none of the figures: {Failure.of(error, 'replay')}"
-        return _Replayed(np.full((len(models), 3, 3), np.nan), None, 0, (), {}, None, ("-", None), failed=(failed,))
+        nothing = np.full((len(models), 3, 3), np.nan)
+        return _Replayed(parameters, (), nothing, None, 0, (), {}, None, ("-", None), failed=(failed,))
 
 
-def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, bag: Path) -> _Replayed:
+def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
+    opened = open_recording([bag], None, named)
+    discovery = discover(opened, named, given)
+    topics, parameters = discovery.topics, discovery.parameters
     observer = Observer(parameters)
     measured: list[Array] = []
     reference: list[Array] = []
@@ -192,7 +214,6 @@ def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, b
         if calibrator.recording is not None:
             kept.append(calibrator.recording[0])
 
-    opened = open_recording([bag], topics, parameters)
     replayed = replay(opened, parameters, topics, on_rows=keep_paired, on_restart=forget, on_finished=keep_recording)
     corrections = np.full((len(models), 3, 3), np.nan)
     for index, name in enumerate(models):
@@ -210,7 +231,10 @@ def _replay_one(parameters: Parameters, models: Sequence[str], topics: Topics, b
     }
     selected = result.selected, _terms(result.estimate) if result.estimate.used else None
     dvl = opened.recorded(topics.found_in(opened.types).dvl, parameters)
-    return _Replayed(corrections, moments, n_paired, replayed.notes, delayed, kept[0] if kept else None, selected, dvl)
+    notes, recording = (*discovery.doubts, *replayed.notes), kept[0] if kept else None
+    return _Replayed(
+        parameters, discovery.found, corrections, moments, n_paired, notes, delayed, recording, selected, dvl
+    )
 
 
 # States of a lever arm and a delay
@@ -228,6 +252,7 @@ def cross_check_document(check: CrossCheck) -> dict[str, Any]:
     """`evaluate --json` of bags; m/s."""
     by_bag = partial(zip, check.bags, strict=True)
     return {
+        "verdict": check.verdict,
         "uncorrected": dict(by_bag(check.uncorrected.tolist())),
         "corrected": {
             calibrated: {

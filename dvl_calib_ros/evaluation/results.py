@@ -7,9 +7,10 @@ attitude on a run without).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,37 @@ def mean_of_known(values: Array, axis: int | tuple[int, ...]) -> Array:
     count = np.asarray(known.sum(axis=axis))
     total = np.asarray(np.where(known, values, 0.0).sum(axis=axis))
     return np.divide(total, count, out=np.full(count.shape, np.nan), where=count > 0)
+
+
+class Improvement(NamedTuple):
+    """Mean velocity error (m/s) without a correction, and with that of the model that improves it most."""
+
+    model: str
+    before: float
+    after: float
+
+    @staticmethod
+    def of(models: Sequence[str], corrected: Array, uncorrected: Array) -> Improvement:
+        """Of models (M): corrected (M, ...), uncorrected (...); each where both are known."""
+        found = []
+        for name, after in zip(models, corrected, strict=True):
+            both = np.isfinite(after) & np.isfinite(uncorrected)
+            if both.any():
+                before = np.broadcast_to(uncorrected, both.shape)[both]
+                found.append(Improvement(name, float(before.mean()), float(after[both].mean())))
+        return min(found, key=lambda each: each.after - each.before, default=Improvement("", math.nan, math.nan))
+
+    @property
+    def verdict(self) -> str:
+        """better, not_better or not_known."""
+        return "not_known" if not self.model else "better" if self.after < self.before else "not_better"
+
+    def sentence(self, what: str) -> str:
+        """Word it. what: bags or runs."""
+        if not self.model:
+            return f"Nothing could be calibrated and checked on other {what}."
+        error = f"{self.model} leaves a velocity error of {self.after:.3f} m/s rms"
+        return f"On {what} that were not calibrated on {error}; without a calibration, {self.before:.3f}."
 
 
 @dataclass(frozen=True)
@@ -248,6 +280,16 @@ class Evaluation(Answering):
     convergence: tuple[ConvergenceCurve, ...] = ()
     coverage_of_all: tuple[Coverage, ...] = ()
     failures: tuple[Failure, ...] = ()
+
+    @property
+    def improvement(self) -> Improvement:
+        """How much the best of the models improves runs that it was not calibrated on, over all sets and seeds."""
+        return Improvement.of(self.models, self.avg_vrmse[:, 1:].swapaxes(0, 1), self.avg_vrmse[:, 0])
+
+    @property
+    def verdict(self) -> str:
+        """The answer: better, not_better or not_known."""
+        return self.improvement.verdict
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -15,11 +15,20 @@ from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.protocol import MANOEUVRING
-from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
-from ..verdict.kinds import VERDICT_WORDS
+from ..evaluation.results import (
+    UNCALIBRATED,
+    Coverage,
+    EachStudy,
+    ErrorsInVariables,
+    Evaluation,
+    HeldOut,
+    Trace,
+)
+from ..verdict.kinds import VERDICT_WORDS, Severity
 from .document import (
     CELL_KINDS,
     HELD_OUT_KINDS,
+    Answer,
     Cell,
     Document,
     Item,
@@ -81,6 +90,8 @@ FACTS: Mapping[str, Callable[[Evaluation], str]] = {
     "Prior sway and heave": lambda e: str(e.parameters["prior_source"]),
 }
 
+SEVERITIES = {"better": Severity.ACCEPT, "not_better": Severity.REJECT, "not_known": Severity.MARGINAL}
+
 
 def evaluation(e: Evaluation) -> Document:
     """How large the velocity error is after calibration, by model and set, and whether σ can be trusted."""
@@ -103,7 +114,7 @@ def evaluation(e: Evaluation) -> Document:
     return Document(
         title="Evaluation of the DVL calibration models",
         subtitle=e.source,
-        answer=None,
+        answer=Answer(e.verdict, SEVERITIES[e.verdict], [e.improvement.sentence("runs")]),
         warnings=e.notes,
         sections=[
             section("", Sentence(f"{e.source}: {len(e.trajectories)} trajectories"), where=Where.TERMINAL),
@@ -460,7 +471,7 @@ def cross_check(check: CrossCheck) -> Document:
     return Document(
         title="Bags checked against each other",
         subtitle=", ".join(check.names),
-        answer=None,
+        answer=Answer(check.verdict, SEVERITIES[check.verdict], [check.improvement.sentence("bags")]),
         warnings=check.notes,
         sections=[
             section(
@@ -477,6 +488,7 @@ def cross_check(check: CrossCheck) -> Document:
                 "Difference of DVL and GNSS on bags that were not calibrated on",
                 Table(head, errors, dense=True, notes=(ERRORS_NOTE,), words=2),
             ),
+            section("", *(Sentence(each, soft=True) for each in check.found)),
         ],
         parameters=check.parameters,
     )

@@ -9,6 +9,8 @@ import pytest
 from command_line import succeed
 from report_fixtures import drawn
 
+from dvl_calib_ros.bags.reader import BagReader
+from dvl_calib_ros.bags.writer import BagWriter
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.evaluation import cross_check as evaluation_of_bags
 
@@ -41,6 +43,23 @@ def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_de
     assert "Dead reckoning on bags that were not calibrated on" in said
     text = page.read_text()
     assert text.count("<img") == 4 and "Track, monday" in text and "Error of position, tuesday" in text
+
+
+def test_topics_are_found_as_by_replay_and_the_answer_is_said_first_with_warnings_of_the_models_asked_for(
+    bags, tmp_path, capsys
+):
+    renamed = {"dvl/twist": "/a50/velocity", "gnss/twist": "/rtk/velocity", "imu/data": "/ahrs/imu"}
+    named = []
+    for bag in bags:
+        named.append(tmp_path / bag.name)
+        with BagReader([bag]) as source, BagWriter(named[-1]) as target:
+            for topic, log_ns, message, _ in source.messages(list(renamed)):
+                target.message(renamed[topic], message.__msgtype__, log_ns, message)
+    said, warned = succeed(capsys, "evaluate", *named, "--models", "M3", "--jobs", "1")
+    # M3 knows nothing of the arm and the clock that these days differ by
+    assert said.startswith("not_better: On bags that were not calibrated on M3 leaves a velocity error of ")
+    assert "DVL /a50/velocity" in said and "reference /rtk/velocity" in said
+    assert not any(f"{name}: " in warned for name in ("G1", "full", "M7", "F1"))
 
 
 def test_the_table_for_spreadsheets_is_for_trajectories_only(bags, tmp_path, capsys):

@@ -32,7 +32,7 @@ from dvl_calib_ros.evaluation.procedure import (
     true_state,
 )
 from dvl_calib_ros.evaluation.protocol import Trajectory, load_folder, own_trajectories
-from dvl_calib_ros.evaluation.results import UNCALIBRATED
+from dvl_calib_ros.evaluation.results import UNCALIBRATED, Improvement
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
 from dvl_calib_ros.logs.dvl_log import angular_velocities
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording
@@ -473,3 +473,12 @@ def test_a_bag_by_two_names_is_not_checked_against_itself(two_bags, tmp_path, ca
 def test_one_bag_is_not_enough(take, said, two_bags, capsys):
     assert main(["evaluate", *take(two_bags)]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_the_verdict_of_an_evaluation_is_that_of_the_model_that_improves_most():
+    uncorrected = np.array([0.2, np.nan, 0.4])
+    corrected = np.array([[0.3, 0.1, np.nan], [0.1, 0.1, 0.3]])
+    found = Improvement.of(("M1", "M2"), corrected, uncorrected)
+    assert found == ("M2", pytest.approx(0.3), pytest.approx(0.2)) and found.verdict == "better"
+    assert Improvement.of(("M1",), corrected[:1], uncorrected).verdict == "not_better"
+    assert Improvement.of(("M1",), np.full((1, 3), np.nan), uncorrected).verdict == "not_known"
