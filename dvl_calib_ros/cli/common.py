@@ -95,13 +95,13 @@ def options_given(arguments: argparse.Namespace) -> list[str]:
     return options(topics, arguments.overrides, arguments.params)
 
 
-def print_found(discovery: Discovery, bags: Sequence[Path]) -> None:
-    """What was found in recordings, and where; on standard output, dim."""
+def print_found(discovery: Discovery, bags: Sequence[Path], first_only: bool = False) -> None:
+    """Print what was found in recordings, and where, dim. first_only: the topics alone."""
     from rich.markup import escape
 
     out = console()
     names = ", ".join(bag.name or str(bag) for bag in bags)
-    for sentence in (f"{names}: {discovery.found[0]}", *discovery.found[1:]):
+    for sentence in (f"{names}: {discovery.found[0]}", *([] if first_only else discovery.found[1:])):
         out.print(f"[dim]{escape(sentence)}[/]")
 
 

@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--twin", type=Path, metavar="FOLDER",
         help="write bags with a simulated DVL on the recorded motion: NAME_without and NAME_with what was found",
     )  # fmt: skip
+    parser.add_argument("-v", "--verbose", action="store_true", help="print all tables as well")
     add_report_option(parser)
     common.add_parameter_options(parser)
     common.add_discovery_options(parser)
@@ -54,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..diagnosis.answer.simulated_twin import write_twins
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.model.recorded_streams import recording_names
-    from ..disk.atomic import save_all
+    from ..disk.atomic import own_stream, save_all
     from ..present import diagnosis as present
     from ..verdict.kinds import Severity
 
@@ -85,15 +86,20 @@ def run(arguments: argparse.Namespace) -> int:
             forget=True,
         )
 
+    written: list[Path] = []
+
     def answer() -> None:
-        common.print_document(present.diagnosis(diagnosis))
-        common.print_found(discovery, arguments.bags)
+        common.print_document((present.diagnosis if arguments.verbose else present.first_screen)(diagnosis))
+        common.print_found(discovery, arguments.bags, first_only=not arguments.verbose)
+        if written:
+            common.console().print(f"wrote {', '.join(map(str, written))}", soft_wrap=True, markup=False)
 
     def apply(path: Path) -> None:
         days: dict[Path, int | None] = {path: None}
         if any(effect.by_recording for effect in diagnosis.effects):
             days |= {of_each[name]: index for index, (name, _) in enumerate(diagnosis.recordings)}
         save_all({at: parameter_file(compensated(parameters, diagnosis, day)).encode() for at, day in days.items()})
+        written.extend(at for at in days if own_stream(at) is None)
 
     def write_all_twins(folder: Path) -> None:
         for twin in diagnosis.twins:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ from .document import (
     section,
     table_by,
 )
-from .numbers import intervals, mm, p_value, quantity, share, three, with_std
+from .numbers import intervals, mm, p_value, quantity, share, three, two, with_std
 
 NOISE_MEANING = {
     "outliers": "samples far outside the noise, as a share",
@@ -47,6 +48,8 @@ NOISE_MEANING = {
 }
 ALL = "all of the run"
 MAX_PLACES = 12
+# Effects of the first screen of a terminal
+FIRST_EFFECTS = 3
 PLACES = "Share: of the gap's energy. Places overlap, so that only the shares of the axes over all of the run add up."
 EFFECTS_NOTE = (
     "The calibration is refitted with every effect. p is adjusted for all effects that were tried. Of names joined by "
@@ -107,8 +110,20 @@ NOISE: Columns[NoiseFinding] = {
 }
 
 
+def first_screen(d: Diagnosis) -> Document:
+    """Lay out the answer, what to do, what the gap costs and what to record next, within 24 rows of a terminal."""
+    whole, gap = diagnosis(replace(d, effects=d.effects[:FIRST_EFFECTS])), d.gap
+    more = len(d.effects) - FIRST_EFFECTS
+    further = [f"{more} more effects: --verbose."] if more > 0 else []
+    if math.isfinite(gap.before):
+        cost = mm(math.sqrt(max(gap.before**2 - gap.noise_floor**2, 0.0)))
+        further.append(f"Cost: {cost} mm/s beyond the noise, of which {mm(gap.not_explained)} mm/s are not explained.")
+    further += [f"Next: {d.next_manoeuvre}.", "Details: --verbose, or --report FILE."]
+    return replace(whole, sections=[section("", *map(Sentence, further))])
+
+
 def diagnosis(d: Diagnosis) -> Document:
-    """Where the DVL differs from what calibration leads to expect, which effect makes it, and what cannot be told."""
+    """Lay out the gap between DVL and reference: places, effects that explain it, and what cannot be told."""
     series, has_effects = d.series, bool(d.effects)
     found = [
         f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, EFFECTS.get(e.name))}." for e in d.effects
@@ -133,7 +148,7 @@ def diagnosis(d: Diagnosis) -> Document:
         caption="Line: 95 % interval, by a bootstrap over blocks of time.",
     )
     return Document(
-        title="Sim-to-real gap of the DVL",
+        title=f"DVL against the reference: {', '.join(name for name, _ in d.recordings)}",
         subtitle="" if series is None else ", ".join(series.recordings),
         answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found, *to_do]),
         warnings=d.notes,
@@ -277,7 +292,7 @@ DETECTABLE: Columns[Detectable] = {
         f"{each.spec.spoken if each.spec else each.parameter} {three(each.said[0][0])} {each.said[1]}".strip(),
         "text" if each.spec is None else "text good" if each.size <= each.spec.typical else "text far",
     ),
-    "worth knowing of": lambda each: f"{each.said[0][1]:g} {each.said[1]}" if each.spec else "–",
+    "worth knowing of": lambda each: f"{two(each.said[0][1])} {each.said[1]}" if each.spec else "–",
 }
 
 

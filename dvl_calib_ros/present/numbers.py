@@ -45,6 +45,11 @@ def mm(value: float) -> str:
     return f"{1e3 * value:.1f}"
 
 
+def two(value: float) -> str:
+    """Two significant digits without an exponent."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
 def three(value: float) -> str:
     """Three significant digits."""
     if math.isinf(value):
@@ -83,9 +88,10 @@ def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffec
     for name, values in parameters.items():
         said, unit = (specs[name].spoken, specs[name].unit) if name in specs else (name, "")
         (value, low, high), unit = quantity(values, unit)
-        width = high - low
-        if math.isfinite(width) and width > 0.0:
-            digits = max(0, 1 - math.floor(math.log10(width)))
+        half = 0.5 * (high - low)
+        if math.isfinite(half) and half > 0.0:
+            exponent = math.floor(math.log10(half))
+            digits = max(0, (half < 3.0 * 10.0**exponent) - exponent)  # two digits of a half from 1 to 3, else one
             shown = [number(each, digits) for each in (value, low, high)]
         else:
             shown = [three(each) for each in (value, low, high)]

@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.numerics.tests import holm
+from dvl_calib_ros.cli import common
 from dvl_calib_ros.diagnosis.answer import confidence_intervals, held_out_validation
 from dvl_calib_ros.diagnosis.answer.compensation import compensated
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
@@ -1236,6 +1237,19 @@ def test_the_twin_with_what_was_found_measures_what_was_recorded(bag_with_lever_
 def test_the_answer_comes_first_in_one_sentence(bag_with_lever_arm, capsys):
     output, _ = succeed(capsys, "diagnose", bag_with_lever_arm)
     assert "lever_arm" in output.splitlines()[0] and output.splitlines()[0].endswith(".")
+
+
+def test_the_first_screen_is_24_rows_of_80_and_ends_with_what_was_written(
+    bag_with_lever_arm, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(common, "_width", lambda _: 80)
+    output, errors = succeed(capsys, "diagnose", bag_with_lever_arm, "--apply", tmp_path / "applied.yaml")
+    rows = (errors + output).splitlines()
+    assert len(rows) <= 24 and "lever_arm" in output.splitlines()[0]
+    assert rows[-1] == f"wrote {tmp_path / 'applied.yaml'}" and (tmp_path / "applied.yaml").exists()
+    assert all(any(row.startswith(word) for row in rows) for word in ("To do for lever_arm", "Cost: ", "Next: "))
+    assert "Where the gap lies" not in output
+    assert "Where the gap lies" in succeed(capsys, "diagnose", bag_with_lever_arm, "--verbose")[0]
 
 
 def test_a_recording_is_not_held_out_from_its_own_copy_also_where_that_is_cut_off(bag_with_lever_arm, tmp_path):

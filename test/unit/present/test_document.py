@@ -17,7 +17,7 @@ from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.present.comparison import comparison
 from dvl_calib_ros.present.document import Answer, Cell, Document, Section, Sentence, Table, Where, section, table_by
-from dvl_calib_ros.present.numbers import intervals, number, with_std
+from dvl_calib_ros.present.numbers import intervals, number, two, with_std
 from dvl_calib_ros.present.page import breakable, write_document
 from dvl_calib_ros.present.terminal import shown
 from dvl_calib_ros.verdict.kinds import Severity
@@ -134,6 +134,8 @@ def test_sizes_are_said_in_units_that_people_use():
     values = (0.0421, 0.03, 0.05)
     assert intervals({"sin_rad": values}, EFFECTS["heading_error"]) == "sin 2.4° (1.7 to 2.9)"
     assert intervals({"seconds": values}, EFFECTS["dvl_time_offset"]) == "42 ms (30 to 50)"
+    assert intervals({"x_m": (-0.238, -0.287, -0.188)}, EFFECTS["lever_arm"]) == "x −0.24 m (−0.29 to −0.19)"
+    assert two(2.86479) == "2.9" and two(100.0) == "100" and two(0.00872665) == "0.0087"
     assert intervals({"seconds": (1.5, 1.0, 2.0)}, EFFECTS["dvl_time_offset"]) == "1.5 s (1.0 to 2.0)"
     assert intervals({"x_mps": values, "y_mps": (0.0, 0.0, math.inf)}, EFFECTS["velocity_bias"]) == (
         "x 42 mm/s (30 to 50); y 0.00 m/s (0.00 to ∞)"
