@@ -221,7 +221,9 @@ class View:
         following = ""
         if _is_usable(status) or not ("REJECTED" in code or "GOOD" in code):
             seconds = status.get("seconds")
-            about = "" if seconds == "-" else f", about {_duration(seconds)} until good enough"
+            spread = status.values.get("seconds spread", "-")
+            left = " ± ".join(_duration(each, rough=True) for each in (seconds, spread))
+            about = "" if seconds == "-" else f", about {left} until good enough"
             following = f"next: {status.get('next')}{about}"
         lines = 1 if width >= WIDE else 2
         return [
@@ -239,8 +241,8 @@ def _is_usable(status: Status) -> bool:
 
 def _warnings(status: Status) -> list[str]:
     found = [each for n in range(1, 100) if (each := status.values.get(f"finding {n}"))]
-    taken_back = status.values.get("taken back", "") if _is_usable(status) else ""
-    return [*filter(None, [taken_back]), *(found or [status.message] * bool(status.level))]
+    told = [status.values.get(name, "") for name in ("taken back", "longer")] if _is_usable(status) else []
+    return [*filter(None, told), *(found or [status.message] * bool(status.level))]
 
 
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
@@ -266,14 +268,16 @@ def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
     yield Row(_rose(status))
 
 
-def _duration(text: str) -> str:
-    """Seconds of another process, as people tell them."""
+def _duration(text: str, rough: bool = False) -> str:
+    """Return seconds of another process as people tell them. rough: without seconds from two minutes on."""
     try:
         seconds = float(text)
     except ValueError:
         return text
     if not math.isfinite(seconds):
         return text
+    if rough and seconds >= 120.0:
+        return f"{seconds / 60.0:.0f} min"
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds // 60:.0f} min {seconds % 60:02.0f} s"
 
 

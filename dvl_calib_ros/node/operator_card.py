@@ -36,6 +36,8 @@ THOUGHT_OF_EVERY_S = 5.0
 STANDS_S, TAKEN_BACK = 30.0, 1.5
 # From one look to the next no more than so long, s, counts: a stamp that is far ahead shows nothing either.
 LEAST_LOOKS = 5
+# Two σ of a predicted time, as a share: it is in proportion to a σ², and that of 25 blocks is known to 2/7 (1 σ).
+SPREAD = 4.0 / 7.0
 # Rates are means over so many statuses.
 RATED_OVER = 10
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
@@ -91,6 +93,36 @@ class RecentWorth:
         return STANDS_S - (0.0 if self._within_since_s is None else min(now_s - self._within_since_s, STANDS_S))
 
 
+class RemainingTime:
+    """Time until a calibration is good enough, s of DVL data, and why it is longer than promised.
+
+    Never longer than promised by more than its spread, unless `longer` says why; None else.
+    """
+
+    def __init__(self) -> None:
+        self._ends_s: deque[tuple[float, float]] = deque()
+        self._latest_s, self._longer_since_s = math.inf, -math.inf
+        self._promised_at = math.nan
+        self.longer: Reason | None = None
+
+    def look(self, seconds: float | None, drift: float, now_s: float) -> float | None:
+        """Return the time left. seconds: as predicted now, None for none. drift: m per km, as the bar has it."""
+        if now_s - self._longer_since_s >= STANDS_S:
+            self.longer = None
+        self._ends_s.append((now_s, math.inf if seconds is None else now_s + seconds))
+        while self._ends_s[0][0] < now_s - STANDS_S:
+            self._ends_s.popleft()
+        end_s = sorted(end for _, end in self._ends_s)[len(self._ends_s) // 2]
+        left = max(end_s - now_s, 0.0)
+        latest_s = end_s + SPREAD * left
+        if end_s > self._latest_s:
+            code = "LONGER_AS_DRIFT_GREW" if drift > self._promised_at else "LONGER_AS_LITTLE_SHOWN"
+            self.longer, self._longer_since_s = finding(code, before=self._promised_at, now=drift), now_s
+        if latest_s < self._latest_s or end_s > self._latest_s:
+            self._latest_s, self._promised_at = latest_s, drift
+        return left if math.isfinite(left) else None
+
+
 class Card:
     """The values of one status after the other. now_s: a clock that does not go back."""
 
@@ -102,9 +134,9 @@ class Card:
         self._newest_ns: int | None = None
         self._shown_s = 0.0
         self._squares, self._looks = 0.0, 0
-        self._worth = RecentWorth()
+        self._worth, self._remaining = RecentWorth(), RemainingTime()
         self._outlook: Outlook | None = None
-        self._thought_s = -math.inf
+        self._thought_s = self._thought_shown_s = -math.inf
 
     def values(
         self,
@@ -164,6 +196,11 @@ class Card:
             found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(self._shown_s))
         else:
             found = self._thought(calibrator, estimate, motion, now_s)
+        left = None
+        if rejected or worth.is_good:
+            self._remaining = RemainingTime()
+        elif found.next.code != "NEXT_WAIT":  # a vehicle that stands keeps what it was promised
+            left = self._remaining.look(found.seconds, drift.both, self._shown_s)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
             "side": _done(drift.side, unknown[0], target / math.sqrt(2.0)),
@@ -179,7 +216,9 @@ class Card:
             "taken back": "" if worth.taken_back is None else worth.taken_back.sentence,
             "next": found.next.sentence,
             "next code": found.next.code,
-            "seconds": "-" if found.seconds is None else f"{found.seconds:.0f}",
+            "seconds": "-" if left is None else f"{left:.0f}",
+            "seconds spread": "-" if left is None else f"{SPREAD * left:.0f}",
+            "longer": "" if self._remaining.longer is None else self._remaining.longer.sentence,
         }
 
     def _thought(
@@ -187,7 +226,7 @@ class Card:
     ) -> Outlook:
         """What to drive next, as it was thought of last."""
         if self._outlook is None or now_s - self._thought_s >= THOUGHT_OF_EVERY_S:
-            self._thought_s = now_s
+            self._thought_s, self._thought_shown_s = now_s, self._shown_s
             parameters, mean_square = calibrator.parameters, self._squares / max(self._looks, 1)
             first_ns, last_ns = calibrator.first_ns, calibrator.last_ns
             seconds = 0.0 if first_ns is None or last_ns is None else 1e-9 * (last_ns - first_ns)
@@ -197,7 +236,8 @@ class Card:
             if moving.speed > 0.0:  # of a vehicle that slows down in a turn, the usual one
                 moving = moving._replace(speed=max(moving.speed, math.sqrt(mean_square)))
             self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
-        return self._outlook
+        planned, since = self._outlook.seconds, self._shown_s - self._thought_shown_s
+        return self._outlook._replace(seconds=None if planned is None else max(planned - since, 0.0) + STANDS_S)
 
 
 def _done(drift: float, unknown: float, target: float) -> float:

@@ -211,6 +211,17 @@ MANOEUVRES = (
         "The drift by yaw is within target_drift. Only a reference velocity shows a scale.",
     ),
     _Said(
+        "LONGER_AS_DRIFT_GREW",
+        "it takes longer than promised: the predicted drift has grown from {before:.1f} to {now:.1f} m per km",
+        "Newer data differ from the older by more than the σ had claimed.",
+    ),
+    _Said(
+        "LONGER_AS_LITTLE_SHOWN",
+        "it takes longer than promised: the motion since then has shown less than what was asked for "
+        "({before:.1f} m per km then, {now:.1f} now)",
+        "The time is that of the manoeuvre that is named next, at the usual speed.",
+    ),
+    _Said(
         "WORTH_OF_ANOTHER_MODEL",
         "no longer good enough: the model is {model} now",
         "Model auto follows the reference. In an outage a model without a reference is in use, and would be saved.",

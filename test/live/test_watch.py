@@ -38,7 +38,7 @@ VALUES = {
     "mounting arm x [m]": "0.300", "sigma mounting arm x [m]": "not estimated",
     "worth": "3.45", "worth to the side": "2.83", "worth ahead": "1.96", "target": "2",
     "goal worth [%]": "75", "goal side [%]": "60", "goal ahead [%]": "100",
-    "next": "drive straight, west (270°)", "next code": "NEXT_LEG", "seconds": "75",
+    "next": "drive straight, west (270°)", "next code": "NEXT_LEG", "seconds": "75", "seconds spread": "43",
     "driven N [s]": "120", "driven E [s]": "60",
 }  # fmt: skip
 GOOD = {"next": "good enough: save", "next code": "NEXT_IS_GOOD", "seconds": "-"}
@@ -65,8 +65,11 @@ def test_the_view_shows_the_mounting_what_it_is_worth_and_what_to_drive():
     assert re.search(r"\ndrift  █{18}░{6}  75 %  3.45 m/km, goal 2\n", text)
     assert re.search(r"\n scale █{24} 100 %  1.96 m/km\n", text)
     assert "N█  NE   E▄  SE   S   SW   W   NW " in text
-    assert "next: drive straight, west (270°), about 75 s until good enough" in text
+    assert "next: drive straight, west (270°), about 75 s ± 43 s until good enough" in text
     assert "phi" not in text and "skid" not in text
+    longer = finding("LONGER_AS_LITTLE_SHOWN", before=3.9, now=3.45).sentence
+    long = drawn(status(longer=longer, seconds="600", **{"seconds spread": "343"}), 100.5)
+    assert "about 10 min ± 6 min until good enough" in long and "it takes longer than promised: the motion" in long
 
 
 def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_used():
@@ -158,7 +161,7 @@ SEEN = {
     (80, 24): """\
 model G1   12 min 34 s
 drift  ██████████████████░░░░░░  75 %  3.45 m/km, goal 2
-next: drive straight, west (270°), about 75 s until good enough
+next: drive straight, west (270°), about 75 s ± 43 s until good enough
 s save  r r forget  w warnings  q quit
 14:03:22 saved to /data/calibration.yaml
 
@@ -179,7 +182,7 @@ headings  N█  NE   E▄  SE   S   SW   W   NW
 model G1   12 min 34 s
 drift  ██████░░  75 %  3.45 m/km, goal 2
 next: drive straight, west (270°), about
-75 s until good enough
+75 s ± 43 s until good enough
 s save  r r forget  w warnings  q quit
 14:03:22 saved to /data/calibration.yaml
 mounting now

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
+import numpy as np
 import pytest
 from runs import MatchedRun, calibrate, make_samples
 
@@ -12,7 +14,16 @@ from dvl_calib_ros.calibration.assessment.manoeuvre_planner import PredictedDrif
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
-from dvl_calib_ros.node.operator_card import LEAST_LOOKS, SECTORS, STANDS_S, THOUGHT_OF_EVERY_S, Card, RecentWorth
+from dvl_calib_ros.node.operator_card import (
+    LEAST_LOOKS,
+    SECTORS,
+    SPREAD,
+    STANDS_S,
+    THOUGHT_OF_EVERY_S,
+    Card,
+    RecentWorth,
+    RemainingTime,
+)
 
 RUN = MatchedRun("box", 120.0, (0.0, 0.0, 0.05), dvl_std=0.01, gnss_std=0.03, frame=VelocityFrame.ENU)
 
@@ -176,3 +187,47 @@ def test_of_a_calibration_that_would_be_rejected_nothing_is_good_enough(at_the_g
     said = card.values(at_the_goal, estimate, counts(1), 40.0, rejected=True)
     assert said["next code"] == "NEXT_REJECTED" and said["goal worth [%]"] == "99"
     assert card.values(at_the_goal, estimate, counts(1), 41.0)["next code"] == "NEXT_STANDS"
+
+
+def told_of(predictions, drifts):
+    """What is told each 5 s: (time, left, latest promised so far with its spread, code)."""
+    remaining, latest, told = RemainingTime(), math.inf, []
+    for number, (seconds, drift) in enumerate(zip(predictions, drifts, strict=True)):
+        now_s = 5.0 * number
+        left = remaining.look(seconds, drift, now_s)
+        code = "" if remaining.longer is None else remaining.longer.code
+        told.append((now_s, left, latest, code))
+        end_s = math.inf if left is None else now_s + left
+        latest = end_s + SPREAD * left if end_s > latest else min(latest, end_s + SPREAD * (left or math.inf))
+    return told
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_remaining_time_is_never_longer_than_promised_by_more_than_its_spread_or_says_why(seed):
+    """It went from 9 to 26, 10 and 12 minutes without a word."""
+    rng = np.random.default_rng(seed)
+    predictions = np.maximum(600.0 - 5.0 * np.arange(100), 30.0) * rng.lognormal(0.0, 0.7, 100)
+    drifts = np.linspace(8.0, 3.0, 100)
+    told = told_of(predictions, drifts)
+    beyond = [code for now_s, left, latest, code in told if now_s + left > latest]
+    assert all(beyond)
+    assert set(beyond) <= {"LONGER_AS_LITTLE_SHOWN", "LONGER_AS_DRIFT_GREW"}
+
+
+def test_a_time_that_runs_out_as_promised_is_without_a_word_and_a_vehicle_that_learns_nothing_is_told_why():
+    told = told_of([600.0 - 5.0 * each for each in range(110)], [5.0] * 110)
+    assert not any(code for *_, code in told) and told[-1][1] == pytest.approx(55.0, abs=15.0)
+    told = told_of([300.0] * 100, [5.0] * 100)  # it is to take as long as ever
+    first = next(now_s for now_s, *_, code in told if code)
+    assert first == pytest.approx(300.0 * SPREAD, abs=STANDS_S)
+    assert {code for *_, code in told} == {"", "LONGER_AS_LITTLE_SHOWN"}
+    grown = told_of([300.0] * 3 + [900.0] * 20, [5.0] * 3 + [7.0] * 20)
+    assert "LONGER_AS_DRIFT_GREW" in {code for *_, code in grown}
+
+
+def test_the_time_that_is_told_includes_that_for_which_the_goal_has_to_stand_and_counts_down():
+    calibrator = calibrate(make_samples(RUN), Parameters(model="G1", target_drift=8.0))
+    said = list(looks(Card(0.0), calibrator, [1.2] * 8))
+    seconds = [float(each["seconds"]) for each in said]
+    assert seconds[0] > STANDS_S and float(said[0]["seconds spread"]) == pytest.approx(SPREAD * seconds[0], abs=1.0)
+    assert all(after <= before for before, after in pairwise(seconds)) and seconds[4] == seconds[0] - 4
