@@ -122,11 +122,6 @@ def now(vehicle: VehicleHistory) -> Extrinsics | None:
     return fused(days)
 
 
-def _smallest(compared: Comparison) -> str:
-    """Word the movement in degrees that is found of the angle that is known worst."""
-    return f"{math.degrees(float(np.nanmax(compared.smallest, initial=0.0))):.1f}"
-
-
 class VehicleNow(NamedTuple):
     """A vehicle with its mounting as it is, None where no recording is usable."""
 
@@ -147,6 +142,12 @@ class VehicleNow(NamedTuple):
         return {0: "No recording is usable.", 1: "One day alone."}.get(days, "No two days show the same angle.")
 
     @property
+    def seen_from(self) -> str:
+        """Movement in degrees that is found of the angle that is known worst."""
+        compared = self.history.compared
+        return "–" if compared is None else f"{math.degrees(float(np.nanmax(compared.smallest, initial=0.0))):.1f}"
+
+    @property
     def moved(self) -> int:
         """How many times its mounting moved."""
         return 0 if self.history.compared is None else len(self.history.compared.moved)
@@ -164,7 +165,7 @@ VEHICLES: Columns[VehicleNow] = {
     "mounting": lambda each: Cell(
         each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text"), each.why
     ),
-    "seen from, °": lambda each: "–" if each.history.compared is None else _smallest(each.history.compared),
+    "seen from, °": lambda each: each.seen_from,
     **columns_for(
         {f"{each.name}, {each.unit}": each for each in _ANGLES_AND_SCALE},
         lambda each, quantity: (
