@@ -41,7 +41,7 @@ _COMPARISONS = (
     Kind(
         "MOUNTING_SUSPICIOUS",
         "the mounting may have moved {moved} {between}; by chance alone so large a difference comes up in 1 of "
-        "{often:.3g} comparisons",
+        "{often:.0f} comparisons",
         "Between 2 and 4 σ.",
         "calibrate once more before you rely on either",
         Severity.MARGINAL,

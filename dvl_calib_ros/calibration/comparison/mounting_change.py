@@ -212,8 +212,7 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
     instants = max(len(series) - 1, 1)
     together = cache(fused)
     changes = _changes(series, MOUNTING, SUSPICIOUS / instants, together)
-    sure = [change for change in changes if change.difference.chance(MOUNTING) < MOVED / instants]
-    moved = sure if accepted else []
+    moved = [change for change in changes if accepted and change.difference.chance(MOUNTING) < MOVED / instants]
     return Comparison(
         calibrations=tuple(ordered),
         pairs=tuple(pairs),
@@ -222,7 +221,7 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
         suspected=tuple(_suspected(series, [each for each in ordered if each not in series])),
         scale_changed=tuple(_changes(series, ONLY_SCALE, CHANCE / instants, together)),
         clock_changed=tuple(_changes(series, ONLY_CLOCK, CHANCE / instants, together)),
-        scatter=_scatter(series, [change.first_after for change in sure], together),
+        scatter=_scatter(series, [change.first_after for change in changes], together),
         smallest=_smallest([change.difference for change in _splits(series, together)] or pairs),
     )
 

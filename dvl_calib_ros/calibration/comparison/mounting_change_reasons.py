@@ -30,7 +30,7 @@ def reasons(comparison: Comparison) -> list[Reason]:
         said.append(finding("DELAY_CHANGED", seconds=abs(seconds), std=std, way=way, between=between(change)))
     scatter = comparison.scatter
     if scatter.freedom and scatter.p < CHANCE:
-        code = "SCATTER_BESIDE_MOVES" if comparison.moved else "SCATTER"
+        code = "SCATTER_BESIDE_MOVES" if comparison.moved or comparison.suspicious else "SCATTER"
         said.append(finding(code, by=math.sqrt(scatter.value / scatter.freedom)))
     return said
 
@@ -61,7 +61,7 @@ def moved(change: Change) -> Reason:
 
 def suspicious(change: Change) -> Reason:
     """Word a possible movement."""
-    often = 1.0 / change.difference.chance(MOUNTING)
+    often = float(f"{1.0 / max(change.difference.chance(MOUNTING), 1e-6):.2g}")
     words = moved_in_words(change.difference)
     return finding("MOUNTING_SUSPICIOUS", moved=words, between=between(change), often=often)
 
