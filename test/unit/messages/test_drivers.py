@@ -36,6 +36,7 @@ from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion, 
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.model.recorded_streams import load_recordings
+from dvl_calib_ros.discovery.discovery import Given
 from dvl_calib_ros.disk.yaml_files import load_yaml
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.cross_check import cross_check
@@ -435,7 +436,7 @@ def test_evaluation_and_diagnosis_read_the_same_from_a_drivers_bag(bare, tmp_pat
     later = [each._replace(stamp_ns=each.stamp_ns + 1000 * 10**9) for each in bare[:-30]]
     other = {kind: write_driver_bag(tmp_path / f"{kind[:5]}_1", later, kind) for kind in (TWIST, MARINE)}
     checks = [
-        cross_check([bags[kind], other[kind]], Parameters(), ["M3"], Topics(), Workers(1)) for kind in (TWIST, MARINE)
+        cross_check([bags[kind], other[kind]], Parameters(), ["M3"], Given(), Workers(1)) for kind in (TWIST, MARINE)
     ]
     np.testing.assert_array_equal(checks[0].corrected, checks[1].corrected)
     loaded = [load_recordings([bags[kind]], Parameters(), Topics()).recordings[0] for kind in (TWIST, MARINE)]
