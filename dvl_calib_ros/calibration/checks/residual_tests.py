@@ -399,7 +399,9 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
         for filtered, each in ((new, values), (rest, error[:, axis])):
             filtered[FORETOLD_BY:-FORETOLD_BY, axis] = np.correlate(each, shares, "valid")
     most = NEW_AT_MOST * robust_std(new)
-    new[1:][np.abs(np.diff(time) - step) > 0.5 * step] = 0.0
+    # nor is a sample foretold by those that are not at its own distances
+    is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
+    new[np.convolve(is_gap, np.ones(2 * FORETOLD_BY), "same") > 0.5] = 0.0
     noise = np.clip(new, -most, most)
     weight = fit.weight * ((new == noise) & (new != 0.0)).all(axis=1)  # neither clipped, nor at an end
 
