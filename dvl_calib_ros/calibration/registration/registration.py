@@ -208,12 +208,12 @@ def _registered(
         moves = _unsteady(motion, curves, lever_arm, rotation_body_from_dvl)
         if moves is not None:
             found = _registered(moves.steadied(motion), rotation_body_from_dvl, lever_arm, moves)
-            if found is None:
-                return None
-            x = np.zeros(N)
-            x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
-            x[APART], x[LATE] = found.dvl.late - found.reference.late, found.reference.late
-            return replace(found, unsteady=moves.timed(motion, fit, x, found.rotation_body_from_dvl, found.spread))
+            # in stretches without manoeuvres waves agree at several delays; without a clock that moves they all agree
+            if found is not None and found.spread < best.level:
+                x = np.zeros(N)
+                x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
+                x[APART], x[LATE] = found.dvl.late - found.reference.late, found.reference.late
+                return replace(found, unsteady=moves.timed(motion, fit, x, found.rotation_body_from_dvl, found.spread))
     in_time = _held(quick, best, rotation_body_from_dvl, 0.0, 0.0, (DVL, REFERENCE))
     if in_time[1] < NO_DOUBT:  # all that there is would show nothing more
         seen = _explained(quick, best, rotation_body_from_dvl, lever_arm)
