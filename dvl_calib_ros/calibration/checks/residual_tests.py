@@ -39,6 +39,8 @@ TILT_S = 1.0, 15.0
 BEND_S = 1.0
 # Stretches, s, by whose scatter σ is found; fewer say nothing.
 STRETCH_S, ENOUGH = 15.0, 12
+# Stretches taken together for that: slow errors of references and attitudes last for a minute or two.
+QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # So many σ are no chance; of smoothing, whose σ knows how few turns show it, fewer (of 197 surveys without any none
 # had more than 3.3); of a bias, whose σ holds all else that is likely, fewer (of 300 combinations without one none
 # had more than 3.6), and from fewer still it is named.
@@ -189,9 +191,9 @@ def residual_trend(
     columns = np.concatenate([_means(each, starts) for each in (beside, by_heading, constant)], axis=2)
     likely = np.concatenate([KNOWN, BY_HEADING, CONSTANT])
     means = _means(time, starts), columns, _means(error, starts)
-    slow = _fitted(*means, likely)
+    slow = _fitted(*means, likely, LASTING)
     likely[OVER_GROUND] = BED_STD_MPS
-    over_bed = _fitted(*means, likely)
+    over_bed = _fitted(*means, likely, LASTING)
     if fast is None or slow is None or over_bed is None:
         return None
     over_ground = over_bed.x[OVER_GROUND]
@@ -348,7 +350,9 @@ def _smoothed_one(found: ResidualTrend) -> str:
     return "reference" if found.smoothed > 0.0 else "DVL"
 
 
-def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> _Fit | None:
+def _fitted(
+    time: Array, columns: Array, error: Array, likely: Array, together: Sequence[int] = QUICK_STRETCHES
+) -> _Fit | None:
     """Of error (N, 3) = columns (N, 3, n) x; None for too few stretches of time."""
     stretch = np.floor((time - time[0]) / STRETCH_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(stretch, prepend=-1))
@@ -372,14 +376,14 @@ def _fitted(time: Array, columns: Array, error: Array, likely: Array) -> _Fit | 
     told = np.sum(each_axis, axis=0)
     # what is not looked for may be there as far as it is likely, and the data do not say that it is not
     beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
-    std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T)
+    std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T, together)
     return _Fit(x, np.sqrt(std**2 + (beside**2).sum(axis=1)), p, weight, rest, starts)
 
 
-def _std(scatter: Array) -> Array:
-    """σ (n,) by what each of M stretches, or two or four together, say (n, M)."""
+def _std(scatter: Array, together: Sequence[int]) -> Array:
+    """σ (n,) by what each of M stretches, or so many together, say (n, M): the largest, for noise lasts."""
     n, m = scatter.shape
-    sums = [scatter[:, : m // k * k].reshape(n, -1, k).sum(axis=2) for k in (1, 2, 4)]
+    sums = [scatter[:, : m // k * k].reshape(n, -1, k).sum(axis=2) for k in together if m >= 2 * k]
     return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
@@ -424,7 +428,7 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
                 continue
             share = float(np.einsum("n,ni,ni->", weight, past, rest)) / square
             scores = np.add.reduceat(weight * (past * (rest - share * past)).sum(axis=1), fit.starts)
-            found.append((share, math.hypot(float(_std(scores[None] / square)[0]), OF_WAVES), seconds))
+            found.append((share, math.hypot(float(_std(scores[None] / square, QUICK_STRETCHES)[0]), OF_WAVES), seconds))
     return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
 
 
