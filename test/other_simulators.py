@@ -23,7 +23,6 @@ from dvl_calib_ros.messages.encode import SampleWriter
 from dvl_calib_ros.simulation.trajectories import Motion, Waves, add_waves, make_motion
 
 GZ = "{http://gazebosim.org/schema}"
-XACRO = "{http://www.ros.org/wiki/xacro}"
 FLIP = np.diag([1.0, -1.0, -1.0])  # forward-right-down <-> forward-left-up
 
 
@@ -154,37 +153,7 @@ def mt19937_doubles(seed: int, n: int) -> np.ndarray:
     return np.array([(low + high * 2**32) / 2**64 for low, high in zip(words[::2], words[1::2], strict=True)])
 
 
-def dave(path: Path) -> OtherDvl:
-    sensor = ElementTree.parse(path).getroot().find("gazebo/sensor")
-    plugin = sensor.find("plugin")
-    assert sensor.get("type") == "dsros_dvl" and plugin.get("filename") == "libdsros_ros_dvl.so"
-    for name in ("robotNamespace", "topicName", "rangesTopicName", "frameName", "pointcloudFrame"):
-        assert plugin.findtext(name)
-    assert plugin.findtext("pos_z_down") == "false" and plugin.findtext("enableWaterTrack") == "0"
-    pose = floats(sensor.findtext("pose"))
-    azimuths = [float(plugin.findtext(f"beamAzimuthDeg{number}")) for number in (1, 2, 3, 4)]
-    angle, std = float(plugin.findtext("beamAngleDeg")), float(plugin.findtext("gaussianNoiseBeamVel"))
-    assert float(sensor.findtext("update_rate")) == float(plugin.findtext("updateRateHZ"))
-    return OtherDvl(
-        fixed_axes(pose[3:]), pose[:3], float(sensor.findtext("update_rate")), *through_beams(azimuths, angle, std)
-    )
-
-
-def uuv_simulator(path: Path) -> OtherDvl:
-    """It knows no lever arm."""
-    macro = ElementTree.parse(path).getroot().find(f"{XACRO}dvl_plugin_macro")
-    names = {"namespace", "suffix", "parent_link", "topic", "scale", "update_rate", "reference_frame", "noise_sigma",
-             "noise_amplitude"}  # fmt: skip
-    assert set(macro.attrib) == names  # as the macro declares
-    rotation = fixed_axes(floats(macro.find("origin").get("rpy")))
-    measure, std = on_axes(float(macro.get("noise_amplitude")))
-    return OtherDvl(rotation, np.zeros(3), float(macro.get("update_rate")), measure, std)
-
-
-READERS = {
-    "gazebo": gazebo, "stonefish": stonefish, "holoocean": holoocean, "dvl-simulator": dvl_simulator, "dave": dave,
-    "uuv_simulator": uuv_simulator,
-}  # fmt: skip
+READERS = {"gazebo": gazebo, "stonefish": stonefish, "holoocean": holoocean, "dvl-simulator": dvl_simulator}
 
 
 def write_log(path: Path, dvl: OtherDvl, seconds: float, seed: int, reference_std: float = 0.02) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +52,8 @@ class DvlDescription:
 
     mounting_rpy: (3,) rad, `dvl_link` in the body as a URDF origin, misalignment included. lever_arm: (3,) m, of the
     DVL from the reference point, body frame. scale: (3,) errors δk, and velocity_bias: (3,) m/s, of its axes.
-    noise_std: (3,) m/s, of its axes; rate_hz: None where not known. speed: (3,) m/s, RMS along its axes. sizes: m/s, by
-    name (`misalignment`, `scale`, effects). others: effects that are none of these. source: file that it is from.
+    noise_std: (3,) m/s, of its axes; rate_hz: None where not known. speed: (3,) m/s, RMS along its axes.
+    others: effects that are none of these. source: file that it is from.
     ambiguous: sets of effects that the data could not tell apart, of which the first is taken. doubts: what is to be
     known before it is used, in sentences.
 
@@ -68,7 +68,6 @@ class DvlDescription:
     noise_std: Three | None = None
     rate_hz: float | None = None
     speed: Three | None = None
-    sizes: Mapping[str, float] = field(default_factory=dict)
     others: tuple[Other, ...] = ()
     ambiguous: tuple[tuple[str, ...], ...] = ()
     doubts: tuple[str, ...] = ()
@@ -147,7 +146,6 @@ def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
         noise_std=_three(dvl["noise_std_mps"]),
         rate_hz=float(dvl["rate_hz"]),
         speed=_three(dvl["speed_mps"]),
-        sizes=sizes,
         others=_others(document, found, sizes),
         ambiguous=tuple(
             (each["name"], *each["equivalent_to"]) for each in document["effects"] if each.get("equivalent_to")

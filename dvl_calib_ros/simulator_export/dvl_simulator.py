@@ -86,7 +86,6 @@ def write(description: DvlDescription) -> Settings:
         above + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120),
         found,
         own,
-        frozenset({"lever_arm", "scale", "velocity_bias"}),
         beams.axis_std if beams else None,
         scale,
         (
@@ -95,6 +94,7 @@ def write(description: DvlDescription) -> Settings:
             "rotation_body_to_sensor_frame holds yaw, pitch, roll, and the lever arm is in the sensor's axes: so its "
             "sources take them",
         ),
+        frozenset({"scale", "velocity_bias"}),
     )
 
 

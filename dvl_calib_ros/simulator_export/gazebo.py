@@ -63,7 +63,7 @@ def write(description: DvlDescription) -> Settings:
     for name in ("resolution", "maximum_range", "minimum_range"):
         ET.SubElement(dvl, name).text = repr(values[name])
     ET.SubElement(dvl, "reference_frame").text = values["reference_frame"]
-    return Settings(xml_text(root), found, own, frozenset({"lever_arm"}), beams.axis_std if beams else None)
+    return Settings(xml_text(root), found, own, beams.axis_std if beams else None)
 
 
 SIMULATOR = Simulator(

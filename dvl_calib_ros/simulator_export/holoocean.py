@@ -45,7 +45,6 @@ def write(description: DvlDescription) -> Settings:
         json.dumps(sensor, indent=2, allow_nan=False) + "\n",
         found,
         own,
-        frozenset({"lever_arm"}),
         beams.axis_std if beams else None,
         remarks=(
             "no socket is named, so location is from the agent's centre: add what lies between",

@@ -9,7 +9,7 @@ from ..disk.atomic import own_stream, save_all
 from ..disk.text_files import as_json
 from ..errors import InputError
 from ..version import __version__
-from . import dave, dvl_simulator, gazebo, holoocean, stonefish, uuv_simulator
+from . import dvl_simulator, gazebo, holoocean, stonefish
 from .dvl_description import load_description
 from .writer import Export, Simulator, export, export_document
 
@@ -18,8 +18,6 @@ SIMULATORS: Mapping[str, Simulator] = {
     "stonefish": stonefish.SIMULATOR,
     "holoocean": holoocean.SIMULATOR,
     "dvl-simulator": dvl_simulator.SIMULATOR,
-    "dave": dave.SIMULATOR,
-    "uuv_simulator": uuv_simulator.SIMULATOR,
 }
 
 

@@ -48,7 +48,6 @@ def write(description: DvlDescription) -> Settings:
         xml_text(sensor),
         found,
         own,
-        frozenset({"lever_arm"}),
         None if std is None else (std, std, std),
         remarks=("velocity_percent stays 0: its noise would shrink going astern, as it goes by the signed velocity",),
     )

@@ -33,18 +33,17 @@ class Settings:
     """What a writer makes of a description.
 
     text: the file. found: settings by name that are from what was found; defaults: those that are the simulator's own.
-    represented: what of `lever_arm`, `scale`, `velocity_bias` is in the file. noise_std: (3,) m/s that its axes have
-    with these settings, None where the default noise stands. scale: the one error of all axes. remarks: what whoever
-    uses the file should know.
+    noise_std: (3,) m/s of its axes with these settings; None at the default noise. scale: the one error of all axes.
+    remarks: for the user of the file. represented: which of `scale` and `velocity_bias` are in the file.
     """
 
     text: str
     found: Mapping[str, Any]
     defaults: Mapping[str, Any]
-    represented: frozenset[str]
     noise_std: tuple[float, float, float] | None = None
     scale: float = 0.0
     remarks: tuple[str, ...] = ()
+    represented: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -92,14 +91,10 @@ def export_document(export: Export, description: DvlDescription, version: str) -
 def _missing(title: str, settings: Settings, description: DvlDescription) -> list[Missing]:
     why = _WHY_NOT.format(title)
     found = []
-    for name, values, unit in (
-        ("lever_arm", description.lever_arm, "m"),
-        ("velocity_bias", description.velocity_bias, "m/s"),
-    ):
-        if any(values) and name not in settings.represented:
-            says = f"{', '.join(f'{value:.3g}' for value in values)} {unit}; {why}"
-            size = float(np.linalg.norm(values)) if name == "velocity_bias" else description.sizes.get(name)
-            found.append(Missing(name, says, size))
+    bias = description.velocity_bias
+    if any(bias) and "velocity_bias" not in settings.represented:
+        says = f"{', '.join(f'{value:.3g}' for value in bias)} m/s; {why}"
+        found.append(Missing("velocity_bias", says, float(np.linalg.norm(bias))))
     found += _scale(title, settings, description)
     found += _noise(settings, description)
     for other in description.others:

@@ -66,7 +66,7 @@ COMMAND = {
     "apply to an instrument": Command("apply result.yaml --instrument ardupilot", ("result.yaml",), ("--settings",)),
     "apply in place": Command("apply result.yaml", ("result.yaml",), ("--urdf", "--launch")),
     "compare": Command("compare result.yaml bag", ("result.yaml", "bag", "bag/bag.mcap"), ("--json", "--report")),
-    "export": Command("export dave result.yaml", ("result.yaml",), ("-o",)),
+    "export": Command("export gazebo result.yaml", ("result.yaml",), ("-o",)),
     "fleet": Command("fleet bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), (), ("--out",)),
     "salvage": Command("salvage bag loose/run.db3", ("bag", "bag/bag.mcap", LOOSE), (), ("-o",)),
     "import": Command(

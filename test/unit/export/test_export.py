@@ -31,7 +31,6 @@ FOUND = DvlDescription(
     noise_std=STD,
     rate_hz=5.0,
     speed=(1.4, 0.1, 0.1),
-    sizes={"lever_arm": 0.12},
     others=(Other("dvl_time_offset", {"seconds": 0.3}, 0.11),),
 )
 VELOCITY = np.array([[1.5, 0.1, -0.2], [-0.7, 0.3, 0.0], [2.0, 0.0, 0.1]])
@@ -96,12 +95,11 @@ def test_mounting_rate_and_noise_are_read_back_as_they_were_found(name, tmp_path
 
 
 @pytest.mark.parametrize("name", SIMULATORS)
-def test_a_simulator_says_of_a_lever_arm_what_it_does_with_it(name, tmp_path):
+def test_a_lever_arm_is_read_back_and_a_delay_is_listed_as_missing(name, tmp_path):
     exported, dvl = read_back(name, FOUND, tmp_path / "file")
-    has_none = name == "uuv_simulator"
-    np.testing.assert_allclose(dvl.lever_arm, np.zeros(3) if has_none else FOUND.lever_arm, atol=1e-8)
+    np.testing.assert_allclose(dvl.lever_arm, FOUND.lever_arm, atol=1e-8)
     said = {each.name: each.error for each in exported.missing}
-    assert said.get("lever_arm") == (0.12 if has_none else None)
+    assert "lever_arm" not in said
     assert said["dvl_time_offset"] == 0.11
 
 
@@ -130,8 +128,7 @@ def test_any_mounting_and_lever_arm_come_back(tmp_path_factory, rpy, lever_arm, 
     path = tmp_path_factory.mktemp("any") / "file"
     _, dvl = read_back(name, DvlDescription("d.json", rpy, lever_arm, noise_std=STD, rate_hz=4.0), path)
     np.testing.assert_allclose(dvl.rotation, Rotation.from_euler("xyz", rpy).as_matrix(), atol=1e-7)
-    if name != "uuv_simulator":
-        np.testing.assert_allclose(dvl.lever_arm, lever_arm, atol=1e-7)
+    np.testing.assert_allclose(dvl.lever_arm, lever_arm, atol=1e-7)
 
 
 def test_a_beam_angle_is_found_from_the_noise_where_beams_can_have_it(tmp_path):
@@ -148,7 +145,7 @@ def test_a_beam_angle_is_found_from_the_noise_where_beams_can_have_it(tmp_path):
 def test_what_is_not_known_is_at_the_defaults_and_named_so(name, tmp_path):
     calibrated = DvlDescription("calibration.yaml", (0.0, 0.0, 0.1), (0.5, 0.0, 0.0))
     exported = export(name, SIMULATORS[name], calibrated)
-    rates = {"update_rate", "rate", "Hz", "sample_time", "updateRateHZ"}
+    rates = {"update_rate", "rate", "Hz", "sample_time"}
     assert rates & set(exported.settings.defaults) and not rates & set(exported.settings.found)
     assert not set(exported.settings.defaults) & set(exported.settings.found)
 
@@ -178,8 +175,7 @@ def test_the_command_writes_settings_and_beside_them_what_is_missing(name, diagn
     assert beside["found"] and beside["defaults"]
     for default in beside["defaults"]:
         assert default in out
-    if name != "uuv_simulator":
-        np.testing.assert_allclose(dvl.lever_arm, [-1.85, 0.0, 0.1], atol=1e-8)
+    np.testing.assert_allclose(dvl.lever_arm, [-1.85, 0.0, 0.1], atol=1e-8)
 
 
 def test_what_no_effect_explains_is_said_to_stay(tmp_path, capsys):
@@ -200,7 +196,7 @@ def test_a_file_before_is_kept_as_a_backup(diagnosis, tmp_path, capsys):
 def test_a_source_with_two_hyphens_leaves_the_xml_well_formed(tmp_path, capsys):
     odd = tmp_path / "a--b-->.json"
     odd.write_text(json.dumps(document()))
-    for name in ("gazebo", "stonefish", "dave", "uuv_simulator"):
+    for name in ("gazebo", "stonefish"):
         succeed(capsys, "export", name, odd, "-o", tmp_path / name)
         READERS[name](tmp_path / name)
 
@@ -299,8 +295,9 @@ def test_the_diagnosis_of_a_bag_says_what_the_export_needs(tmp_path, capsys):
     assert found.noise_std == pytest.approx((0.0103, 0.0103, 0.0027), rel=0.1)
     assert found.scale[0] == pytest.approx(0.008, abs=0.002)
     # ω × l of the whole lever arm, not only of what was found on top
-    assert 0.05 < found.sizes["lever_arm"] < 0.3
-    assert found.sizes["scale"] == pytest.approx(0.008 * found.speed[0], rel=0.25)
+    sizes = json.loads((tmp_path / "d.json").read_text())["dvl"]["sizes_mps"]
+    assert 0.05 < sizes["lever_arm"] < 0.3
+    assert sizes["scale"] == pytest.approx(0.008 * found.speed[0], rel=0.25)
 
 
 def test_repeated_samples_have_a_size(tmp_path, capsys):
@@ -318,8 +315,9 @@ def test_a_recording_without_an_imu_is_diagnosed_and_exported_with_the_lever_arm
     given_before = ("-p", "mounting_rpy:=[0.0,0.0,0.0]", "-p", "lever_arm:=[0.5,0.0,0.0]", "-p", "dvl_time_offset:=0.1")
     succeed(capsys, "diagnose", tmp_path / "bag", "--json", tmp_path / "d.json", *given_before)
     found = load_description(tmp_path / "d.json")
-    assert found.lever_arm == (0.5, 0.0, 0.0) and "lever_arm" not in found.sizes
-    assert 0.0 < found.sizes["dvl_time_offset"] < 0.2
+    sizes = json.loads((tmp_path / "d.json").read_text())["dvl"]["sizes_mps"]
+    assert found.lever_arm == (0.5, 0.0, 0.0) and "lever_arm" not in sizes
+    assert 0.0 < sizes["dvl_time_offset"] < 0.2
     assert {"seconds": pytest.approx(0.1, abs=0.12)} in [each.parameters for each in found.others]
 
 
