@@ -215,7 +215,7 @@ def print_document(document: Document) -> None:
 
     print_warnings(document.warnings)
     out = console()
-    for each in shown(document, out.width if out.is_terminal else None):
+    for each in shown(document):
         out.print(each, soft_wrap=isinstance(each, Text) and bool(each.no_wrap))
 
 

@@ -21,7 +21,6 @@ from ..verdict.reasons import Reason
 if TYPE_CHECKING:
     import pandas
 
-    from ..calibration.assessment.dead_reckoning import Navigation
     from .figure_style import Picture
 
 
@@ -285,22 +284,13 @@ class Legend:
 
 
 @dataclass(frozen=True)
-class Map:
-    """A track, for a terminal that people look at."""
-
-    navigation: Navigation
-
-
-@dataclass(frozen=True)
 class Warned:
     """Where a page has the document's warnings: before all sections, where none says so."""
 
     warned: bool = True
 
 
-Item = (
-    Warned | Sentence | Table | Figures | SideBySide | FindingLine | Commands | Facts | Numbers | Worth | Legend | Map
-)
+Item = Warned | Sentence | Table | Figures | SideBySide | FindingLine | Commands | Facts | Numbers | Worth | Legend
 
 
 @dataclass(frozen=True)

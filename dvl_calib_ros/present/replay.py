@@ -32,7 +32,6 @@ from .document import (
     Document,
     Item,
     Legend,
-    Map,
     Number,
     Numbers,
     Section,
@@ -196,7 +195,6 @@ def replayed(
                 "What it means for navigation",
                 None if worth is None else Sentence(STRAIGHT.format(worth)),
                 *map(Sentence, in_words(drift) if drift else ()),
-                Map(drift) if drift and drift.on_a_map else None,
                 figures("replay_figures.navigation_pictures", drift, {"": drift}, "", history.stamps_ns)
                 if drift and history
                 else None,

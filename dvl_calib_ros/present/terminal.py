@@ -13,7 +13,7 @@ from rich.text import Text
 
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason
-from .document import Cell, Commands, Document, Facts, FindingLine, Map, Numbers, Sentence, Table, Where
+from .document import Cell, Commands, Document, Facts, FindingLine, Numbers, Sentence, Table, Where
 
 if TYPE_CHECKING:
     from rich.padding import Padding
@@ -120,14 +120,9 @@ COLOURS = {
 _STYLES = {"good": "green", "off": "yellow", "far": "yellow", "bad": "red"}
 
 
-def shown(document: Document, width: int | None = None) -> Iterator[Any]:
-    """What rich prints of a document, but for its warnings, one after the other.
-
-    width: of a terminal that people look at, characters.
-    """
+def shown(document: Document) -> Iterator[Any]:
+    """Yield what rich prints of a document, without its warnings."""
     from rich.text import Text
-
-    from .terminal_map import terminal_map
 
     if document.lead:
         yield from _found(document.lead)
@@ -159,8 +154,6 @@ def shown(document: Document, width: int | None = None) -> Iterator[Any]:
                 yield from (Text(f"{name}: {value}") for name, value in item.facts.items() if value)
             elif isinstance(item, Numbers):
                 yield rich_table(item.table)
-            elif isinstance(item, Map) and width is not None:
-                yield terminal_map(item.navigation, width)
 
 
 def _found(reason: Reason) -> Iterator[Padding]:

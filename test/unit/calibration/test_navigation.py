@@ -14,7 +14,6 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
 from dvl_calib_ros.calibration.streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
-from dvl_calib_ros.present.terminal_map import terminal_map
 from dvl_calib_ros.verdict.kinds import Severity
 
 YAW = math.radians(1.0)
@@ -122,17 +121,6 @@ def test_ten_hours_take_seconds_and_keep_a_bounded_track():
     found = navigated(data)
     assert time.process_time() - start < 10.0
     assert found is not None and len(found.reference) <= 1500 and found.stretch_m == pytest.approx(1000.0, rel=0.01)
-
-
-@pytest.mark.parametrize("width", [20, 80, 200])
-def test_the_map_on_a_terminal_fits_and_names_its_tracks(width):
-    found = navigated(recording(300.0, turn_rate=0.01, phi=(0.0, 0.0, 5 * YAW)))
-    assert found is not None
-    rows = terminal_map(found, width).plain.splitlines()
-    assert all(len(row) <= min(width, 60) for row in rows[:-1]) and len(rows) <= 16
-    assert "reference" in rows[-1] and "corrected" in rows[-1]
-    straight = navigated(recording(100.0))
-    assert straight is not None and terminal_map(straight, 80).plain
 
 
 def test_a_correction_that_makes_the_track_worse_is_rejected_where_velocities_do_not_fit_clearly_better():
