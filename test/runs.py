@@ -9,6 +9,7 @@ import numpy as np
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import (
     FRAME_CODES,
@@ -22,7 +23,6 @@ from dvl_calib_ros.calibration.numerics.samples import (
     VelocityFrame,
     sample_block,
 )
-from dvl_calib_ros.simulation.sensors import measure_dvl_matched
 from dvl_calib_ros.simulation.trajectories import Motion, make_motion
 
 START_NS = 1_700_000_000_123_456_789
@@ -65,8 +65,8 @@ def _made(run: MatchedRun) -> tuple[DvlSample | ReferenceSample | ImuSample, ...
     motion, orientations = _motion(run.trajectory, run.seconds)
     mounting = rotation_from_rpy(run.mounting_rpy).T
     at_dvl = motion.velocity_body + np.cross(motion.angular_velocity, run.lever_arm)
-    scale = np.full(3, run.scale)
-    measured = measure_dvl_matched(at_dvl, np.array(run.phi), scale, run.dvl_std, mounting, rng)
+    measured = distort(at_dvl, np.array(run.phi), np.full(3, run.scale), mounting)
+    measured = measured + rng.normal(0.0, run.dvl_std, measured.shape)
     reference = motion.velocity_body + rng.normal(0, run.gnss_std, motion.velocity_body.shape)
     if run.frame is not VelocityFrame.BODY:
         reference = np.einsum("nij,nj->ni", motion.rotation_enu_from_body, reference)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..calibration.numerics.error_model import distort
 from ..calibration.numerics.frames import Array, rotation_from_rpy
 
 JANUS_FROM_VERTICAL = np.deg2rad(20.0)
@@ -86,19 +85,6 @@ def measure_dvl(
 def axis_covariance(beam_std: float) -> Array:
     """Covariance (3, 3) (m/s)² of the axes for white noise on the beams."""
     return beam_std**2 * AXES_FROM_BEAMS @ AXES_FROM_BEAMS.T
-
-
-def measure_dvl_matched(
-    velocity_body: Array,
-    misalignment: Array,
-    scale: Array,
-    std: float,
-    rotation_dvl_from_body: Array,
-    rng: np.random.Generator,
-) -> Array:
-    """As the models assume it: the error model itself (φ rad, δk, DVL frame) and white noise per axis; (N, 3) m/s."""
-    measured = distort(velocity_body, misalignment, scale, rotation_dvl_from_body)
-    return measured + rng.normal(0.0, std, measured.shape)
 
 
 def measure_gnss(velocity: Array, std: float, rng: np.random.Generator) -> Array:

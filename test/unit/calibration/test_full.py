@@ -20,11 +20,11 @@ from dvl_calib_ros.calibration.models.own import DELAY
 from dvl_calib_ros.calibration.models.own import LEVER_ARM as LEVER_ARM_STATES
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.block_covariance import MOST, TimeBlocks
+from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.results.velocity_correction import lever_arm
 from dvl_calib_ros.calibration.streams.interpolation import local_fit, reach_at, spacing_at
-from dvl_calib_ros.simulation.sensors import measure_dvl_matched
 from dvl_calib_ros.simulation.trajectories import body_rates
 from dvl_calib_ros.verdict.kinds import Severity
 
@@ -45,7 +45,7 @@ def late(seconds: float, seed: int = 0, arm=LEVER_ARM, duration: float = 150.0, 
     rng = np.random.default_rng(seed)
     time, body, rates, rotation, orientations = _figure_of_eight(duration, tuple(bursts))
     at_dvl = body + np.cross(rates, arm)
-    measured = measure_dvl_matched(at_dvl, np.array(PHI), np.zeros(3), DVL_STD, np.eye(3), rng)
+    measured = distort(at_dvl, np.array(PHI), np.zeros(3), np.eye(3)) + rng.normal(0.0, DVL_STD, at_dvl.shape)
     reference = np.einsum("nij,nj->ni", rotation, body) + rng.normal(0.0, GNSS_STD, body.shape)
     samples = []
     for i in range(len(time)):
