@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -55,16 +55,13 @@ BODY_AXES = ("ahead", "to port", "up")
 TRACE_POINTS = 400
 CONVERGENCE_NOTE = (
     "Error of the misalignment, ° rms: of the whole angle / of pitch and yaw alone. Calibrated on each run with "
-    f"attitude, for each noise of the reference. A published network has {PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s."
+    f"attitude, for each noise of the reference. A published network has {PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s. "
+    "Only turns make roll observable: without them the whole angle keeps the error of the prior."
 )
 BASELINES_NOTE = (
     "The rotation alone by least squares on SO(3): of displacements (Kinsey and Whitcomb, 2007; here of the integrated "
     "reference velocity, whose noise grows with time, where they had positions), and of velocities (Troni and "
     "Whitcomb, 2010). They have neither scale nor prior."
-)
-CONVERGENCE_CAPTION = (
-    "Calibrated on each run with attitude, from ten seconds on, with a reference of this noise or none. Roll is shown "
-    "by turns only: without them the whole angle stays near that of the prior."
 )
 # How names of states begin, and how people read them
 SYMBOLS = {"phi_": "φ", "delta_k": "δk", "delta_k_": "δk "}
@@ -107,10 +104,14 @@ def evaluation(e: Evaluation) -> Document:
     others = [(name, *(f"{value:.4f}" for value in each), f"{each.mean():.4f}") for name, each in e.baselines.items()]
     baselines = Table(("Avg.VRMSE, m/s", *(each.name for each in e.sets), "mean"), others, notes=(BASELINES_NOTE,))
     where = "mean over the sets" if len(e.sets) > 1 else f"set {e.sets[0].name}"
-    found = [
-        Number(UNCALIBRATED, f"{e.set_mean[e.columns.index(UNCALIBRATED)]:.4f} m/s", note=f"Avg.VRMSE, {where}"),
-        *(Number(f"best {w}", f"{value:.4f} m/s", note=name) for w, (name, value) in e.best(e.set_mean).items()),
-    ]
+    uncalibrated = e.set_mean[e.columns.index(UNCALIBRATED)]
+    published = e.best(e.published_of_these.mean(axis=0))
+    found = [Number(UNCALIBRATED, f"{uncalibrated:.4f} m/s", note=f"Avg.VRMSE, {where}")]
+    for words, (name, value) in e.best(e.set_mean).items():
+        note = f"{name}, {100.0 * (1.0 - value / uncalibrated):.0f} % less than uncalibrated"
+        if words in published:
+            note += "; best published: {} with {:.4f} m/s".format(*published[words])
+        found.append(Number(f"best {words}", f"{value:.4f} m/s", note=note))
     return Document(
         title="Evaluation of the DVL calibration models",
         subtitle=e.source,
@@ -123,8 +124,8 @@ def evaluation(e: Evaluation) -> Document:
             section("", facts_by(FACTS, e)),
             section("", Warned(), where=Where.PAGE),
             section("Velocity error after calibration", *_scores(e)),
-            *_by_time(e),
-            *(_converging(e) if e.convergence else []),
+            _by_time(e),
+            *([_converging(e)] if e.convergence else []),
             section("What was done before", baselines),
             *(
                 section(f"Can the uncertainty be trusted? {title}", *_coverage(found))
@@ -132,7 +133,7 @@ def evaluation(e: Evaluation) -> Document:
                 if found
             ),
             *([_pull(e.errors_in_variables)] if e.errors_in_variables is not None else []),
-            *(each for study, title in studies if study is not None and study.runs for each in _study(e, study, title)),
+            *(_study(e, study, title) for study, title in studies if study is not None and study.runs),
             *([_held_out(e.held_out)] if e.held_out else []),
             *map(_trace, e.traces),
         ],
@@ -141,15 +142,7 @@ def evaluation(e: Evaluation) -> Document:
 
 
 def _summary(e: Evaluation) -> Iterable[str]:
-    """What was found, in sentences."""
-    uncalibrated = e.set_mean[e.columns.index(UNCALIBRATED)]
-    published = e.best(e.published_of_these.mean(axis=0))
-    for words, (name, value) in e.best(e.set_mean).items():
-        gain = 100.0 * (1.0 - value / uncalibrated)
-        sentence = f"Best {words}: {name} with {value:.4f} m/s, {gain:.0f} % less than uncalibrated"
-        if words in published:
-            sentence += "; best published: {} with {:.4f} m/s".format(*published[words])
-        yield sentence + "."
+    """Summarise in sentences."""
     if e.each is not None and e.each.runs:
         medians = e.best(e.each.median()).items()
         found = ", ".join(f"{name} {value:.4f} m/s {words}" for words, (name, value) in medians)
@@ -198,16 +191,15 @@ def _scores(e: Evaluation) -> Iterable[Item]:
     )
 
 
-def _by_time(e: Evaluation) -> Iterator[Section]:
-    """Error against how long was calibrated, by set."""
-    title = "Velocity error against calibration time"
+def _by_time(e: Evaluation) -> Section:
+    """Lay out the error by set and calibration time."""
     rows = [
         (each.name, "all" if window is None else f"{window:g} s", *(number(value, 4) for value in row.tolist()))
         for each, of_set in zip(e.sets, e.seed_mean_by_time, strict=True)
         for window, row in zip(e.windows_s, of_set, strict=True)
     ]
-    table = Table(("set", "first", *e.columns), rows, notes=("Avg.VRMSE, m/s.",), words=2)
-    yield section(title, table, where=Where.TERMINAL)
+    table = Table(("set", "first", *e.columns), rows, notes=("Avg.VRMSE, m/s.",), words=2, dense=True)
+    rings = "Rings: published." if np.isfinite(e.published_of_these).any() else ""
     drawn = [
         figure(
             "evaluation_figures.error_over_calibration_time",
@@ -219,26 +211,21 @@ def _by_time(e: Evaluation) -> Iterator[Section]:
             e.of_models(e.seed_mean_by_time[i]),
             each.window_s,
             e.of_models(e.published_of_these[i]),
+            caption=rings,
         )
         for i, each in enumerate(e.sets)
     ]
-    is_published = bool(np.isfinite(e.published_of_these).any())
-    rings = Sentence("Rings: published.", soft=True) if is_published else None
-    yield section(title, Legend(e.models, ""), rings, SideBySide(drawn), where=Where.PAGE)
+    return section("Velocity error against calibration time", Legend(e.models, ""), SideBySide(drawn), table)
 
 
-def _converging(e: Evaluation) -> Iterator[Section]:
-    """Error of the misalignment against time."""
-    title = "How fast is the misalignment found?"
+def _converging(e: Evaluation) -> Section:
+    """Lay out the error of the misalignment against time."""
     rows = [
         (f"{seconds:g} s", *(f"{each.angle_deg[k]:.2f} / {each.level_deg[k]:.2f}" for each in e.convergence))
         for k, seconds in enumerate(TIMES_S)
     ]
-    table = Table(("first", *(each.label for each in e.convergence)), rows, notes=(CONVERGENCE_NOTE,))
-    yield section(title, table, where=Where.TERMINAL)
+    table = Table(("first", *(each.label for each in e.convergence)), rows, notes=(CONVERGENCE_NOTE,), dense=True)
     shown = [each for each in e.convergence if each.name in MODELS]
-    if not shown:
-        return
     drawn = []
     for what, values in (
         ("Pitch and yaw", [each.level_deg for each in shown]),
@@ -258,7 +245,7 @@ def _converging(e: Evaluation) -> Iterator[Section]:
                 caption="rms over runs, combinations of errors and seeds. Star: published for a network.",
             )
         )
-    yield section(title, Sentence(CONVERGENCE_CAPTION, soft=True), SideBySide(drawn), where=Where.PAGE)
+    return section("How fast is the misalignment found?", SideBySide(drawn) if shown else None, table)
 
 
 def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
@@ -325,7 +312,7 @@ def _pull(study: ErrorsInVariables) -> Section:
     )
 
 
-def _study(e: Evaluation, study: EachStudy, title: str) -> list[Section]:
+def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
     rows = []
     for run, label, values, observed in zip(
         study.runs, study.run_names, study.seed_mean.tolist(), study.yaw_observed.tolist(), strict=True
@@ -358,10 +345,7 @@ def _study(e: Evaluation, study: EachStudy, title: str) -> list[Section]:
         e.of_models(study.seed_mean),
         caption="Bars: uncalibrated. Filled: models with GNSS. Hollow: without.",
     )
-    return [
-        section(title, table, where=Where.TERMINAL),
-        section(title, Legend(e.models, ""), by_run, table, where=Where.PAGE),
-    ]
+    return section(title, Legend(e.models, ""), by_run, table)
 
 
 def _held_out(held_out: Sequence[HeldOut]) -> Section:
