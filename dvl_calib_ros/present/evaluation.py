@@ -119,7 +119,6 @@ def evaluation(e: Evaluation) -> Document:
         warnings=e.notes,
         sections=[
             section("", Sentence(f"{e.source}: {len(e.trajectories)} trajectories"), where=Where.TERMINAL),
-            section("", *map(Sentence, _summary(e))),
             section("", Numbers(found)),
             section("", facts_by(FACTS, e)),
             section("", Warned(), where=Where.PAGE),
@@ -141,21 +140,6 @@ def evaluation(e: Evaluation) -> Document:
     )
 
 
-def _summary(e: Evaluation) -> Iterable[str]:
-    """Summarise in sentences."""
-    if e.each is not None and e.each.runs:
-        medians = e.best(e.each.median()).items()
-        found = ", ".join(f"{name} {value:.4f} m/s {words}" for words, (name, value) in medians)
-        yield f"Calibrated on each of {len(e.each.runs)} runs with attitude, best medians: {found}."
-    if e.own_generator:
-        yield "The trajectories are simulated: the published figures do not apply to them."
-    else:
-        ratio = e.ratio[np.isfinite(e.ratio)]
-        if len(ratio):
-            near = int((np.abs(ratio - 1.0) <= 0.25).sum())
-            yield f"{near} of {len(ratio)} published cells are met within 25 %."
-
-
 def _scores(e: Evaluation) -> Iterable[Item]:
     """Avg.VRMSE, a line per model and a column per set, with the published figure and the ratio to it below; and how
     much of the error is gone, by model."""
@@ -172,8 +156,12 @@ def _scores(e: Evaluation) -> Iterable[Item]:
     notes = [
         "Avg.VRMSE in m/s: root mean square of the velocity error, mean over trajectories, combinations and seeds."
     ]
+    if e.own_generator:
+        notes.append("The trajectories are simulated: the published figures do not apply to them.")
     if np.isfinite(published).any():
+        near = e.ratio[np.isfinite(e.ratio)]
         notes.append(
+            f"{int((np.abs(near - 1.0) <= 0.25).sum())} of {len(near)} published cells are met within 25 %. "
             "Below each: the published figure and the ratio to it; green within 5 %, yellow 25 %, orange 50 %, red "
             "beyond. Means are those of the cells beside them, not the paper's."
         )
