@@ -275,6 +275,3 @@ class _Seen:
             yield np.cos(k * yaw)
         for k in range(1, 9):
             yield np.cos(np.pi * k * share)
-
-
-N_GENERIC = 3 * (10 + 6 + 8)

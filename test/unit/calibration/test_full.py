@@ -256,18 +256,6 @@ def test_blocks_that_are_gathered_see_no_more_than_each_by_itself(seed):
     assert held_out.samples == beside.samples and held_out.corrected == pytest.approx(beside.corrected, rel=1e-9)
 
 
-def in_waves(samples):
-    """The same in a swell that both measure, and with references that are off by half a metre per second for a while,
-    which neighbours do not show to be spikes."""
-    for sample in samples:
-        if not isinstance(sample, ImuSample):
-            seconds = 1e-9 * (sample.stamp_ns - START_NS)
-            heave = 0.3 * np.sin(2.0 * np.pi * seconds / 8.3) + 0.15 * np.sin(2.0 * np.pi * seconds / 97.0)
-            off = 0.5 if isinstance(sample, ReferenceSample) and 90.0 < seconds % 100.0 < 92.0 else 0.0
-            sample = sample._replace(velocity=tuple(np.add(sample.velocity, (off, -off, heave)).tolist()))
-        yield sample
-
-
 class Lazy:
     """A worker that does nothing before somebody waits for it, the latest that it could be done."""
 
