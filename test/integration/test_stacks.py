@@ -158,7 +158,8 @@ def test_the_answer_says_what_was_found_the_mounting_to_paste_and_what_to_type(b
     assert '<origin xyz="-0.6 0.15 -0.3" rpy="' in out
     assert f"next  dvl-calib replay {bag} --save calibration.yaml" in out
     assert "m of drift per km as mounted" in out
-    assert "gated" not in out and "M3" not in out
+    assert "gated" not in out and "M1" not in out
+    assert "The paper's own selection (iac, M3): roll" in out
     document = json.loads((tmp_path / "o.json").read_text())
     assert document["discovery"]["topics"]["gnss"] == "/ins/velocity"
 
