@@ -147,7 +147,7 @@ def test_on_a_phone_no_table_of_a_fleet_is_scrolled_and_every_value_has_its_head
                td => getComputedStyle(td, '::before').content.replaceAll('"', '') || '-')])"""
     )
     assert len(tables) >= 2 and all(fits for fits, _ in tables)
-    assert next(headings for _, headings in tables if headings)[2:4] == ["mounting", "roll, °"]
+    assert next(headings for _, headings in tables if headings)[2:5] == ["mounting", "seen from, °", "roll, °"]
     page.close()
 
 

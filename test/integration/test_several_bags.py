@@ -60,7 +60,7 @@ def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(
     bags = [place / "wednesday", place / "monday", place / "tuesday"]  # in any order
     out, _ = succeed(capsys, "replay", *bags, "--json", tmp_path / "r.json", "--save", tmp_path / "r.yaml")
     said = " ".join(out.split())
-    assert re.search(r"reject: Do not use this calibration. The mounting differs by [23]\.\d\d° ± 0", said)
+    assert re.search(r"reject: Do not use this calibration. The mounting differs in yaw by \+?-?[23]\.\d\d° ± 0", said)
     assert "5 Hz" in said and "360 s of data" in said  # the nights are not counted
     assert "(tuesday) and" in said and "(wednesday): the average of all" in said
     document = json.loads((tmp_path / "r.json").read_text())
@@ -82,7 +82,7 @@ def test_a_mounting_that_moved_is_not_hidden_by_the_bias_of_the_dvl(place):
 def test_who_asks_to_merge_gets_it_with_a_note(place):
     run = dc.replay([place / "monday", place / "wednesday"], merge=True)
     assert run.verdict != "reject"
-    assert any(note.startswith("merged as asked: the mounting differs by") for note in run.replayed.notes)
+    assert any(note.startswith("merged as asked: the mounting differs in yaw by") for note in run.replayed.notes)
 
 
 @pytest.mark.slow
@@ -117,7 +117,7 @@ def test_an_initial_calibration_that_the_data_contradict_is_said_and_left_out(pl
     contradicted = Parameters(initial_calibration=str(tmp_path / "wednesday.yaml"))
     replayed = checked_replay([place / "tuesday"], contradicted)
     (found,) = [each for each in replayed.findings if each.code == "INITIAL_CONTRADICTED"]
-    assert re.search(r"the mounting has moved by -3\.[0-4]", found.says)
+    assert re.search(r"the mounting has moved in yaw by -3\.[0-4]", found.says)
     alone = replay([place / "tuesday"], Parameters()).result
     assert (replayed.result.estimate.state == alone.estimate.state).all()
     fitting = checked_replay([place / "tuesday"], Parameters(initial_calibration=str(tmp_path / "monday.yaml")))
