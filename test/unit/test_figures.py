@@ -20,9 +20,7 @@ from validation.figures.unmarked import unmarked
 DEFINITIONS = {
     "evaluation.md": ("R 0.2 m/s with GNSS and 0.025 m/s without",),
     "glossary.md": ("differ by less than 2 σ",),
-    "lever_arm.md": (
-        "two hundred simulated runs of 120 s", "delays within 2.9 s", "mounting_rpy 0 0 0.785",
-    ),
+    "lever_arm.md": ("two hundred simulated runs of 120 s", "delays within 2.9 s"),
     "models.md": (
         "the paper's own, 0.0323", "`reference_offset_std` (5 mm/s", "within the 68 / 95 % interval",
         "(1.9988, -0.0698, 0)", "memory 55 s (2.8)", "σ 0.05 m with", "yaw +2°. Driving ahead",
