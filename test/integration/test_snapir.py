@@ -160,7 +160,7 @@ def test_recordings_of_one_vehicle_agree_within_their_sigmas_and_its_mounting_ha
     assert compared[1] == compared[3] == compared[6] == 6
     assert within[2] == 6  # yaw
     assert comparison.same_mounting and not comparison.scale_changed
-    arms = [each.lever_arm[0] for each in found if each.name != "T13"]  # which hardly turns
+    arms = [each.value[3] for each in found if each.name != "T13"]  # which hardly turns
     assert np.ptp(arms) < 0.05 and abs(np.mean(arms) + 1.85) < 0.05
     for name, most in {"T01": 0.035, "T03": 0.020, "T05": 0.030, "T13": 0.012}.items():
         assert held_out[name] <= most, name
