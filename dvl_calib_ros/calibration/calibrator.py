@@ -506,7 +506,7 @@ class Calibrator:
         chosen = self._estimators.get(self.selected)  # None where it is not among the models wanted
         return Result(
             selected=self.selected,
-            of_paper=self.selection.of_paper(self.parameters),
+            iac_model=self.selection.iac_model(self.parameters),
             selected_because=self.selection.reason(self.parameters, None if chosen is None else chosen.evidence),
             estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._told},
             segments=tuple(self.selection.segments),

@@ -109,7 +109,7 @@ class CalibrationNode(AnsweringNode):
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
         self._correction: Correction | None = None
         self._corrected_by = ""
-        self._published = self._mounting_published = self._paper_published = ("", 0)
+        self._published = self._mounting_published = self._iac_published = ("", 0)
         self._pauses = Pauses(steady_s())
         self._save_problem: Reason | None = None
 
@@ -123,7 +123,7 @@ class CalibrationNode(AnsweringNode):
             durability=DurabilityPolicy.TRANSIENT_LOCAL,
         )
         self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", latched)
-        self._paper_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", latched)
+        self._iac_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", latched)
         self._mounting_publisher = self._publisher(PoseWithCovarianceStamped, "~/mounting", latched)
         self._mounting = MountingOutput(self, self._mounting_publisher, parameters.publish_tf, self._warn)
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
@@ -259,7 +259,7 @@ class CalibrationNode(AnsweringNode):
         self._begin(parameters, None, feed)
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         self._recent, self._correction = RecentCounts(), None
-        self._mounting_published = self._paper_published = ("", 0)
+        self._mounting_published = self._iac_published = ("", 0)
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Any:
         # every event callback is one more thing that the executor looks at for every message
@@ -374,16 +374,16 @@ class CalibrationNode(AnsweringNode):
         fill_errors(self._estimate, model, state, calibrator.last_ns, self._feed.decoder.dvl_frame)
         self._estimate_publisher.publish(self._estimate)
 
-    def _publish_paper(self) -> None:
+    def _publish_iac(self) -> None:
         """Once a second at most, what the paper's own selection says, with the covariance of its filter."""
         calibrator = self._calibrator
-        name = calibrator.selection.of_paper(calibrator.parameters)
+        name = calibrator.selection.iac_model(calibrator.parameters)
         state_of = (name, calibrator.n_given(name))
-        if state_of != self._paper_published and calibrator.last_ns is not None:
-            self._paper_published = state_of
+        if state_of != self._iac_published and calibrator.last_ns is not None:
+            self._iac_published = state_of
             message, state = empty_twist(), calibrator.state(name)
             fill_errors(message, MODELS[name], state, calibrator.last_ns, self._feed.decoder.dvl_frame)
-            self._paper_publisher.publish(message)
+            self._iac_publisher.publish(message)
 
     def _set_correction(self, model: Model, state: GaussianState) -> Correction:
         """Correct by this state from now on; its correction."""
@@ -442,7 +442,7 @@ class CalibrationNode(AnsweringNode):
     def _publish_diagnostics(self) -> None:
         self._discover()
         self._publish_mounting()
-        self._publish_paper()
+        self._publish_iac()
         decoder = self._feed.decoder
         problems = [*self._found, *decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
         problems += self._gravity.problems(self._inputs["imu/data"].topic_name, self._calibrator.parameters)

@@ -184,7 +184,7 @@ def diagnose(
         "model": estimate.model,
         "why": selection.reason(calibrator.parameters).sentence,
         "gnss": selection.gnss.reason.sentence,
-        "model of the paper": f"{selection.of_paper(calibrator.parameters)} (iac: {selection.gnss.reason.sentence})",
+        "model of the paper": f"{selection.iac_model(calibrator.parameters)} (iac: {selection.gnss.reason.sentence})",
         "gnss available": str(int(selection.gnss.available)),
         "convergence": estimate.convergence.value,
         "verdict": verdict.value,

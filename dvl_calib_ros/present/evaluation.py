@@ -15,15 +15,7 @@ from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.protocol import MANOEUVRING
-from ..evaluation.results import (
-    UNCALIBRATED,
-    Coverage,
-    EachStudy,
-    ErrorsInVariables,
-    Evaluation,
-    HeldOut,
-    Trace,
-)
+from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from .document import (
     CELL_KINDS,

@@ -281,18 +281,18 @@ def _mounting(run: Replayed) -> Iterator[Item]:
         yield Sentence(f"{axes} (?): not shown by this recording; it needs {lacks}")
     if (cause := run.cause_of_scale) is not None:
         yield Sentence(cause.sentence)
-    if run.result.of_paper in run.result.estimates and run.result.of_paper != run.result.selected:
-        yield Sentence(_of_paper(run.result))
+    if run.result.iac_model in run.result.estimates and run.result.iac_model != run.result.selected:
+        yield Sentence(_of_iac(run.result))
 
 
-def _of_paper(result: Result) -> str:
+def _of_iac(result: Result) -> str:
     """What the paper's own selection says of roll, pitch, yaw and scale."""
-    found = quantities(replace(result, selected=result.of_paper))
+    found = quantities(replace(result, selected=result.iac_model))
     said = ", ".join(
         f"{each.name} {each.in_unit(each.value)} ± {each.in_unit(each.std)}" if each.shown else f"{each.name} not shown"
         for each in found[:4]
     )
-    return f"The paper's own selection (iac, {result.of_paper}): {said}."
+    return f"The paper's own selection (iac, {result.iac_model}): {said}."
 
 
 def _paste(run: Replayed) -> Commands:

@@ -112,7 +112,7 @@ def test_the_papers_own_selection_is_published_whatever_is_selected(model, world
         sent = play(world, bag)
         until(lambda: diagnosed(diagnostics, "dvl received") == str(sent["dvl/twist"]), "all DVL samples")
         offline = replay([bag], Parameters()).result
-        assert offline.of_paper == "M3"
+        assert offline.iac_model == "M3"
         x = offline.estimates["M3"].state
 
         def angles():

@@ -188,7 +188,7 @@ class Selection:
             return EXTENDED_BY.get(aided, aided)
         return aided
 
-    def of_paper(self, parameters: Parameters) -> str:
+    def iac_model(self, parameters: Parameters) -> str:
         """Name of the model that the paper's own selection runs now, whatever is selected."""
         aided, unaided = published_models(parameters)
         return aided if self.gnss.available else unaided

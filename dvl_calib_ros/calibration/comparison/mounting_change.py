@@ -22,12 +22,12 @@ from ...errors import InputError
 from ...verdict.answering import Answering
 from ...verdict.kinds import Severity
 from ..numerics.frames import Array, near_angles
-from ..numerics.tests import chi2_sf, holm, normal_sf, smallest_found
+from ..numerics.tests import chi2_sf, holm, smallest_found
 from ..results.extrinsics import ANGLES, GROUPS, MOUNTING, N_AXES, N_COMPONENTS, ONLY_CLOCK, ONLY_SCALE, Extrinsics
 
 # False-alarm rates of one comparison, whatever its numbers of quantities and instants: a mounting has moved at the two-
 # sided 4 σ of a normal error and is suspicious at 2 σ; scale and delay have changed at 1 %.
-MOVED, SUSPICIOUS, CHANCE = normal_sf(4.0), normal_sf(2.0), 0.01
+MOVED, SUSPICIOUS, CHANCE = chi2_sf(16.0, 1), chi2_sf(4.0, 1), 0.01
 # Share of movements as large as `Comparison.smallest` that are found
 POWER = 0.9
 
@@ -76,7 +76,9 @@ class Difference:
     def p(self) -> Array:
         """(8,) two-sided p-values corrected for their number by Holm, nan for what is not compared."""
         found = np.full(N_COMPONENTS, np.nan)
-        found[self.compared] = holm([normal_sf(each) for each in (self.value / self.std)[self.compared]])
+        found[self.compared] = holm(
+            [chi2_sf(each, 1) for each in ((self.value / self.std) ** 2)[self.compared].tolist()]
+        )
         return found
 
     def chance(self, components: NDArray[np.intp] = _ALL) -> float:

@@ -24,11 +24,6 @@ def holm(p_values: Sequence[float]) -> Array:
     return adjusted
 
 
-def normal_sf(sigmas: float) -> float:
-    """Return how often a normal error exceeds so many σ to either side."""
-    return math.erfc(abs(sigmas) / math.sqrt(2.0))
-
-
 def smallest_found(p: float, power: float) -> float:
     """Return the true size, in σ, that a two-sided test of a normal error at level p finds with a power above 0.5."""
     return math.sqrt(chi2_isf(p, 1.0)) + math.sqrt(chi2_isf(2.0 * (1.0 - power), 1.0))

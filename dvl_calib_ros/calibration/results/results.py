@@ -170,8 +170,8 @@ class Result:
     `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values. verifications:
     by model, empty if the calibrator was not to verify. suggestion: what configuration the data fit, where the one
     given is grossly wrong, else ''. days: in order, none where there is one; days_of: the model whose states they are.
-    doubts: live, what the data say against the calibration, as bad as that is to the verdict of a replay. of_paper: the
-    model that the paper's own selection ends with.
+    doubts: live, what the data say against the calibration, as bad as that is to the verdict of a replay. iac_model:
+    the model that the paper's own selection ends with.
     """
 
     selected: str
@@ -187,7 +187,7 @@ class Result:
     days: tuple[Day, ...] = ()
     days_of: str = ""
     doubts: tuple[Reason, ...] = ()
-    of_paper: str = ""
+    iac_model: str = ""
 
     @property
     def estimate(self) -> Estimate:
