@@ -195,7 +195,7 @@ def test_a_file_that_has_nothing_for_the_node_by_its_full_name_is_refused(tmp_pa
 def test_a_key_that_stands_twice_is_refused_for_only_one_of_both_would_count(tmp_path, text):
     path = tmp_path / "p.yaml"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"stands there twice, first in line [123]; keep one"):
+    with pytest.raises(InputError, match=r"is there twice, first in line [123]; keep one"):
         load_parameters(path)
 
 
