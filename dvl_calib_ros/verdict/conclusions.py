@@ -1,4 +1,4 @@
-"""What comparisons and diagnoses conclude."""
+"""Conclusions of comparisons and diagnoses."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .kinds import Kind, Severity
 _COMPARISONS = (
     Kind(
         "MOUNTING_SAME",
-        "no movement found; smaller than {smallest:.1f}° could not be seen ({angles}; {power:.0f} of 100 such "
+        "no movement found; smaller than {smallest:.1f}° is not detectable ({angles}; {power:.0f} of 100 such "
         "movements are found){unseen}",
         "No quantity differs at 2 σ, corrected for the number of tests.",
         "",
@@ -40,8 +40,8 @@ _COMPARISONS = (
     ),
     Kind(
         "MOUNTING_SUSPICIOUS",
-        "the mounting may have moved {moved} {between}; by chance alone so large a difference comes up in 1 of "
-        "{often:.0f} comparisons",
+        "the mounting may have moved {moved} {between}; without a movement, 1 of {often:.0f} comparisons "
+        "differs this much",
         "Between 2 and 4 σ.",
         "calibrate once more before you rely on either",
         Severity.MARGINAL,
@@ -63,34 +63,34 @@ _COMPARISONS = (
     Kind(
         "SCATTER_BESIDE_MOVES",
         "apart from that, the calibrations scatter by {by:.1f} times their σ, so the size of the move is as uncertain",
-        "σ does not hold all that differs between the recordings.",
+        "σ does not include all differences between the recordings.",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "SCATTER",
         "the calibrations scatter by {by:.1f} times their σ, and no single date explains it: σ is too small",
-        "σ does not hold all that differs between the recordings.",
+        "σ does not include all differences between the recordings.",
         "",
         Severity.MARGINAL,
     ),
-    # what makes a comparison worth less
+    # remarks that weaken a comparison
     Kind(
         "CALIBRATION_DOUBTED",
         "{name}: {remark}",
-        "Its result file says so.",
-        "calibrate it anew, or leave it out of the comparison",
+        "A remark in its result file.",
+        "calibrate again, or leave it out of the comparison",
     ),
     Kind(
         "MODELS_DIFFER",
         "the models differ ({models}): so may their errors",
-        "An error that two models make alike cancels in a difference; one that one of them makes does not.",
+        "An error common to both models cancels in the difference; an error of one model does not.",
         "calibrate all with one model (-p model:=full)",
     ),
     Kind(
         "ARMS_DIFFER",
         "{name} was calibrated with another lever arm than {other} {verb} ({arm} m); the wrong one turns its angles",
-        "A lever arm that is taken as known and is wrong turns the yaw.",
+        "A wrong lever arm that is not estimated changes the yaw.",
         "if that one is right, calibrate {name} again with -p lever_arm:=[{arm}]",
     ),
 )
@@ -152,7 +152,7 @@ _DIAGNOSES = (
     Kind(
         "GAP_REFERENCE_CONSTANT",
         "this recording cannot show a gap: the reference velocity is constant to the last digit",
-        "A receiver that has stopped says nothing.",
+        "A stopped receiver measures nothing.",
         "check the receiver",
         Severity.MARGINAL,
     ),
@@ -166,28 +166,28 @@ _DIAGNOSES = (
     Kind(
         "REST_UNEXPLAINED",
         "{rest:.1f} mm/s are not explained",
-        "What is left on held-out data beyond the noise.",
+        "Residual on held-out data beyond the noise.",
         "",
         Severity.ACCEPT,
     ),
     Kind(
         "REST_FOLLOWS",
-        "what is left follows {about}",
-        "What is left changes with it more than chance would.",
+        "the residual follows {about}",
+        "The dependence is statistically significant.",
         "",
         Severity.ACCEPT,
     ),
     Kind(
         "REST_FOLLOWS_PERIOD",
-        "what is left follows a period of {seconds:.0f} s",
-        "What is left changes with it more than chance would.",
+        "the residual follows a period of {seconds:.0f} s",
+        "The dependence is statistically significant.",
         "",
         Severity.ACCEPT,
     ),
     Kind(
         "REST_FOLLOWS_NOTHING",
-        "nothing shows what the rest depends on",
-        "What is left changes with neither motion nor time more than chance would.",
+        "the residual follows neither motion nor time",
+        "No dependence is statistically significant.",
         "",
         Severity.ACCEPT,
     ),
@@ -199,10 +199,10 @@ _DIAGNOSES = (
         "",
         Severity.ACCEPT,
     ),
-    Kind("NEXT_SHOW", "to see {name}: {manoeuvre}", "What this recording shows worst.", "", Severity.ACCEPT),
+    Kind("NEXT_SHOW", "to see {name}: {manoeuvre}", "The least observable effect here.", "", Severity.ACCEPT),
     Kind(
         "NEXT_SAME_ROUTE",
-        "the same route again: what stays with the place, the time or the motion tells what it follows",
+        "the same route again, to see whether the residual follows place, time or motion",
         "No effect of the library explains the gap.",
         "",
         Severity.ACCEPT,
@@ -210,7 +210,7 @@ _DIAGNOSES = (
     Kind(
         "NEXT_RECORD",
         "record {needs} as well, to test {names}",
-        "All effects that this recording can test would show.",
+        "All effects that this recording can test would be found.",
         "",
         Severity.ACCEPT,
     ),

@@ -1,4 +1,4 @@
-"""Reasons: what the data fit where it is not what was configured, and what discovery had to guess."""
+"""Reasons: conventions that fit the data better than the configured ones, and guesses of discovery."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ CONFIGURATIONS = (
     ),
     _Said(
         "DVL_AXIS_SCALED",
-        "the DVL's {axis} is {factor:.2g} of what it should be, and its x is not",
-        "An axis that is wrong alone comes from beam angles or a beam matrix that are not those of the instrument.",
+        "the DVL's {axis} is {factor:.2g} times its true value, and its x is not",
+        "A single wrong axis is due to beam angles or a beam matrix of another instrument.",
         "check the beam angle and the beam order in the DVL's driver",
     ),
     _Said(
         "MOUNTING_FITS",
         "the data fit mounting_rpy {roll:.3g} {pitch:.3g} {yaw:.3g}",
-        "The DVL is turned by far more than a misalignment.",
+        "The DVL is rotated by far more than a misalignment.",
         "set mounting_rpy to [{roll:.4g}, {pitch:.4g}, {yaw:.4g}]",
     ),
     # the reference
@@ -67,7 +67,7 @@ CONFIGURATIONS = (
     _Said(
         "REFERENCE_OR_IMU_NED",
         "the reference looks like {name} (gnss_frame: {frame}), or the IMU's orientation looks like NED (imu_frame: "
-        "ned); only sway tells which",
+        "ned); only sway distinguishes them",
         "Both explain the motion ahead alike.",
         "check both drivers",
     ),
@@ -81,13 +81,13 @@ CONFIGURATIONS = (
     _Said(
         "IMU_LOOKS_NED",
         "the IMU's orientation looks like NED, forward-right-down",
-        "The data fit much better with the orientation taken so.",
+        "The data fit much better under this convention.",
         "set imu_frame to ned and imu_rpy to [3.1416, 0, 0]",
     ),
     _Said(
         "IMU_NO_RATES",
         "the IMU sends no angular velocity (exactly 0 in every message) while its orientation turns",
-        "A lever arm shows in turns only, and needs the angular velocity.",
+        "A lever arm is observable in turns only, and needs the angular velocity.",
         "let the IMU's driver fill angular_velocity",
     ),
     _Said(
@@ -112,7 +112,7 @@ CONFIGURATIONS = (
     _Said("RATES_NEGATED", "an angular velocity of the other sign", "All three axes are negated.", ""),
     _Said(
         "IMU_AXES_MIXED",
-        "an attitude and an angular velocity of which one is forward-left-up, the other forward-right-down",
+        "an attitude and an angular velocity in different axes: one forward-left-up, the other forward-right-down",
         "y and z are negated in one of them.",
         "",
     ),
@@ -137,13 +137,13 @@ CONFIGURATIONS = (
     ),
     _Said(
         "ATTITUDE_INVERTED",
-        "an inverted attitude (a quaternion that turns the earth into the body)",
-        "sensor_msgs/Imu has the quaternion that turns the body into the earth.",
+        "an inverted attitude (a quaternion from earth to body axes)",
+        "sensor_msgs/Imu has the quaternion from body to earth axes.",
         "",
     ),
     _Said(
         "RATES_TURNED",
-        "an angular velocity whose axes are turned by {degrees:.0f}° against the attitude's",
+        "an angular velocity whose axes are rotated by {degrees:.0f}° from the attitude's",
         "Two instruments in one message, or one that is corrected for its mounting and one that is not.",
         "",
     ),
@@ -164,13 +164,13 @@ CONFIGURATIONS = (
         "GRAVITY_FITS_INVERTED",
         "{topic}: the IMU's orientation looks inverted: gravity is {given:.1f}° from up, and {inverted:.1f}° with the "
         "quaternion inverted",
-        "The quaternion turns the earth into the body, and not the body into the earth.",
+        "The quaternion is from earth to body axes, instead of body to earth.",
         "correct the IMU's driver",
     ),
     _Said(
         "GRAVITY_LEANS",
         "{topic}: gravity is {degrees:.0f}° from up by the IMU's own orientation",
-        "Roll and pitch are wrong by that, or the acceleration is.",
+        "Roll and pitch are wrong by this angle, or the acceleration is wrong.",
         "check the IMU's mounting in its driver",
     ),
     _Said(
@@ -182,70 +182,70 @@ CONFIGURATIONS = (
     _Said(
         "GRAVITY_SIZE",
         "{topic}: the IMU's acceleration at rest is {size:.3g} m/s², which is not gravity",
-        "Gravity has been taken out, or the units are others.",
+        "Gravity has been taken out, or the unit is not m/s².",
         "let the driver send the acceleration with gravity, in m/s²",
     ),
     # clocks
     _Said(
         "CLOCK_OFF",
         "{whose} stamps are {seconds:.2f} ± {std:.2f} s {way}",
-        "By what velocities and turns show, beside the IMU's clock.",
+        "Estimated from velocities and turns, relative to the IMU's clock.",
         "",
     ),
     _Said(
         "CLOCK_LATE",
         "{whose} stamps are {seconds:.2f} s {way}",
-        "By what velocities and turns show; the other clocks are in time.",
+        "Estimated from velocities and turns; the other clocks are synchronised.",
         "set {parameter} to {offset:g}",
     ),
     _Said(
         "CLOCKS_LATE",
         "the reference's stamps are {seconds:.2f} s {way}, and the DVL's {dvl_seconds:.2f} s {dvl_way}",
-        "Both are off beside the IMU's clock. A calibration finds the DVL's delay by itself.",
+        "Both are offset from the IMU's clock. A calibration finds the DVL's delay by itself.",
         "set {parameter} to {offset:g}",
     ),
     _Said(
         "CLOCKS_NOT_TOLD_APART",
-        "the stamps of DVL and reference are {seconds:.2f} ± {std:.2f} s apart; whose clock is off does not show",
-        "Legs that repeat at one speed fit more than one clock, and more than one delay.",
+        "the stamps of DVL and reference differ by {seconds:.2f} ± {std:.2f} s; it is unknown whose clock is wrong",
+        "Repeated legs at one speed fit more than one clock offset, and more than one delay.",
         "set the clocks by one source, or drive turns at two speeds",
     ),
     _Said(
         "CLOCK_DRIFTS",
-        "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
+        "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
         "It gains or loses time at a steady rate.",
         "set the clocks by one source",
     ),
     _Said(
         "CLOCK_DRIFTS_DVL",
-        "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
+        "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
         "It gains or loses time at a steady rate.",
         "set the clocks by one source, or dvl_clock_drift to {drift:.2g}",
     ),
     _Said(
         "CLOCK_LEAPS",
-        "{whose} clock leaps {way} by {seconds:.2f} ± {std:.2f} s after {at:.0f} s",
+        "{whose} clock steps {way} by {seconds:.2f} ± {std:.2f} s after {at:.0f} s",
         "A clock was set during the recording.",
         "cut the recording there, and calibrate with either part",
     ),
     _Said(
         "CLOCK_FAR",
-        "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be found and taken off",
-        "Speeds agree only with that much between the stamps.",
+        "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be estimated and "
+        "subtracted",
+        "The speeds agree only after this shift of the stamps.",
         "set that clock right; this recording: --restamp log takes the times at which messages were recorded",
     ),
-    # what a recording declares
+    # declarations of a recording
     _Said(
         "DVL_FRAME_NOT_OWN",
-        "{topic}: the DVL's messages carry frame {frame!r} and not one of the DVL's own; the data are taken as they "
-        "are",
+        "{topic}: the DVL's messages carry frame {frame!r} and not one of the DVL's own; the data are used unchanged",
         "The driver may have turned the velocity into that frame.",
         "check the driver's settings",
     ),
     _Said(
         "BODY_OR_EARTH",
         "DVL and reference agree in the body frame, but would agree as well if both were in the earth's frame",
-        "Without an attitude that turns, nothing tells the two apart.",
+        "Without a changing attitude, the two cannot be distinguished.",
         "set gnss_frame",
     ),
     _Said(
@@ -257,13 +257,13 @@ CONFIGURATIONS = (
     _Said(
         "MOUNTING_CONTRADICTED",
         "DVL and reference do not agree with the mounting {given}; they do with {found}",
-        "A transform or parameter says another mounting than the data.",
+        "A transform or parameter and the data disagree about the mounting.",
         "try -p mounting_rpy:={option}",
     ),
     _Said(
         "TRAVELS_SIDEWAYS",
         "with the mounting {given} the vehicle travels sideways; it goes ahead with {found}",
-        "A transform whose yaw has the wrong sign does that, or a vehicle that drifts.",
+        "Its cause is a transform whose yaw has the wrong sign, or a vehicle that drifts.",
         "try -p mounting_rpy:={option}",
     ),
     _Said(
@@ -274,7 +274,7 @@ CONFIGURATIONS = (
         "set the one that is right",
         severity=Severity.MARGINAL,
     ),
-    _Said("TWO_CONTRADICTIONS", "{one}; {other}", "Two of this list at once.", ""),
+    _Said("TWO_CONTRADICTIONS", "{one}; {other}", "Two entries of this list together.", ""),
 )
 
 
@@ -290,7 +290,7 @@ DISCOVERIES = (
     _Discovered(
         "TOPIC_DOES_NOT_MOVE",
         "{topic} does not move; not taken as a reference",
-        "A velocity that is 0 throughout, as of a station.",
+        "A velocity that is always 0, such as a station's.",
         "",
     ),
     _Discovered(
@@ -303,7 +303,7 @@ DISCOVERIES = (
         "TOPIC_DERIVED",
         "{topic} may be a filter's output that uses the DVL; not taken as a reference. If it does not use the DVL: "
         "--gnss-topic {topic}",
-        "Its name says that it is computed.",
+        "Its name suggests that it is computed.",
         "",
     ),
     _Discovered(
@@ -315,19 +315,19 @@ DISCOVERIES = (
     _Discovered(
         "FRAME_NOT_IN_TREE",
         "no transform for the DVL's frame {frame!r}; using frame {other!r} instead",
-        "Its name is that of a DVL.",
+        "The name of that frame suggests a DVL.",
         "",
     ),
     _Discovered(
         "REFERENCE_FRAME_NOT_TOLD",
-        "{topic}: nothing tells its frame, not even the data without an IMU",
-        "A frame fits where the velocities agree under it, which takes an attitude.",
+        "{topic}: its frame is unknown, and without an IMU the data do not show it",
+        "Finding the frame by comparing velocities needs an attitude.",
         "",
     ),
     _Discovered(
         "MOUNTING_GUESSED",
         "mounting {mounting}, {why}: nothing in the bag says how the DVL is mounted (-p mounting_rpy:={option}){also}",
-        "Taken from the data, to the next quarter of a turn where that fits.",
+        "Estimated from the data, rounded to a multiple of 90° if that fits.",
         "",
     ),
     _Discovered(

@@ -1,4 +1,4 @@
-"""What the doctor can find wrong with a recording: every finding with its code, meaning and remedy."""
+"""Faults of a recording that the doctor finds: code, sentence, meaning and remedy."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ _KINDS = (
     Kind(
         "DOCTOR_STAMP_ZERO",
         "{topic}: {share:.0%} of the messages have no stamp",
-        "header.stamp is zero; the time of reception stands in, which is late by the transport.",
+        "header.stamp is zero; the time of reception is used, which includes the transport's delay.",
         "let the driver fill header.stamp with the time of measurement",
     ),
     Kind(
         "DOCTOR_STAMP_RECEPTION",
         "{topic}: stamps jitter with the reception ({jitter_ms:.0f} ms about {period_ms:.0f} ms), not with the sensor",
-        "The driver stamps when a message arrives, not when the sensor measured: late by transport, worse in turns.",
-        "let the driver take the sensor's own time; then dvl-calib diagnose BAG shows what delay is left",
+        "The driver stamps when a message arrives, not when the sensor measured. The delay matters most in turns.",
+        "let the driver take the sensor's own time; then dvl-calib diagnose BAG estimates the remaining delay",
     ),
     Kind(
         "DOCTOR_STAMP_BACK",
@@ -28,7 +28,7 @@ _KINDS = (
     Kind(
         "DOCTOR_STAMP_JUMP",
         "{topic}: stamps jump ahead by {seconds:.1f} s while recording went on",
-        "The clock of the driver was set during the recording; what comes after does not pair with the rest.",
+        "The clock of the driver was set during the recording; later samples do not match those of other topics.",
         "set clocks before the recording, or cut the recording there",
         Severity.ERROR,
     ),
@@ -42,8 +42,8 @@ _KINDS = (
     Kind(
         "DOCTOR_APART",
         "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
-        "One of them came only while the other did not, or a clock is off by more than the recording is long.",
-        "record both at once; if they were, check the clocks, and for import the times of both files",
+        "One of them came only while the other did not, or a clock offset exceeds the length of the recording.",
+        "record both together; if they were, check the clocks, and for import the times of both files",
         Severity.ERROR,
     ),
     Kind(
@@ -62,14 +62,14 @@ _KINDS = (
     Kind(
         "DOCTOR_TOO_FEW",
         "{topic}: {count} messages are too few",
-        "It was hardly recorded; nothing can be said of it, nor learnt from it.",
+        "It was hardly recorded, so it can be neither checked nor used.",
         "record all topics for some minutes",
         Severity.ERROR,
     ),
     Kind(
         "DOCTOR_UNDECODABLE",
         "{topic}: {count} of {total} messages cannot be decoded: {reason}",
-        "They are of another version than the recording says, damaged, or written by a tool that does it otherwise.",
+        "They are of another version than the recording says, damaged, or written by a tool with another encoding.",
         "rebuild the driver's messages, or record with ros2 bag record",
     ),
     Kind(
@@ -87,19 +87,19 @@ _KINDS = (
     Kind(
         "DOCTOR_REFUSED",
         "{topic}: {share:.0%} of the messages are refused: {reason}",
-        "The message itself says that it is not to be believed.",
+        "The message itself is marked as invalid.",
         "{remedy}",
     ),
     Kind(
         "DOCTOR_FROZEN",
         "{topic}: {share:.0%} of the velocities repeat the one before exactly",
         "The driver sends its last value again while the sensor is silent or slower.",
-        "let the driver send new measurements only; -p max_repeats:=1 leaves the others out",
+        "let the driver send new measurements only; -p max_repeats:=1 skips the repeats",
     ),
     Kind(
         "DOCTOR_COVARIANCE",
         "{topic}: claims a noise of {claimed:.3g} m/s in every message, the data show {shown:.3g} m/s",
-        "A constant of the driver, not the sensor's own figure: weights and standard deviations follow it.",
+        "A constant of the driver, not the sensor's own figure; weights and standard deviations depend on it.",
         "let the driver send the sensor's figure; for this bag: -p use_message_covariance:=false",
     ),
     Kind(
@@ -117,21 +117,21 @@ _KINDS = (
     Kind(
         "DOCTOR_NO_ORIENTATION",
         "{topic}: no orientation ({why})",
-        "A reference in ENU or NED cannot be turned into the body, so the models with GNSS learn nothing.",
+        "A reference in ENU or NED cannot be rotated to body axes, so the models with GNSS learn nothing.",
         "record the IMU's or INS's filtered topic, or a reference in the body frame",
         Severity.ERROR,
     ),
     Kind(
         "DOCTOR_NO_IMU",
         "no IMU in the bag: {what}",
-        "Attitude turns a velocity over ground into the body; turn rates take out what a lever arm adds in turns.",
-        "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
+        "Attitude rotates a velocity over ground to body axes; turn rates remove the lever arm's velocity in turns.",
+        "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
     ),
     Kind(
         "DOCTOR_NO_IMU_EARTH",
         "no IMU in the bag: the reference is not in the body's frame, so it cannot be compared with the DVL",
-        "Without an attitude, a velocity over ground says nothing of the DVL's axes.",
-        "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
+        "Without an attitude, a velocity over ground cannot be compared with the DVL's axes.",
+        "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
         Severity.ERROR,
     ),
     Kind(
@@ -151,19 +151,19 @@ _KINDS = (
     Kind(
         "DOCTOR_FRAMES",
         "{says}",
-        "What the recording declares and what its data show are not the same.",
+        "The recording's declarations and its data contradict each other.",
         "check frames and transforms",
     ),
     Kind(
         "DOCTOR_SLOW_REFERENCE",
         "{topic}: {rate_hz:.2g} Hz is too slow for turns",
-        "Between two reference samples the velocity is taken as a straight line.",
+        "The velocity is interpolated linearly between two reference samples.",
         "set the receiver to 1 Hz or more, better 5 Hz",
     ),
     Kind(
         "DOCTOR_NOT_MOVING",
         "{topic}: the vehicle does not move faster than min_speed ({min_speed:g} m/s)",
-        "Nothing can be learnt at rest.",
+        "A vehicle at rest gives no information.",
         "record a run at 0.5 m/s or more",
         Severity.ERROR,
     ),

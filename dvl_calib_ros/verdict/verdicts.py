@@ -12,7 +12,7 @@ _HELD_OUT = (
     "{corrected:.3f} with it, {predicted:.3f} predicted"
 )
 _KINDS = (
-    # what it used
+    # use of the samples
     Kind(
         "NO_SAMPLE_USED",
         "no sample was used",
@@ -30,18 +30,18 @@ _KINDS = (
     Kind(
         "NOTHING_COMPARED",
         "there is no IMU, so no DVL sample can be compared with the reference",
-        "A velocity in the earth's frame says nothing of the DVL's axes without an attitude.",
+        "Without an attitude, a velocity in the earth's frame cannot be compared with the DVL's axes.",
         "record the IMU's topic, with orientation",
         Severity.REJECT,
     ),
     Kind(
         "NO_ANGLE_SHOWN",
-        "the data has shown none of the angles yet",
-        "σ of each angle is still about that of the prior.",
+        "none of the angles is observable in the data yet",
+        "σ of each angle is still close to the prior's.",
         "",
         Severity.MARGINAL,
     ),
-    # what it found
+    # estimated values
     Kind(
         "MISALIGNMENT_LARGE",
         "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
@@ -52,7 +52,7 @@ _KINDS = (
     Kind(
         "SCALE_LARGE",
         "a scale is {percent:.1f} % off, more than {limit:.1f} %",
-        "No DVL is so wrong; units, speed of sound or a wrong reference are (max_scale_error).",
+        "No DVL has such an error; check units, speed of sound and reference (max_scale_error).",
         "",
         Severity.REJECT,
     ),
@@ -65,23 +65,23 @@ _KINDS = (
     ),
     Kind(
         "LEVER_ARM_NOT_SHOWN",
-        "the lever arm is not shown well, and {turns}",
-        "On this track an error of the lever arm looks like an angle. σ holds it.",
+        "the lever arm is poorly observable, and {turns}",
+        "On this track an error of the lever arm looks like an angle. σ includes it.",
         "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways",
         Severity.MARGINAL,
     ),
     Kind(
         "LEVER_ARM_TURNS_ANGLE",
         "the lever arm is known to ±{std:.2g} m, and {turns}",
-        "On this track an error of the lever arm looks like an angle, and this model takes the arm as known.",
+        "On this track an error of the lever arm looks like an angle, and this model does not estimate the arm.",
         "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways",
         Severity.REJECT,
     ),
-    # what it does on data that it had not seen
+    # errors on held-out data
     Kind(
         "HELD_OUT",
         _HELD_OUT,
-        "As good as its σ promises.",
+        "The error agrees with the σ.",
         "",
         Severity.ACCEPT,
     ),
@@ -95,35 +95,35 @@ _KINDS = (
     Kind(
         "HELD_OUT_OUTLIERS",
         _HELD_OUT + ", {typical:.3f} without outliers: there are many of them",
-        "The error is large by outliers alone, which the calibration leaves out.",
+        "Only outliers make the error large, and the calibration excludes them.",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "HELD_OUT_WORSE",
         _HELD_OUT + ": the calibration makes it worse",
-        "By more than the variance of the estimate explains.",
+        "The increase is larger than the variance of the estimate explains.",
         "",
         Severity.REJECT,
     ),
     Kind(
         "HELD_OUT_NO_BETTER",
         _HELD_OUT + ": the calibration makes no difference, perhaps for lack of data",
-        "Worse by no more than what its σ by blocks of time allows.",
+        "The increase is within the σ estimated from blocks of time.",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "HELD_OUT_SEVERAL_TIMES",
         _HELD_OUT + ": the error is several times the predicted one",
-        "The error is more than three times what the noise explains.",
+        "The error is more than three times the noise.",
         "the configuration is wrong, or an effect is missing from the model (dvl-calib diagnose looks for it)",
         Severity.REJECT,
     ),
     Kind(
         "HELD_OUT_IMPLAUSIBLE",
         _HELD_OUT + ": implausibly small, as if the DVL were fused into the reference, which then cannot judge it",
-        "Less than a fifth of what the instruments claim is less than their noise: they share it.",
+        "An error below a fifth of the instruments' claimed noise means that they share their noise.",
         "take GNSS alone",
         Severity.REJECT,
     ),
@@ -138,22 +138,22 @@ _KINDS = (
     Kind(
         "DRIFT_NO_BETTER",
         "on data held out dead reckoning gets no better: {after:.1f} m per km with it, {before:.1f} as mounted",
-        "Velocities may fit better and the track no better, where an error lasts.",
+        "If an error persists, velocities may fit better without a better track.",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "DRIFT_WORSE",
         "on data held out dead reckoning drifts by {after:.1f} m per km with it, by {before:.1f} as mounted",
-        "More than half as much again, and more than noise explains.",
+        "The drift grows by more than half, and by more than noise explains.",
         "an effect is missing from the model (dvl-calib diagnose looks for it)",
         Severity.REJECT,
     ),
     # clocks
     Kind(
         "CLOCKS_APART",
-        "{whose} stamps are {seconds:.1f} s {side} {other} with which they came{known}",
-        "The two drivers stamp by different clocks, further apart than any model looks for.",
+        "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
+        "The two drivers use different clocks, with an offset beyond the models' search range.",
         "set the clocks by one source; this recording: --restamp log takes the times at which messages were recorded",
         Severity.REJECT,
     ),
@@ -174,8 +174,8 @@ _KINDS = (
     ),
     Kind(
         "BAGS_DELAY_CHANGED",
-        "the delay of the DVL's stamps differs between recordings, but one delay is used for all that follow each "
-        "other so closely",
+        "the delay of the DVL's stamps differs between recordings, but one delay is used for recordings that follow "
+        "each other so closely",
         "A model with one delay averages two.",
         "calibrate each by itself",
         Severity.REJECT,
@@ -186,13 +186,13 @@ VERDICTS = tuple(replace(kind, page="troubleshooting.md#reasons-of-a-verdict") f
 
 _Said = partial(Kind, page="troubleshooting.md#what-to-drive-next", severity=Severity.ACCEPT, remedy="")
 MANOEUVRES = (
-    _Said("NEXT_LEG", "drive straight, {name} ({compass:.0f}°)", "Another heading tells a current from the mounting."),
-    _Said("NEXT_AHEAD", "drive straight ahead", "Motion ahead shows yaw, pitch and scale."),
-    _Said("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", "An angle shows in proportion to the speed."),
-    _Said("NEXT_SPEEDS", "speed up and slow down by half", "A delay shows in accelerations, a bias at two speeds."),
-    _Said("NEXT_CIRCLE", "circle to {side}", "Turns show the lever arm, and average what stays with the earth."),
-    _Said("NEXT_EIGHT", "drive a figure eight", "Turns to both sides tell a lever arm from a yaw."),
-    _Said("NEXT_DIVE", "dive and rise by 10° of pitch", "Pitching shows what the vertical axis brings."),
+    _Said("NEXT_LEG", "drive straight, {name} ({compass:.0f}°)", "Another heading reveals a current."),
+    _Said("NEXT_AHEAD", "drive straight ahead", "Motion ahead makes yaw, pitch and scale observable."),
+    _Said("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", "An angle is more observable at a higher speed."),
+    _Said("NEXT_SPEEDS", "speed up and slow down by half", "Accelerations reveal a delay, two speeds a bias."),
+    _Said("NEXT_CIRCLE", "circle to {side}", "Turns reveal the lever arm, and average earth-fixed errors."),
+    _Said("NEXT_EIGHT", "drive a figure eight", "Turns to both sides distinguish a lever arm from a yaw."),
+    _Said("NEXT_DIVE", "dive and rise by 10° of pitch", "Pitching makes errors of the vertical axis observable."),
     _Said("NEXT_WAIT", "keep on: nothing is learnt yet", "The models have not used a sample, or the vehicle stands."),
     _Said(
         "NEXT_REJECTED",
@@ -202,13 +202,13 @@ MANOEUVRES = (
     _Said(
         "NEXT_STANDS",
         "keep on: the goal is reached, if it stays so",
-        "What is predicted differs from second to second, so that it has to stand for half a minute.",
+        "The prediction varies from second to second, so it must stay within the goal for half a minute.",
     ),
     _Said("NEXT_IS_GOOD", "good enough: save", "The predicted drift is within target_drift."),
     _Said(
         "NEXT_IS_GOOD_BUT_SCALE",
         "as good as it gets without a reference: save; the scale stays unknown",
-        "The drift by yaw is within target_drift. Only a reference velocity shows a scale.",
+        "The drift by yaw is within target_drift. A scale is observable only with a reference velocity.",
     ),
     _Said(
         "LONGER_AS_DRIFT_GREW",
@@ -217,9 +217,9 @@ MANOEUVRES = (
     ),
     _Said(
         "LONGER_AS_LITTLE_SHOWN",
-        "it takes longer than promised: the motion since then has shown less than what was asked for "
+        "it takes longer than promised: the motion since then was less informative than the suggested one "
         "({before:.1f} m per km then, {now:.1f} now)",
-        "The time is that of the manoeuvre that is named next, at the usual speed.",
+        "The promised time was for the suggested manoeuvre at the usual speed.",
     ),
     _Said(
         "WORTH_OF_ANOTHER_MODEL",
@@ -239,8 +239,8 @@ MANOEUVRES = (
 _Selected = partial(Kind, page="troubleshooting.md#why-a-model-is-selected", severity=Severity.ACCEPT)
 SELECTIONS = (
     _Selected("MODEL_NAMED", "set by parameter model", "The parameter names one model.", ""),
-    _Selected("MODEL_CHOSEN", "{by}: {gnss}", "The parameter model is auto or iac, which go by GNSS.", ""),
-    _Selected("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}", "As MODEL_CHOSEN, and by what the data show beside.", ""),
+    _Selected("MODEL_CHOSEN", "{by}: {gnss}", "The parameter model is auto or iac, which depend on GNSS.", ""),
+    _Selected("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}", "As MODEL_CHOSEN, with a further reason in the data.", ""),
     _Selected("GNSS_AVAILABLE", "GNSS is available", "References keep coming (gnss_timeout).", ""),
     _Selected("GNSS_NOT_AVAILABLE", "GNSS is not available", "No reference has come for gnss_timeout.", ""),
     _Selected(
@@ -257,13 +257,13 @@ SELECTIONS = (
     ),
     _Selected(
         "HEADINGS_TELL_CURRENT",
-        "headings tell a current from the mounting",
-        "The mounting turns with the vehicle, a current does not.",
+        "headings distinguish a current from the mounting",
+        "The mounting rotates with the vehicle, a current does not.",
         "",
     ),
     _Selected(
         "HEADINGS_TOO_FEW",
-        "no attitude over headings that would tell a current from the mounting",
+        "no attitude over headings that would distinguish a current from the mounting",
         "On one heading, or without an IMU, a current looks like a mounting.",
         "",
     ),
@@ -277,19 +277,19 @@ SELECTIONS = (
     _Selected(
         "ARM_LOOKS_LIKE_ANGLE",
         "on this track a {metres:g} m error of the lever arm looks like {degrees:.1f}° of {angle}",
-        "Turns to one side at one speed do not tell a lever arm from an angle.",
+        "Turns to one side at one speed do not distinguish a lever arm from an angle.",
         "",
     ),
     _Selected(
         "POSITIONS_NOISY",
-        "velocities made of the positions would be off by {noise:.1f} m/s, so these are compared over legs",
+        "velocities from the positions would have {noise:.1f} m/s of noise, so positions are compared over legs",
         "Positions with metres of noise: USBL, plain GPS.",
         "",
     ),
     _Selected(
         "POSITIONS_SELDOM",
-        "positions come too seldom to make velocities of them, so these are compared over legs",
-        "More than three times position_window between two.",
+        "positions are too infrequent for velocities, so they are compared over legs",
+        "The interval between positions exceeds three times position_window.",
         "",
     ),
     _Selected(
