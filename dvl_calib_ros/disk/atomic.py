@@ -75,7 +75,7 @@ def save_all(contents: Mapping[Path, bytes], keep: Keep = newest_only) -> None:
                 target = _target(path)
                 if target.parent not in alone:
                     alone[target.parent] = stack.enter_context(_locked(target.parent))
-                saves[path] = stack.enter_context(_prepared(target, content))
+                saves[path] = stack.enter_context(_prepared_save(target, content))
             try:
                 for path in saves:  # the error message names this path
                     os.replace(saves[path].temporary, saves[path].target)
@@ -88,7 +88,7 @@ def save_all(contents: Mapping[Path, bytes], keep: Keep = newest_only) -> None:
     except (OSError, ValueError) as error:  # ValueError: an impossible file name
         full = isinstance(error, OSError) and error.errno in NO_SPACE
         remedy = "free some space, or name a file on another disk" if full else "name another place"
-        raise InputError(f"{path}: could not be written ({_why(error)}); {remedy}") from error
+        raise InputError(f"{path}: could not be written ({_error_text(error)}); {remedy}") from error
 
 
 def check_writable(path: Path) -> None:
@@ -106,7 +106,7 @@ def check_writable(path: Path) -> None:
         where = (
             f"the folder {Path(os.path.realpath(path)).parent} is not writable" if "\0" not in str(path) else "no name"
         )
-        raise InputError(f"{path}: {where} ({_why(error)}); name another") from error
+        raise InputError(f"{path}: {where} ({_error_text(error)}); name another") from error
 
 
 def check_folder_writable(path: Path) -> None:
@@ -118,7 +118,7 @@ def check_folder_writable(path: Path) -> None:
         with tempfile.TemporaryFile(dir=above):
             pass
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: the folder {above} is not writable ({_why(error)}); name another") from error
+        raise InputError(f"{path}: the folder {above} is not writable ({_error_text(error)}); name another") from error
 
 
 def backup_of(path: Path) -> Path:
@@ -153,7 +153,7 @@ def own_stream(path: Path) -> int | None:
     return -1 if here == os.devnull else None
 
 
-def _why(error: OSError | ValueError) -> str:
+def _error_text(error: OSError | ValueError) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
@@ -201,13 +201,13 @@ class _Save(NamedTuple):
 
 
 @contextmanager
-def _prepared(target: Path, content: bytes) -> Iterator[_Save]:
+def _prepared_save(target: Path, content: bytes) -> Iterator[_Save]:
     """Prepare a save: everything except the final rename.
 
     If the process is killed after the rename, the previous file remains under a hidden name, where the next save finds
     it.
     """
-    with _written_beside(target, content) as temporary:
+    with _temporary_file(target, content) as temporary:
         save = _Save(target, temporary, _second_name(target, temporary) if target.exists() else None)
         try:
             yield save
@@ -229,8 +229,8 @@ def _tidy(save: _Save, keep: Keep, is_alone: bool) -> None:
 
 
 @contextmanager
-def _written_beside(target: Path, content: bytes) -> Iterator[str]:
-    """Write a hidden temporary file next to `target`, synced to disk, and remove it at the end if it still exists."""
+def _temporary_file(target: Path, content: bytes) -> Iterator[str]:
+    """Write a hidden temporary file next to `target`, synced to disk; remove it at the end."""
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=_PREFIX, suffix=_TEMPORARY)
     try:
         with suppress(OSError):  # tells other writers that this one is alive
