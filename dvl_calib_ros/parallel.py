@@ -147,13 +147,13 @@ def _until_one_dies(
     broken: list[tuple[int, Item]] = []
     # one thread of linear algebra per process: the matrices are small, and the processes fill the cores
     executor = ProcessPoolExecutor(
-        jobs, initializer=_begin, initargs=(os.getpid(), work), env=dict.fromkeys(_THREADS, "1")
+        jobs, initializer=_start_worker, initargs=(os.getpid(), work), env=dict.fromkeys(_THREADS, "1")
     )
     try:
         while not broken:
             for item in islice(left, HANDED_OUT * jobs - len(under_way)):
                 try:
-                    under_way[executor.submit(_do, item[1])] = item
+                    under_way[executor.submit(_work_on, item[1])] = item
                 except BrokenProcessPool:
                     broken.append(item)
                     break
@@ -172,21 +172,21 @@ def _until_one_dies(
     return [*broken, *under_way.values()]
 
 
-# the function of a worker process, set once by `_begin`
+# the function of a worker process, set once by `_start_worker`
 _work: Callable[[Any], Any]
 
 
-def _begin(parent: int, work: Callable[[Any], Any]) -> None:
+def _start_worker(parent: int, work: Callable[[Any], Any]) -> None:
     global _work
     _work = work
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
 
 
-def _do(item: Any) -> Any:
+def _work_on(item: Any) -> Any:
     return _work(item)
 
 
-def _end_with(parent: int) -> None:
+def _end_with_parent(parent: int) -> None:
     """End this process when its parent ends; a killed parent cannot tell it to."""
     while os.getppid() == parent:
         time.sleep(PARENT_LOOKED_FOR_S)

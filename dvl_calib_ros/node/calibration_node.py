@@ -329,9 +329,7 @@ class CalibrationNode(AnsweringNode):
             self._publish_if_updated()
 
     def _received_ns(self, message: Any) -> int:
-        """Return the time of reception if the message's stamp is missing or not used, else 0, which costs no clock
-        call.
-        """
+        """Return the time of reception if the message's stamp is not used, else 0, without a clock call."""
         stamp = message.header.stamp
         believed = self._calibrator.parameters.restamp != RESTAMP_ALL
         return 0 if believed and (stamp.sec or stamp.nanosec) else self.get_clock().now().nanoseconds

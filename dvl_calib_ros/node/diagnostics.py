@@ -73,7 +73,7 @@ class RecentCounts:
 
 
 class _Taken(NamedTuple):
-    """Number of samples taken of a stream, since when it has this value (s), and time of the first sample (s)."""
+    """Number of samples taken of a stream, time of its last change (s), and of the first sample (s)."""
 
     taken: int
     since_s: float

@@ -169,7 +169,7 @@ class Card:
         self._received.append((now_s, received))
         return values
 
-    def _step(self, newest_ns: int | None) -> float:
+    def _dvl_time_step(self, newest_ns: int | None) -> float:
         """Return the DVL time since the last look, s."""
         before_ns, self._newest_ns = self._newest_ns, newest_ns
         if before_ns is None or newest_ns is None:
@@ -178,7 +178,7 @@ class Card:
 
     def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float, rejected: bool) -> dict[str, str]:
         parameters, model = calibrator.parameters, MODELS[estimate.model]
-        motion, step = calibrator.latest_motion(), self._step(calibrator.last_ns)
+        motion, step = calibrator.latest_motion(), self._dvl_time_step(calibrator.last_ns)
         self._shown_s += step
         if motion is not None and motion.speed > 0.0:
             self._squares, self._looks = self._squares + motion.speed**2, self._looks + 1
@@ -203,9 +203,9 @@ class Card:
             left = self._remaining.look(found.seconds, drift.both, self._shown_s)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
-            "side": _done(drift.side, unknown[0], target / math.sqrt(2.0)),
-            "ahead": _done(drift.ahead, unknown[1], target / math.sqrt(2.0)),
-            "worth": 100.0 if worth.is_good else min(_done(drift.both, math.hypot(*unknown), target), 99.0),
+            "side": _progress_percent(drift.side, unknown[0], target / math.sqrt(2.0)),
+            "ahead": _progress_percent(drift.ahead, unknown[1], target / math.sqrt(2.0)),
+            "worth": 100.0 if worth.is_good else min(_progress_percent(drift.both, math.hypot(*unknown), target), 99.0),
         }
         return {
             "worth": f"{drift.both:.2f}",
@@ -240,7 +240,7 @@ class Card:
         return self._outlook._replace(seconds=None if planned is None else max(planned - since, 0.0) + STANDS_S)
 
 
-def _done(drift: float, unknown: float, target: float) -> float:
+def _progress_percent(drift: float, unknown: float, target: float) -> float:
     """Return the progress from the initial uncertainty to the target on a logarithmic scale, per cent; nan if never."""
     if drift <= target or math.isnan(drift):
         return 100.0 if drift <= target else math.nan
