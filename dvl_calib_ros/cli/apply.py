@@ -83,13 +83,13 @@ def run(arguments: argparse.Namespace) -> None:
 
     calibrated = load_calibrated_mounting(arguments.result)
     if arguments.instrument is not None:
-        _set(calibrated, arguments)
+        _apply_to_instrument(calibrated, arguments)
         return
     applied = write_calibration(calibrated, targets, arguments.force, arguments.dry_run)
     show(*(f"note: {note}" for note in applied.notes))
     is_refused = calibrated.objections and not arguments.force
     refused = ["nothing to apply; --force shows and writes it anyway"]
-    _show(calibrated, refused if is_refused else _mounting_lines(calibrated))
+    _print_lines(calibrated, refused if is_refused else _mounting_lines(calibrated))
     if arguments.dry_run:
         show(*(applied.changes.splitlines() or ["nothing would change"]))
         return
@@ -98,14 +98,14 @@ def run(arguments: argparse.Namespace) -> None:
         show(f"{path}: written{before}" if path in applied.written else f"{path}: is so already")
 
 
-def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
+def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
     """Print an instrument's settings; with the options, also write and send them."""
     from ..disk.atomic import save_bytes
     from ..errors import InputError
     from ..instruments.settings import AS_RECORDED, instrument_settings
     from ..instruments.water_linked import configure
 
-    now = _told_settings(arguments.now)
+    now = _parse_now(arguments.now)
     chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)
     untold = [each.name for each in chosen.settings if each.name not in now and each.now_by != AS_RECORDED]
     if arguments.send and (arguments.instrument != "waterlinked" or untold):
@@ -113,7 +113,7 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
             "--send is for waterlinked, and needs its settings when the data were recorded: "
             + " ".join(f"--now {name}=..." for name in untold or ("mounting_rotation_offset",))
         )
-    _show(calibrated, _settings_lines(chosen))
+    _print_lines(calibrated, _settings_lines(chosen))
     if arguments.settings and not arguments.dry_run:
         save_bytes(arguments.settings, chosen.text.encode())
         show(f"{arguments.settings}: written")
@@ -123,7 +123,7 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
         show(f"{arguments.send}: {'is so already' if is_so else done}")
 
 
-def _told_settings(words: Sequence[str]) -> dict[str, float]:
+def _parse_now(words: Sequence[str]) -> dict[str, float]:
     """Parse --now NAME=VALUE. Raises InputError."""
     from ..errors import InputError
 
@@ -183,7 +183,7 @@ def _metres(values: Sequence[float]) -> str:
     return " ".join(f"{value:+.2f}" for value in values) + " m"
 
 
-def _show(calibrated: CalibratedMounting, lines: Sequence[str]) -> None:
+def _print_lines(calibrated: CalibratedMounting, lines: Sequence[str]) -> None:
     """Print lines after the warnings about the calibration."""
     common.print_warnings([f"{calibrated.path}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
     show(*lines)

@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     common.check_outputs(arguments, "json", "report")
     write_report = report_writer(arguments)
     names = _names(paths)
-    calibrations = [_loaded(arguments, path, name) for path, name in zip(paths, names, strict=True)]
+    calibrations = [_load_or_calibrate(arguments, path, name) for path, name in zip(paths, names, strict=True)]
     check_distinct(calibrations)
     comparison = compare(calibrations)
     try:
@@ -69,7 +69,7 @@ def _names(paths: Sequence[Path]) -> list[str]:
     return short if len(set(short)) == len(short) else list(map(str, paths))
 
 
-def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
+def _load_or_calibrate(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
     """Load a result file, or calibrate with a bag."""
     from ..bags.files import is_bag
     from ..files.mounting import load_extrinsics

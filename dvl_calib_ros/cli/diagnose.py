@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
-    of_each = _applied_to_each(arguments.apply, names)
+    of_each = _apply_paths(arguments.apply, names)
     common.check_outputs(
         arguments,
         "json",
@@ -115,7 +115,7 @@ def run(arguments: argparse.Namespace) -> int:
     return int(diagnosis.reasons[0].severity is Severity.REJECT)
 
 
-def _applied_to_each(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
+def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
     """Return parameter files per recording, next to --apply, if there are several. Raises InputError."""
     from ..disk.atomic import own_stream
     from ..errors import InputError
@@ -185,8 +185,8 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
     check_rounds(arguments.rounds, arguments.keep)
     common.check_outputs(arguments, "json", "report", folders=["keep"])
     write_report = report_writer(arguments)
-    real = _source(arguments, arguments.bags, arguments.params, defaults)
-    made = _source(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
+    real = _open_side(arguments, arguments.bags, arguments.params, defaults)
+    made = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
     with common.progress("comparing") as on_progress:
         found = against(
             real[0], made[0], arguments.rounds, arguments.keep, on_progress, with_series=arguments.report is not None
@@ -206,7 +206,7 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
     return int(found.verdict is SimulatorVerdict.CANNOT_TELL)
 
 
-def _source(
+def _open_side(
     arguments: argparse.Namespace, bags: Sequence[Path], params: Path | None, defaults: Mapping[str, float]
 ) -> tuple[RecordedSide, Discovery]:
     """Open one side's bags and discover their topics and frames."""

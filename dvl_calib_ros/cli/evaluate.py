@@ -1,5 +1,4 @@
-"""Run the published validation procedure: calibrate on one run, correct all others, and compare with the published
-table.
+"""Run the published validation procedure: calibrate on one run, correct all others, compare with the published table.
 
 FOLDER holds trajectories T01_dvl.csv .. T15_dvl.csv (time s; surge, sway, heave m/s, forward-right-down) and,
 optionally, T01_attitude.csv .. (time s, the same stamps; roll, pitch, yaw rad in north-east-down). They are public:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..bags.reader import BagReader
     from ..demo.player import BagPlayer
 
-# Time after which the user is told for which topics playback waits, s; discovery takes less.
+# time without subscribers before a message names their topics, s; discovery takes less
 SAID_AFTER_S = 2.0
 RATES = (0.01, 1000.0)
 DESCRIPTION = "/robot_description"
