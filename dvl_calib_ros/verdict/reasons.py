@@ -159,7 +159,7 @@ def lookup(kinds: Iterable[Kind]) -> str:
 
 def _cause_and_remedy(kind: Kind) -> str:
     remedy = _FIELD.sub("…", re.sub(r"^{\w+}", "", kind.remedy))
-    return f"{kind.means} {full(remedy)}" if remedy else kind.means
+    return f"{kind.means} {full(remedy)}".replace("….", "…") if remedy else kind.means
 
 
 def _causes(value: object) -> tuple[Reason, ...]:
