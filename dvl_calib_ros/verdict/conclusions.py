@@ -173,7 +173,7 @@ _DIAGNOSES = (
     Kind(
         "REST_FOLLOWS",
         "what is left follows {about}",
-        "The residual changes significantly with it.",
+        "The residual changes significantly with this quantity.",
         "",
         Severity.ACCEPT,
     ),
@@ -199,7 +199,7 @@ _DIAGNOSES = (
         "",
         Severity.ACCEPT,
     ),
-    Kind("NEXT_SHOW", "to see {name}: {manoeuvre}", "This recording shows it worst.", "", Severity.ACCEPT),
+    Kind("NEXT_SHOW", "to see {name}: {manoeuvre}", "This recording shows this effect worst.", "", Severity.ACCEPT),
     Kind(
         "NEXT_SAME_ROUTE",
         "the same route again: what stays with the place, the time or the motion tells what it follows",
@@ -237,7 +237,7 @@ UNPAIRED = (
     _Said(
         "SIMULATOR_OTHER_SIZE",
         "the simulator has {names} of another size",
-        "Both show them, and the sizes differ significantly.",
+        "Both sides show the effects, with significantly different sizes.",
         severity=Severity.REJECT,
     ),
     _Said(

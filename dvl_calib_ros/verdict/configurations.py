@@ -122,7 +122,7 @@ CONFIGURATIONS = (
         "Axes are exchanged or negated.",
         "",
     ),
-    _Said("RATES_DEGREES", "an angular velocity in degrees per second", "It has to be in rad/s.", ""),
+    _Said("RATES_DEGREES", "an angular velocity in degrees per second", "The angular velocity has to be in rad/s.", ""),
     _Said(
         "RATES_SCALED",
         "an angular velocity that is {times:.2g} times as large",
@@ -132,7 +132,7 @@ CONFIGURATIONS = (
     _Said(
         "RATES_IN_EARTH",
         "an angular velocity about the axes of the earth ({frame}), not of the body",
-        "It has to be about the IMU's own axes.",
+        "The angular velocity has to be about the IMU's own axes.",
         "",
     ),
     _Said(
@@ -170,7 +170,7 @@ CONFIGURATIONS = (
     _Said(
         "GRAVITY_LEANS",
         "{topic}: gravity is {degrees:.0f}° from up by the IMU's own orientation",
-        "Roll and pitch, or the acceleration, are wrong by that.",
+        "Roll and pitch, or the acceleration, are wrong by that angle.",
         "check the IMU's mounting in its driver",
     ),
     _Said(
@@ -213,13 +213,13 @@ CONFIGURATIONS = (
     _Said(
         "CLOCK_DRIFTS",
         "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
-        "It gains or loses time at a steady rate.",
+        "The clock gains or loses time at a steady rate.",
         "set the clocks by one source",
     ),
     _Said(
         "CLOCK_DRIFTS_DVL",
         "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
-        "It gains or loses time at a steady rate.",
+        "The clock gains or loses time at a steady rate.",
         "set the clocks by one source, or dvl_clock_drift to {drift:.2g}",
     ),
     _Said(
@@ -289,20 +289,20 @@ DISCOVERIES = (
     _Discovered(
         "TOPIC_DOES_NOT_MOVE",
         "{topic} does not move; not taken as a reference",
-        "Its velocity is 0 throughout.",
+        "The velocity is 0 throughout.",
         "",
     ),
     _Discovered(
         "TOPIC_FROM_DVL",
         "{topic} looks as if it was computed from the DVL; not taken as a reference",
-        "It equals the DVL's velocity, or is named after it.",
+        "The topic equals the DVL's velocity, or is named after the DVL.",
         "",
     ),
     _Discovered(
         "TOPIC_DERIVED",
         "{topic} may be a filter's output that uses the DVL; not taken as a reference. If it does not use the DVL: "
         "--gnss-topic {topic}",
-        "Its name says that a filter made it.",
+        "The name says that a filter made it.",
         "",
     ),
     _Discovered(
@@ -314,7 +314,7 @@ DISCOVERIES = (
     _Discovered(
         "FRAME_NOT_IN_TREE",
         "no transform for the DVL's frame {frame!r}; using frame {other!r} instead",
-        "Its name is that of a DVL.",
+        "The frame used instead has a DVL's name.",
         "",
     ),
     _Discovered(
@@ -332,7 +332,7 @@ DISCOVERIES = (
     _Discovered(
         "TRANSFORM_NOT_ROTATION",
         "/tf_static: the transform of {frame!r} is not a rotation; not used",
-        "Its quaternion does not have length 1.",
+        "The quaternion does not have length 1.",
         "",
     ),
     _Discovered("URDF_NOT_READ", "{reason}; not used", "`/robot_description` is no URDF.", ""),

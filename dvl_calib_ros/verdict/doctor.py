@@ -42,7 +42,7 @@ _KINDS = (
     Kind(
         "DOCTOR_APART",
         "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
-        "They were recorded at different times, or a clock is wrong.",
+        "The topics were recorded at different times, or a clock is wrong.",
         "record both at once; if they were, check the clocks, and for import the times of both files",
         Severity.ERROR,
     ),
@@ -62,7 +62,7 @@ _KINDS = (
     Kind(
         "DOCTOR_TOO_FEW",
         "{topic}: {count} messages are too few",
-        "The topic was hardly recorded.",
+        "Hardly a message of the topic was recorded.",
         "record all topics for some minutes",
         Severity.ERROR,
     ),
@@ -124,7 +124,7 @@ _KINDS = (
     Kind(
         "DOCTOR_NO_IMU",
         "no IMU in the bag: {what}",
-        "Without an IMU there is no attitude and no lever arm correction in turns.",
+        "Attitude and lever arm correction need an IMU.",
         "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
     ),
     Kind(
@@ -137,7 +137,7 @@ _KINDS = (
     Kind(
         "DOCTOR_UNITS",
         "DVL and reference differ by a factor of {factor:.4g}{guess}",
-        "One of them is not in m/s.",
+        "DVL or reference is not in m/s.",
         "let its driver convert to m/s",
         Severity.ERROR,
     ),

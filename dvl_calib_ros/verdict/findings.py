@@ -94,7 +94,7 @@ FINDINGS = (
     Kind(
         "SAMPLES_BEFORE_RESTART",
         "{count} {stream} samples were from before the clock was set back or the bag looped; they are not used",
-        "They belong to the run that ended there.",
+        "These samples belong to the run before the restart.",
         "nothing, unless clocks are set during a run",
     ),
     Kind(
@@ -233,7 +233,7 @@ FINDINGS = (
     Kind(
         "PROCESS_PAUSED",
         "this process was not running for {seconds:.0f} s",
-        "The node was stopped, or the machine slept or was overloaded; messages may be lost.",
+        "The node was stopped, or the machine slept or was overloaded.",
         "let it run in the background (bg), keep the machine awake, give it more of a core",
     ),
     Kind(
@@ -270,7 +270,7 @@ FINDINGS = (
     Kind(
         "BAG_NO_IMU",
         "no IMU in the bag: {what}",
-        "Without an IMU there is no attitude and no lever arm correction in turns.",
+        "Attitude and lever arm correction need an IMU.",
         "record the IMU's topic (sensor_msgs/Imu, with orientation) beside the DVL, or name it: --imu-topic",
     ),
     Kind(
@@ -322,7 +322,7 @@ FINDINGS = (
         "HEADING_DEVIATION",
         "the heading error changes {course}: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
         "{least:+.1f}° at {least_at:.0f}°; it costs {cost:.0f} m per km",
-        "A compass deviates with the heading, a gyro drifts; the yaw holds the mean of it.",
+        "A compass deviates with the heading, a gyro drifts; the yaw holds the mean deviation.",
         "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
     ),
     Kind(
@@ -336,7 +336,7 @@ FINDINGS = (
         "TILT_NOT_FOLLOWED",
         "the DVL's velocity does not follow the vehicle's {axis}: {share:.1f} ± {std:.1f} times the {axis} is left, "
         "which looks like {off:.1f}° of mounting",
-        "1: the driver levels the velocity. 2 or -2: an angle of the IMU, or a DVL axis, has the wrong sign.",
+        "Factor 1: the driver levels the velocity. 2 or -2: wrong sign of an IMU angle or a DVL axis.",
         "have the driver send the velocity in the DVL's own axes; check the sign of the IMU's roll and pitch",
     ),
     Kind(
