@@ -59,9 +59,9 @@ def run(arguments: argparse.Namespace) -> None:
         show(*command_table().splitlines())
         return
     if asked := next((name for name in _TABLES if getattr(arguments, name)), None):
-        from ..verdict.reasons import TABLES, table
+        from ..verdict.reasons import TABLES, lookup
 
-        show(*table(TABLES[asked]).splitlines())
+        show(*lookup(TABLES[asked]).splitlines())
         return
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters

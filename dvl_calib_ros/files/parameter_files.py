@@ -230,20 +230,19 @@ def parameter_file_text() -> str:
 
 def parameter_table() -> str:
     """Return the documentation's table of parameters, in Markdown."""
-    lines = ["| parameter | default | unit, range | at run time | meaning |", "|---|---|---|---|---|"]
+    lines = ["| parameter | default | unit, range | meaning |", "|---|---|---|---|"]
     for name, spec in SCHEMA.items():
         about = " ".join(part for part in (spec.unit, ", ".join(spec.choices), _range(name)) if part)
-        lines.append(
-            f"| `{name}` | {_shown(spec.default)} | {about} | {'' if spec.read_only else 'yes'} | {spec.description} |"
-        )
+        at_run_time = "" if spec.read_only else " *"
+        lines.append(f"| `{name}`{at_run_time} | {_shown(spec.default)} | {about} | {spec.description} |")
     return "\n".join(lines) + "\n"
 
 
 def model_table() -> str:
     """Return the documentation's table of models, in Markdown."""
-    lines = ["| model | states | assumes | is wrong |", "|---|---|---|---|"]
+    lines = ["| model | assumes | is wrong |", "|---|---|---|"]
     for model in MODELS.values():
-        lines.append(f"| {model.name} | {' '.join(model.state_names)} | {model.assumes} | {model.wrong_when} |")
+        lines.append(f"| {model.name} | {model.assumes} | {model.wrong_when} |")
     return "\n".join(lines) + "\n"
 
 

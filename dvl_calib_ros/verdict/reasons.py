@@ -151,14 +151,14 @@ def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
     return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), not is_cause(each)))
 
 
-def table(kinds: Iterable[Kind]) -> str:
-    """Return the documentation's table in Markdown, with … for each field."""
-    lines = ["| code | it says | which means | what to do |", "|---|---|---|---|"]
-    for kind in kinds:
-        code = f"`{kind.code}`" + ("" if kind.severity is Severity.WARNING else f" ({kind.severity.value})")
-        cells = (_FIELD.sub("…", text).replace("|", "\\|") for text in (kind.says, kind.means, kind.remedy))
-        lines.append(f"| {code} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+def lookup(kinds: Iterable[Kind]) -> str:
+    """Return a part of docs/troubleshooting.md: cause and remedy under each code, with … for fields."""
+    return "\n".join(f"### {kind.code}\n\n{_cause_and_remedy(kind)}\n" for kind in kinds)
+
+
+def _cause_and_remedy(kind: Kind) -> str:
+    remedy = _FIELD.sub("…", re.sub(r"^{\w+}", "", kind.remedy))
+    return f"{kind.means} {full(remedy)}".replace("….", "…") if remedy else kind.means
 
 
 def _causes(value: object) -> tuple[Reason, ...]:

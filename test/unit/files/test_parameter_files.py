@@ -250,10 +250,10 @@ def test_the_generated_file_holds_every_parameter_at_its_default(tmp_path):
     assert set(parsed(path.read_text())["/**"]["ros__parameters"]) == set(SCHEMA)
 
 
-def test_the_table_has_one_row_of_five_cells_for_every_parameter():
+def test_the_table_has_one_row_of_four_cells_for_every_parameter():
     rows = parameter_table().strip().splitlines()[2:]
     assert [row.split("`")[1] for row in rows] == list(SCHEMA)
-    assert all(row.count("|") == 6 for row in rows)
+    assert all(row.count("|") == 5 for row in rows)
 
 
 @pytest.mark.parametrize(
