@@ -72,7 +72,7 @@ class Replayed:
     @property
     def dvl_data(self) -> str:
         """Type and axes of the DVL's data, in words."""
-        return self.dvl_type + (", turned from forward-right-down to forward-left-up" if self.turned else "")
+        return self.dvl_type + (", converted from forward-right-down to forward-left-up" if self.turned else "")
 
     @property
     def cause_of_scale(self) -> CauseOfScale | None:
@@ -270,7 +270,7 @@ def reference_prior(recording: Recording, parameters: Parameters, topics: Topics
     mean = np.concatenate([*velocities, np.zeros((0, 3))])
     if not len(mean):
         raise InputError(
-            f"prior_source reference: topic {topics.gnss} has no velocity that can be turned into the body frame in "
+            f"prior_source reference: topic {topics.gnss} has no velocity that can be rotated to the body frame in "
             f"its first {parameters.prior_window:g} s; set --gnss-topic, or use prior_source fixed"
         )
     _, sway, heave = mean.mean(axis=0).tolist()

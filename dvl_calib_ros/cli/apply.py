@@ -70,8 +70,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise InputError("--now, --settings and --send go with --instrument; name that, too")
     if arguments.instrument is not None and (targets.paths or arguments.rollback):
         raise InputError(
-            "--instrument takes the error out where it is made; with --urdf, --params, --launch or --fusion the DVL "
-            "would be turned twice: give one of them"
+            "--instrument corrects the error at its source; with --urdf, --params, --launch or --fusion the DVL "
+            "would be corrected twice: give one of them"
         )
     if arguments.rollback:
         for path, kept in roll_back(targets).items():
@@ -171,8 +171,8 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     if calibrated.dvl_time_offset:
         late = "late" if calibrated.dvl_time_offset > 0.0 else "early"
         lines.append(
-            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late}, today: URDF and TF hold no "
-            "delay; --params writes dvl_time_offset, or set the DVL's clock"
+            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late} in this recording: URDF and "
+            "TF have no delay; --params writes dvl_time_offset, or set the DVL's clock"
         )
     if calibrated.position is not None:
         lines.append(f"position: {_metres(calibrated.position)} in {calibrated.base_frame}")

@@ -154,7 +154,7 @@ def add_simulator_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rounds", type=int, metavar="N",
-        help="put the simulator's DVL right by what was found, simulate it on the simulator's motion and compare "
+        help="correct the simulator's DVL by the differences, simulate it on the simulator's motion and compare "
         "again, up to N times",
     )  # fmt: skip
     parser.add_argument(

@@ -55,5 +55,5 @@ def _print(exported: Export, arguments: argparse.Namespace) -> None:
         out.print(f"{arguments.simulator} can represent everything that was found")
         return
     rows = [(e.name, "-" if e.error is None else f"{1e3 * e.error:.1f}", e.says) for e in exported.missing]
-    head = ("what", "error that stays, mm/s", "why")
+    head = ("what", "remaining error, mm/s", "why")
     out.print(rich_table(Table(head, rows, f"{arguments.simulator} cannot represent", words=3)))

@@ -248,7 +248,7 @@ def _warnings(status: Status) -> list[str]:
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
     """Yield the mounting, the first warning, streams, drift by axis and headings."""
     is_usable, colour = _is_usable(status), COLOURS.get(status.level, "red")
-    why = "see below" if status.get("next code") == "NEXT_REJECTED" else "the data do not show it yet"
+    why = "see below" if status.get("next code") == "NEXT_REJECTED" else "not observable yet"
     between = [Row("")] if width >= WIDE else []
     yield from between
     yield Row("mounting now") if is_usable else Row(f"mounting: not to be used, {why}", colour, most=2)

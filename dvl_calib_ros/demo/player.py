@@ -90,7 +90,7 @@ class BagPlayer:
         deadline = time.monotonic() + timeout_s
         while unheard := self.unheard:
             if time.monotonic() > deadline:
-                raise InputError(f"nobody subscribes to {unheard[0]} within {timeout_s:.0f} s; is the node running?")
+                raise InputError(f"no subscriber of {unheard[0]} within {timeout_s:.0f} s; is the node running?")
             time.sleep(0.01)
 
     def play(

@@ -207,7 +207,7 @@ class _Search:
         if dvl.claimed_std >= SAYS_NOTHING and not self._is_given("use_message_covariance"):
             self._values["use_message_covariance"] = False
             self._found.append(
-                f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which says nothing and is not used "
+                f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which is no information and not used "
                 "(-p use_message_covariance:=false)"
             )
         if reference is not None:
@@ -231,7 +231,7 @@ class _Search:
         ):
             axes = self._values["dvl_axes"] = FRD if turned != self._is_z_down else FLU
             which = "forward-right-down" if axes == FRD else "forward-left-up"
-            self._found.append(f"the DVL's data are taken {which} (dvl_axes {axes})")
+            self._found.append(f"the DVL's data are used as {which} (dvl_axes {axes})")
         if known is not None and not self._is_given("mounting_rpy"):
             self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
         if placed is not None and placed.source:
@@ -390,8 +390,8 @@ class _Search:
             name = self._values["gnss_frame"] = taken.name
             if declared is None:
                 self._found.append(
-                    f"the reference is taken as {name}, which fits best; its frame {reference.frame_id!r} does not "
-                    f"say (-p gnss_frame:={name})"
+                    f"the reference is used as {name}, which fits best; its frame {reference.frame_id!r} does not "
+                    f"define it (-p gnss_frame:={name})"
                 )
             else:
                 frame = {"frame": reference.frame_id, "declared": declared.name, "taken": name}
@@ -454,7 +454,7 @@ class _Search:
         if np.allclose(rpy, 0.0, atol=1e-9) and frame.world == "enu":
             return
         self._values |= {"imu_rpy": rpy, "imu_frame": frame.world}
-        self._found.append(f"the IMU's data are taken {frame.says}: imu_rpy {in_degrees(rpy)}, imu_frame {frame.world}")
+        self._found.append(f"the IMU's data are used {frame.says}: imu_rpy {in_degrees(rpy)}, imu_frame {frame.world}")
 
     def _mounting_found(self, rpy: tuple[float, float, float], why: str) -> None:
         if not any(rpy):
@@ -484,7 +484,7 @@ class _Search:
                 said = {"given": given, "found": in_degrees(fits), "option": as_option(fits)}
                 self._contradictions.append(finding("TRAVELS_SIDEWAYS", **said))
         elif abs(yaw) > OTHER_MOUNTING:
-            self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "where the vehicle goes ahead")
+            self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 
     def _reference_position(self, reference: Look) -> Array:
         """Return the position in the body of the point whose velocity the reference measures."""

@@ -179,7 +179,7 @@ class FrameChooser:
             (ImuFrame(at, NWU, f"with a heading that counts from north, {says}"), IMU_OTHERWISE),
         ]
         if not np.allclose(at, np.eye(3)):
-            said = "as the body, whatever its transform says"
+            said = "as the body, despite its transform"
             frames.append((ImuFrame(np.eye(3), IMU_ENU, said), IMU_IN_OTHER_WORLD))
         if self._gravity is not None:
             frames.append((ImuFrame(at @ FLU_FROM_FRD, IMU_ENU, f"turned over, {says}"), IMU_OTHERWISE))

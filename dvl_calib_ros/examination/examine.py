@@ -253,7 +253,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         found += topic_checks.orientation_findings(imu)
     if imu is None:
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
-        what = "no lever arm is taken out or found" if reference is not None else "nothing tells the heading"
+        what = "no lever arm is corrected or estimated" if reference is not None else "nothing tells the heading"
         found.append(finding("DOCTOR_NO_IMU", what=what) if in_body else finding("DOCTOR_NO_IMU_EARTH"))
     told_by_log = any(each.code == "DOCTOR_CLOCKS" for each in found)  # the clock and its offset are already reported
     without = None if discovery.clocks is None else discovery.clocks.doubt  # this doubt prevents every calibration

@@ -184,7 +184,7 @@ def _objections_and_doubts(
     """Return objections and doubts from the verdict and the convergence in a result file."""
     objections, doubts = [], []
     if convergence is Convergence.COLLECTING:
-        objections.append("its data show no angle and no scale yet (collecting)")
+        objections.append("no angle and no scale is observable in its data yet (collecting)")
     elif convergence is Convergence.COARSE:
         doubts.append(
             "its convergence is coarse: standard deviations are above fine_std_misalignment or fine_std_scale"
@@ -207,7 +207,7 @@ def _saved_warnings(content: Mapping[str, Any], *severities: Severity) -> tuple[
 def _unobservable(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
     entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
     return tuple(
-        f"{each.name} ({each.axis}) was not shown by the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
+        f"{each.name} ({each.axis}) was not observable in the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
         for each in entries
     )
 
@@ -268,7 +268,7 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
     there, default = load_parameters(path), Parameters()
     if there.initial_calibration:
         raise InputError(
-            f"{path}: sets initial_calibration, whose angles are relative to the mounting before; take it out first"
+            f"{path}: sets initial_calibration, whose angles are relative to the previous mounting; remove it first"
         )
     for name, value in values.items():
         now, begun_with = getattr(there, name), getattr(calibrated.parameters, name)
@@ -307,12 +307,12 @@ def launch_file(calibrated: CalibratedMounting) -> str:
     for frame in (calibrated.base_frame, calibrated.dvl_frame):
         if "$" in frame:
             raise InputError(
-                f"{calibrated.path}: the frame {frame!r} cannot be named in a launch file, which would run what "
-                "stands behind a $; name it otherwise in the driver, or run static_transform_publisher yourself"
+                f"{calibrated.path}: the frame {frame!r} cannot be used in a launch file, which would evaluate "
+                "text after a $; rename it in the driver, or run static_transform_publisher yourself"
             )
     arguments = quoteattr(calibrated.static_transform)
     return f"""<launch>
-  <!-- {_origin(calibrated)}. A transform holds no scale. Not beside a robot_state_publisher with the same joint. -->
+  <!-- {_origin(calibrated)}. A transform has no scale. Do not add a robot_state_publisher with this joint. -->
   <node pkg="tf2_ros" exec="static_transform_publisher" name="dvl_mounting" args={arguments}/>
 </launch>
 """
@@ -326,10 +326,10 @@ def _origin(calibrated: CalibratedMounting) -> str:
 def scale_advice(calibrated: CalibratedMounting) -> str:
     """Return a sentence on the scale error, which a transform cannot correct, and its remedy."""
     if not calibrated.model.scale_axes:
-        return f"{calibrated.model.name} estimates no scale: a scale error of the DVL stays in"
+        return f"{calibrated.model.name} estimates no scale: a scale error of the DVL remains"
     error = calibrated.scale_ahead
     return (
-        f"a transform holds no scale: {100.0 * error:+.2f} % ahead stays in ({abs(1000.0 * error):.1f} m per km). Use "
+        f"a transform has no scale: {100.0 * error:+.2f} % ahead stays in ({abs(1000.0 * error):.1f} m per km). Use "
         "~/calibrated_twist, which is corrected in both, or multiply the driver's speed of sound by "
         f"{calibrated.speed_of_sound_factor:.5f} (not with a phased array, which measures ahead without it)"
     )
@@ -397,7 +397,7 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     if not used:
-        raise InputError(f"{path}: {model.name} used no sample, so it says nothing of the mounting; leave it out")
+        raise InputError(f"{path}: {model.name} used no sample, so it has no mounting; leave it out")
     remarks = list(calibrated.objections)
     if initial := calibrated.parameters.initial_calibration:
         remarks.append(

@@ -160,7 +160,7 @@ def days_document(result: Result) -> dict[str, Any]:
 
 def _in_words(found: Quantity) -> str:
     unit = found.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
-    return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not shown by this data)")
+    return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not observable in this data)")
 
 
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:

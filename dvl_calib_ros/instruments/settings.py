@@ -152,13 +152,13 @@ def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[
     factor, scale = calibrated.speed_of_sound_factor, f"{100.0 * calibrated.scale_ahead:+.2f} %"
     if calibrated.model.scale_axes and now is not None:
         new = round(factor * now, 2)
-        said = f"scale {scale}: as a speed of sound that is {now - new:+.1f} m/s off. Other water, another speed"
+        said = f"scale {scale}: equals a speed of sound error of {now - new:+.1f} m/s. It changes with the water"
         return [Setting(SPEED_OF_SOUND, now, new, "m/s")], [said]
     water = calibrated.water
     if water is not None and water.speed is not None and not math.isnan(water.salinity):
         middle, half = 0.5 * (water.speed.most + water.speed.least), 0.5 * (water.speed.most - water.speed.least)
         why = (
-            "for the calibration holds no scale"
+            "because the calibration has no scale"
             if now is not None
             else f"because the DVL's setting is unknown; if you know it, give --now {SPEED_OF_SOUND}=1500"
         )
@@ -183,7 +183,7 @@ def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple
         settings.append(Setting("velocity_adjustment", now["velocity_adjustment"], new))
         lines.append(f"SET-VELOCITY-ADJUSTMENT {new:g}")
         if calibrated.cause_of_scale is not None:
-            notes.append("velocity_adjustment takes the scale out: set it or the speed of sound, not both")
+            notes.append("velocity_adjustment corrects the scale: set it or the speed of sound, not both")
     return settings, "\n".join(lines) + "\n", notes
 
 
@@ -208,16 +208,16 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tupl
     settings.append(Setting("VISO_ORIENT", now.get("VISO_ORIENT"), float(quarters % 4 * 2)))
     if abs(off) > SAID_FROM:
         notes.append(
-            f"{math.degrees(off):+.2f}° of yaw (clockwise) stay: VISO_ORIENT holds quarter turns. Set them in the DVL "
-            "itself (--instrument waterlinked or cerulean)"
+            f"{math.degrees(off):+.2f}° of yaw (clockwise) remain: VISO_ORIENT has only quarter turns. Set them in "
+            "the DVL itself (--instrument waterlinked or cerulean)"
         )
     delay = round(1000.0 * calibrated.dvl_time_offset)
     if DELAY_MS[0] <= delay <= DELAY_MS[1]:
         settings.append(Setting("VISO_DELAY_MS", now.get("VISO_DELAY_MS"), float(delay), "ms"))
     else:
         notes.append(
-            f"VISO_DELAY_MS holds {DELAY_MS[0]} to {DELAY_MS[1]} ms, and the DVL's stamps are {delay} ms late: set its "
-            "clock right"
+            f"VISO_DELAY_MS allows {DELAY_MS[0]} to {DELAY_MS[1]} ms, and the DVL's stamps are {delay} ms late: "
+            "correct its clock"
         )
     if calibrated.model.scale_axes:
         notes.append(f"the DVL's scale, {100.0 * calibrated.scale_ahead:+.2f} %, is its own to set")
@@ -263,7 +263,7 @@ def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
 
 def _delay(calibrated: CalibratedMounting) -> list[str]:
     late = calibrated.dvl_time_offset
-    return [f"the DVL's stamps are {late:+.3f} s late, which is no setting of the instrument"] if late else []
+    return [f"the DVL's stamps are {late:+.3f} s late, for which the instrument has no setting"] if late else []
 
 
 INSTRUMENTS: Mapping[str, Instrument] = {

@@ -250,7 +250,7 @@ class CalibrationNode(AnsweringNode):
             self._calibrator.set_parameters(parameters.replace(**place))
             return
         self.get_logger().info(
-            f"{printable(found.said)}; the calibration begins with it (use_transforms: false does without)"
+            f"{printable(found.said)}; the calibration starts with it (set use_transforms to false to ignore it)"
         )
         self._restart(parameters.replace(**found.values))
 

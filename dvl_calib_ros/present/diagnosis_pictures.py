@@ -121,7 +121,7 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
     noise = float(np.sqrt(2.0 * interval * (twin.noise**2).sum()))
     densities = {name: density for name, (_, density) in spectra.items()} | {"noise": np.full(len(frequency), noise)}
     yield picture(
-        f"{twin.name}: by frequency", f"Amplitude spectral density of recorded less twin, {names}, beside the noise",
+        f"{twin.name}: by frequency", f"Amplitude spectral density of recorded less twin, {names}, and the noise",
         figures.spectra, frequency, densities, "recorded − twin, mm/s/√Hz",
     )  # fmt: skip
     pooled = {name: values[:, measured].ravel() for name, values in found.items()}

@@ -48,9 +48,9 @@ CONVERGENCE_NOTE = (
     "Only turns make roll observable: without them the whole angle keeps the error of the prior."
 )
 BASELINES_NOTE = (
-    "The rotation alone by least squares on SO(3): of displacements (Kinsey and Whitcomb, 2007; here of the integrated "
-    "reference velocity, whose noise grows with time, where they had positions), and of velocities (Troni and "
-    "Whitcomb, 2010). They have neither scale nor prior."
+    "Only the rotation, by least squares on SO(3): from displacements (Kinsey and Whitcomb, 2007; here of the "
+    "integrated reference velocity, whose noise grows with time, where they had positions), and from velocities "
+    "(Troni and Whitcomb, 2010). They have neither scale nor prior."
 )
 # prefixes of state names -> displayed symbols
 SYMBOLS = {"phi_": "φ", "delta_k": "δk", "delta_k_": "δk "}
@@ -307,7 +307,7 @@ def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
     ]
     notes = (
         "Avg.VRMSE on all other trajectories, m/s. Headings: their circular standard deviation. ? marks where the "
-        "model mostly says that it has not seen yaw; – where it cannot run.",
+        "yaw is mostly not observable for the model; – where it cannot run.",
     )
     table = Table(("run", "headings, °", *e.columns), rows, marked=len(study.runs), dense=True, notes=notes)
     median = ", ".join(f"{name} {v:.4f}" for name, v in zip(e.columns, medians["median"].tolist(), strict=True))

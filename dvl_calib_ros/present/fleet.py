@@ -57,9 +57,9 @@ def fleet(result: Fleet) -> Document:
         if each.compared.verdict != "same" and reason.code in MOVEMENTS
     ]
     if not said and result.word == "same":
-        said = ["No movement found; the table says how small a movement could not be seen."]
+        said = ["No movement found; the table has the smallest detectable movement."]
     if not said:
-        said = ["No vehicle has two days that show the same angle, so nothing can be compared."]
+        said = ["No vehicle has an angle that is observable on two days, so nothing can be compared."]
     said.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
     sitting = [VehicleNow(each, now(each)) for each in sorted(vehicles, key=_urgency)]
@@ -139,7 +139,7 @@ class VehicleNow(NamedTuple):
         if self.history.compared is not None:
             return ""
         days = len(self.history.days)
-        return {0: "No recording is usable.", 1: "One day alone."}.get(days, "No two days show the same angle.")
+        return {0: "No recording is usable.", 1: "One day alone."}.get(days, "No angle is observable on two days.")
 
     @property
     def seen_from(self) -> str:

@@ -65,14 +65,14 @@ _AXES = {
 NO_MOUNTING = "No mounting is given. The models' estimates are in the details (--verbose)."
 AGAINST_TRAVEL = (
     "Without a reference the angles are relative to the direction of travel: a constant sideslip looks like yaw, and "
-    "driving astern looks like a DVL turned by 180°."
+    "driving astern looks like a DVL rotated by 180°."
 )
 AGAINST_IMU = (
     "Angles are relative to the IMU: a constant error of its heading is in the yaw, one of its level in roll and "
     "pitch. Both are harmless as long as the same IMU is used."
 )
 STRAIGHT = "A straight kilometre of dead reckoning ends {0.before} m off as mounted, {0.after} m corrected (1σ)."
-NO_RESIDUALS = ". No reference is beside enough of them for residuals."
+NO_RESIDUALS = ". Too few of them have a reference for residuals."
 RESIDUALS = (
     "; residuals are at the reference point, corrected by estimates without this data, with everything "
     "found, including lever arm and delay. They include the reference's noise. Lines are running means."
@@ -266,7 +266,7 @@ def _mounting(run: Replayed) -> Iterator[Item]:
             each.in_unit(each.std),
             each.in_unit(each.nominal),
             each.in_unit(each.value - each.nominal, signed=True),
-            "" if each.shown else "not shown by this data",
+            "" if each.shown else "not observable in this data",
             each.shown,
         )
         for each in quantities(run.result)
@@ -277,7 +277,7 @@ def _mounting(run: Replayed) -> Iterator[Item]:
     elif run.reference_frame in EARTH:
         yield Sentence(AGAINST_IMU)
     for lacks, axes in not_shown(run.result).items():
-        yield Sentence(f"{axes} (?): not shown by this recording; it needs {lacks}")
+        yield Sentence(f"{axes} (?): not observable in this recording; it needs {lacks}")
     if (cause := run.cause_of_scale) is not None:
         yield Sentence(cause.sentence)
     if run.result.iac_model in run.result.estimates and run.result.iac_model != run.result.selected:

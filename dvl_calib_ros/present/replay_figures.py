@@ -219,7 +219,7 @@ def mounting_pictures(result: Result) -> list[Picture]:
     place = result.position_in_body
     how = f"The turn of {math.degrees(angle):.2f}° is drawn {times} times as large." if times > 1 else "True to scale."
     if place is None:
-        how += " Where the DVL sits is not known: drawn in the middle."
+        how += " The position of the DVL is unknown: drawn in the middle."
     return [
         picture(
             f"DVL on the vehicle, {where}", f"Axes of the DVL as configured and as found, {where}. {how}",
@@ -280,7 +280,7 @@ def navigation_pictures(
     first four are drawn. stamps_ns: of figures whose cursor the map follows.
     """
     told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
-    alt = f"over {one.distance_m:.0f} m; off at the end: as mounted {one.before.end:.1f} m; {told}"
+    alt = f"over {one.distance_m:.0f} m; error at the end: as mounted {one.before.end:.1f} m; {told}"
     time = None if stamps_ns is None else TimeAxis(stamps_ns)
     figures = []
     if one.on_a_map:
@@ -331,7 +331,7 @@ def _coloured(figure: Figure, axes: Axes, one: Navigation) -> None:
     axes.add_collection(track)
     bar = figure.colorbar(track, ax=axes, shrink=0.6, aspect=24, pad=0.02)
     bar.outline.set_visible(False)
-    bar.set_label("corrected: off by, m")
+    bar.set_label("corrected: error, m")
 
 
 def error_along(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:

@@ -39,11 +39,11 @@ def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | Non
     if topics.imu in recording.types:
         return []
     if topics.gnss not in recording.types:
-        what = "nothing tells the heading"
+        what = "the heading is unknown"
     elif frame is VelocityFrame.BODY:
-        what = "no lever arm is taken out or found"
+        what = "no lever arm is corrected or estimated"
     else:
-        what = "a reference in the earth's frame cannot be compared with the DVL; no lever arm is found"
+        what = "a reference in the earth's frame cannot be compared with the DVL; no lever arm is estimated"
     return [finding("BAG_NO_IMU", what=what)]
 
 

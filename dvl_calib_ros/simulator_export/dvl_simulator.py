@@ -91,8 +91,8 @@ def write(description: DvlDescription) -> Settings:
         (
             f"the intervals of scale and biases are made for the constant seed {SEED}: leave it; every run then has "
             "the same noise, and another C++ library than libstdc++ may draw others",
-            "rotation_body_to_sensor_frame holds yaw, pitch, roll, and the lever arm is in the sensor's axes: so its "
-            "sources take them",
+            "rotation_body_to_sensor_frame has yaw, pitch, roll, and the lever arm is in the sensor's axes, as the "
+            "simulator's sources use them",
         ),
         frozenset({"scale", "velocity_bias"}),
     )

@@ -48,7 +48,7 @@ def write(description: DvlDescription) -> Settings:
         beams.axis_std if beams else None,
         remarks=(
             "no socket is named, so location is from the agent's centre: add what lies between",
-            "pitch is about y, which points left; its documentation also calls that axis right: look at the sign",
+            "pitch is about y, which points left; its documentation also says right: check the sign",
             f"Hz must divide ticks_per_sec of the scenario; this is {values['Hz']:g}",
         ),
     )

@@ -70,7 +70,7 @@ def export(name: str, simulator: Simulator, description: DvlDescription) -> Expo
     settings = simulator.write(description)
     missing = sorted(_missing(simulator.title, settings, description), key=lambda each: -(each.error or 0.0))
     ambiguous = tuple(
-        f"the data could not tell {', '.join(names)} apart; {names[0]} is taken" for names in description.ambiguous
+        f"the data could not distinguish {', '.join(names)}; {names[0]} is used" for names in description.ambiguous
     )
     return Export(name, settings, tuple(missing), (*description.doubts, *settings.remarks, *ambiguous, simulator.where))
 

@@ -169,7 +169,7 @@ class _Compared:
         """Report an effect that one side cannot be tested for, or whose observable parts differ between the sides."""
         shown = [side[name].intervals() if name in side else {} for side in self._per_side]
         effect = self._effects[name]
-        needs = f"the two logs show nothing of it that is the same: {effect.manoeuvre}"
+        needs = f"no common part of it is observable in both logs: {effect.manoeuvre}"
         for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True):
             if name not in selection.testable:
                 lacks = ", ".join(sorted(need.value for need in effect.needs))

@@ -111,7 +111,7 @@ class Tables:
         except PARSING as error:
             raise DamagedError(f"the record at byte {at} is damaged") from error
         if (opcode, record.id) in self._met and says(table[record.id]) != says(record):
-            raise DamagedError(f"the record at byte {at} says otherwise of {known} {record.id} than others")
+            raise DamagedError(f"the record at byte {at} contradicts others about {known} {record.id}")
         self._met.add((opcode, record.id))
         table[record.id] = record
         self._made.clear()
