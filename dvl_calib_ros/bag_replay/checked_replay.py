@@ -127,8 +127,10 @@ def checked_replay(
 def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
     """Add ambiguous frames to the verdict and, if the calibration is rejected anyway, their likely cause."""
     is_rejected = verification.verdict is Severity.REJECT
-    said = [each for each in contradictions if each.severity is Severity.MARGINAL or (is_rejected and is_cause(each))]
-    return verification.with_objections(said) if said else verification
+    objections = [
+        each for each in contradictions if each.severity is Severity.MARGINAL or (is_rejected and is_cause(each))
+    ]
+    return verification.with_objections(objections) if objections else verification
 
 
 def _mounting_instead_of_guess(result: Result) -> tuple[float, float, float] | None:
@@ -293,8 +295,8 @@ def _replay_from_valid_start(
     contradiction = None if found is None else contradicts(found, load_extrinsics(Path(saved), saved))
     if contradiction is None:
         return replayed
-    said = finding("INITIAL_CONTRADICTED", file=saved, difference=moved_in_words(contradiction))
-    return replace(alone, findings=(*alone.findings, said), notes=(*alone.notes, str(said)))
+    warning = finding("INITIAL_CONTRADICTED", file=saved, difference=moved_in_words(contradiction))
+    return replace(alone, findings=(*alone.findings, warning), notes=(*alone.notes, str(warning)))
 
 
 class Calibrated(NamedTuple):

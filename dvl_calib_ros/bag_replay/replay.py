@@ -321,7 +321,7 @@ def _counts_in_words(counts: Any) -> str:
 def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]:
     """Return plain data of a replay for the requested models. Segments are in s since the first DVL sample."""
     result = replayed.result
-    told = [name for name in models if name in result.estimates]
+    estimated = [name for name in models if name in result.estimates]
     segments = []
     with suppress(TypeError):  # no sample at all: first_ns is None and there are no segments
         ends = [segment.from_ns for segment in result.segments[1:]] + [result.last_ns]
@@ -334,8 +334,8 @@ def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]
             for segment, end in zip(result.segments, ends, strict=True)
         ]
     return {
-        "models": {name: estimate_document(result.estimates[name]) for name in told},
-        "verification": {name: verification_document(result.verifications[name]) for name in told},
+        "models": {name: estimate_document(result.estimates[name]) for name in estimated},
+        "verification": {name: verification_document(result.verifications[name]) for name in estimated},
         "selected": segments,
         **days_document(result),
         "counts": {name: dict(counts) for name, counts in result.counts.items()},

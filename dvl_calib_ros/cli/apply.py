@@ -127,14 +127,14 @@ def _parse_now(words: Sequence[str]) -> dict[str, float]:
     """Parse --now NAME=VALUE. Raises InputError."""
     from ..errors import InputError
 
-    told = {}
+    settings = {}
     for word in words:
         name, _, value = word.partition("=")
         try:
-            told[name.strip()] = float(value)
+            settings[name.strip()] = float(value)
         except ValueError as error:
             raise InputError(f"--now {word}: is not NAME=VALUE with a number") from error
-    return told
+    return settings
 
 
 def _settings_lines(chosen: InstrumentSettings) -> list[str]:

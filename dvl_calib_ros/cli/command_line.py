@@ -186,5 +186,5 @@ def _files(path: Path) -> list[Path]:
     """Return a folder's recordings, or a recording and its journals."""
     if path.is_dir():
         return [path / name for name in sorted(os.listdir(path)) if name.endswith(_SUFFIXES)]
-    beside = [path, *(path.with_name(path.name + journal) for journal in ("-wal", "-journal"))]
-    return [file for file in beside if file.name.endswith(_SUFFIXES) and file.exists()]
+    candidates = [path, *(path.with_name(path.name + journal) for journal in ("-wal", "-journal"))]
+    return [file for file in candidates if file.name.endswith(_SUFFIXES) and file.exists()]

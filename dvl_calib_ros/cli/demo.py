@@ -138,9 +138,9 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     of_these = [row[: len(truth)] for row in found.rows]  # only the columns that have a truth
     out.print(rich_table(Table(found.head[: len(truth)], [truth, *of_these])))
     worst = max(
-        float(np.abs(here - there).max())
+        float(np.abs(live_value - replay_value).max())
         for name, estimate in offline.estimates.items()
-        for here, there in ((live[name].x, estimate.state), (live[name].p, estimate.covariance))
+        for live_value, replay_value in ((live[name].x, estimate.state), (live[name].p, estimate.covariance))
     )
     model = load_yaml(saved, "result file")["model"]
     start_ns = offline.first_ns or 0

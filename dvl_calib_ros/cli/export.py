@@ -33,8 +33,8 @@ def run(arguments: argparse.Namespace) -> None:
     from ..simulator_export.registry import missing_beside, write_settings
 
     missing = missing_beside(arguments.output)
-    beside = {} if missing is None else {"--output, for missing effects,": missing}
-    common.check_outputs(arguments, "output", also_written=beside)
+    also_written = {} if missing is None else {"--output, for missing effects,": missing}
+    common.check_outputs(arguments, "output", also_written=also_written)
     exported = write_settings(arguments.simulator, arguments.source, arguments.output)
     if missing is not None:
         _print(exported, arguments)

@@ -145,10 +145,10 @@ def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str])
     from ..recordings.topics import spelled
 
     def found(name: str, option: str) -> str:
-        there = spelled(name, bag.topics)
-        if there is None:
+        spelled_topic = spelled(name, bag.topics)
+        if spelled_topic is None:
             raise InputError(f"{option}: {name} is not in the recording, which has {', '.join(sorted(bag.topics))}")
-        return there
+        return spelled_topic
 
     renamed = {}
     for each in remap:

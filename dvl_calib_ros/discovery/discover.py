@@ -143,9 +143,9 @@ class _Search:
         self._notes += topic_choice.other_dvls(self._seen, dvl, difference_of)
         gnss, imu = default.gnss, default.imu
         if given.gnss_topic is None:
-            chosen, said = topic_choice.choose_reference(self._seen, default.gnss, dvl, difference_of)
+            chosen, notes = topic_choice.choose_reference(self._seen, default.gnss, dvl, difference_of)
             gnss = chosen or default.gnss
-            self._notes += said
+            self._notes += notes
         elif given.gnss_topic != topic_choice.NONE:
             gnss = self._named("gnss", given.gnss_topic) or gnss
         else:
@@ -285,7 +285,7 @@ class _Search:
         """Set the knowledge about the DVL's position in the body, which needs more than the lever arm."""
         if self._is_given("dvl_position"):
             return
-        told = _is_located(placed) and not self._is_given("lever_arm")
+        is_known = _is_located(placed) and not self._is_given("lever_arm")
         at = None if reference is None else self._known_reference_position(reference)
         if self._is_given("reference_position"):
             at = np.array(self._parameters.reference_position)
@@ -293,7 +293,7 @@ class _Search:
             self._values["dvl_position"] = FROM_REFERENCE
             if at.any() and not self._is_given("reference_position"):
                 self._values["reference_position"] = tuple((at + 0.0).tolist())
-        elif told:
+        elif is_known:
             self._values["dvl_position"] = TOLD
 
     def _known_reference_position(self, reference: Look) -> Array | None:
@@ -340,8 +340,8 @@ class _Search:
         if reference is None:
             return None
         taken = self._values.get("gnss_frame")
-        said = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
-        return None if said is None else said.frame
+        declared = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
+        return None if declared is None else declared.frame
 
     def _knows_imu(self, imu: Look | None) -> bool:
         """Return whether the IMU's orientation in the body is known: by a transform, or DVL and reference agree."""
@@ -481,8 +481,8 @@ class _Search:
             ahead_in_body = known @ mean
             if abs(ahead_in_body[1]) > abs(ahead_in_body[0]) and not self._is_given("mounting_rpy"):
                 given, fits = in_degrees(rpy_from_rotation(known)), nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
-                said = {"given": given, "found": in_degrees(fits), "option": as_option(fits)}
-                self._contradictions.append(finding("TRAVELS_SIDEWAYS", **said))
+                fields = {"given": given, "found": in_degrees(fits), "option": as_option(fits)}
+                self._contradictions.append(finding("TRAVELS_SIDEWAYS", **fields))
         elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 
@@ -493,16 +493,16 @@ class _Search:
 
     def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
         given_mounting = self._is_given("mounting_rpy")
-        said = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]
+        parts = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]
         if placed.is_located and not self._is_given("lever_arm"):
             position = placed.position
             if reference is not None:
                 position = position - self._reference_position(reference)
             if np.abs(position).max() <= 100.0:  # the parameter's range; a larger value is a transform in another unit
                 self._values["lever_arm"] = tuple((position + 0.0).tolist())
-                said.append(f"lever arm {in_metres(position)} m")
-        if said:
-            self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
+                parts.append(f"lever arm {in_metres(position)} m")
+        if parts:
+            self._found.append(f"{', '.join(parts)}: {placed.frame} in {placed.base}, from {placed.source}")
 
 
 def _is_located(placed: Placed | None) -> bool:

@@ -179,8 +179,8 @@ class FrameChooser:
             (ImuFrame(at, NWU, f"with a heading that counts from north, {says}"), IMU_OTHERWISE),
         ]
         if not np.allclose(at, np.eye(3)):
-            said = "as the body, despite its transform"
-            frames.append((ImuFrame(np.eye(3), IMU_ENU, said), IMU_IN_OTHER_WORLD))
+            note = "as the body, despite its transform"
+            frames.append((ImuFrame(np.eye(3), IMU_ENU, note), IMU_IN_OTHER_WORLD))
         if self._gravity is not None:
             frames.append((ImuFrame(at @ FLU_FROM_FRD, IMU_ENU, f"turned over, {says}"), IMU_OTHERWISE))
         found = []
@@ -339,8 +339,8 @@ class FrameChooser:
                 break
         if mounting is not None and best.mounting is None:
             given, fitting = in_degrees(rpy_from_rotation(mounting.T)), nominal_rpy(fits[best].rotation_dvl_from_body.T)
-            said = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting)}
-            says += (finding("MOUNTING_CONTRADICTED", **said),)
+            fields = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting)}
+            says += (finding("MOUNTING_CONTRADICTED", **fields),)
         return FrameChoice(best.agreement, imus[best.reading], says)
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:

@@ -140,17 +140,17 @@ def own_stream(path: Path) -> int | None:
 
     /dev/null gives -1.
     """
-    here = os.path.abspath(path)
+    target = os.path.abspath(path)
     for _ in range(40):  # the kernel follows at most 40 links
-        folder, name = os.path.split(here)
+        folder, name = os.path.split(target)
         folder = os.path.realpath(folder)
         if re.fullmatch(rf"/proc/{os.getpid()}(/task/\d+)?/fd", folder) and name.isdigit():
             return int(name)
-        here = os.path.join(folder, name)
-        if not os.path.islink(here):
+        target = os.path.join(folder, name)
+        if not os.path.islink(target):
             break
-        here = os.path.join(folder, os.readlink(here))
-    return -1 if here == os.devnull else None
+        target = os.path.join(folder, os.readlink(target))
+    return -1 if target == os.devnull else None
 
 
 def _error_text(error: OSError | ValueError) -> str:

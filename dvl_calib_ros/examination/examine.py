@@ -147,10 +147,10 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     discovery = discover(recording, parameters, given)
     topics = discovery.topics
     wanted = {"dvl": topics.dvl, "reference": topics.gnss, "imu": topics.imu}
-    there = {role: name for role, name in wanted.items() if name in recording.types}
-    looks = {role: recording.survey.looks.get(name) for role, name in there.items()}
+    present = {role: name for role, name in wanted.items() if name in recording.types}
+    looks = {role: recording.survey.looks.get(name) for role, name in present.items()}
     start_ns, end_ns = recording.span_ns
-    streams = {role: recording.recorded(name, discovery.parameters) for role, name in there.items()}
+    streams = {role: recording.recorded(name, discovery.parameters) for role, name in present.items()}
     recorded_s = 1e-9 * (end_ns - start_ns)
     seconds = {role: recorded_s * (1.0 if look is None else look.clock_rate) for role, look in looks.items()}
     velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)

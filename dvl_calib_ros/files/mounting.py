@@ -136,7 +136,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         saved = rotation_from_rpy(np.array(content["mounting"]["corrected_rpy"], dtype=float).reshape(3))
         frames = (str(content["mounting"]["frame_id"]), str(content["mounting"]["child_frame_id"]))
         turned = content["mounting"].get("dvl_data_axes") == FRD
-        told = {
+        in_result = {
             name: np.array(content["mounting"][name], dtype=float).reshape(3)
             for name in ("lever_arm", "position")
             if content["mounting"].get(name) is not None
@@ -154,7 +154,9 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
     arm, position = lever_arm(model, state, parameters.lever_arm), position_in_body(model, state, parameters)
     at_hand = {"lever_arm": arm, "position": position}
-    agree = all(np.allclose(told[name], at_hand[name] or told[name], rtol=0.0, atol=1e-6) for name in told)
+    agree = all(
+        np.allclose(in_result[name], at_hand[name] or in_result[name], rtol=0.0, atol=1e-6) for name in in_result
+    )
     if not (angle_between(rotation, saved) < 1e-6 and agree):
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
     if parameters.dvl_frame not in ("", frames[1]):
@@ -265,18 +267,18 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
     if not path.exists():
         own = calibrated.parameters.replace(result_file="", initial_calibration="")
         return new_file(own, values, _origin(calibrated))
-    there, default = load_parameters(path), Parameters()
-    if there.initial_calibration:
+    in_file, default = load_parameters(path), Parameters()
+    if in_file.initial_calibration:
         raise InputError(
             f"{path}: sets initial_calibration, whose angles are relative to the previous mounting; remove it first"
         )
     for name, value in values.items():
-        now, begun_with = getattr(there, name), getattr(calibrated.parameters, name)
+        now, begun_with = getattr(in_file, name), getattr(calibrated.parameters, name)
         known = [np.array(each) for each in (getattr(default, name), begun_with, value)]
         within = SAME_POSITION if name == "lever_arm" else SAME_MOUNTING
         if not any(np.allclose(now, each, rtol=0.0, atol=within) for each in known) and not force:
             raise InputError(
-                f"{path}: sets {name} to {as_yaml(there.as_dict()[name])}, but {calibrated.path} began with "
+                f"{path}: sets {name} to {as_yaml(in_file.as_dict()[name])}, but {calibrated.path} began with "
                 f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's, or write the calibrated "
                 "one all the same with --force"
             )

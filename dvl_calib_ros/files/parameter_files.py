@@ -274,9 +274,9 @@ def with_parameters(path: Path, values: Mapping[str, Any]) -> bytes:
     content = path.read_bytes()
     text = content.decode("utf-8")
     sections = list(_own_mappings(compose_yaml(text), ""))
-    there = [(key.value, node) for section in sections for key, node in section.value]
-    changes = [(*_span(node), as_yaml(values[name])) for name, node in there if name in values]
-    new = {name: as_yaml(value) for name, value in values.items() if name not in dict(there)}
+    existing = [(key.value, node) for section in sections for key, node in section.value]
+    changes = [(*_span(node), as_yaml(values[name])) for name, node in existing if name in values]
+    new = {name: as_yaml(value) for name, value in values.items() if name not in dict(existing)}
     if new:
         changes.append(_insertion(text, sections[-1], new))
     for start, end, value in sorted(changes, reverse=True):

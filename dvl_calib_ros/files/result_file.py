@@ -91,7 +91,7 @@ def result_document(
     model, state = MODELS[estimate.model], GaussianState(estimate.state, estimate.covariance)
     checked = Parameters.from_mapping(parameters)
     position = position_in_body(model, state, checked)
-    beside = scale_and_delay(model, state, checked)
+    scale_delay = scale_and_delay(model, state, checked)
     arguments = None if position is None else static_transform_arguments(position, of_frame, parent, child)
     return {
         "format": FORMAT,
@@ -115,10 +115,10 @@ def result_document(
             "scale_error_xyz": estimate.scale.tolist(),
             "lever_arm": estimate.lever_arm(parameters["lever_arm"]).tolist(),
             "position": None if position is None else list(position),
-            "scale_error_ahead": beside.scale,
-            "scale_error_ahead_std": beside.scale_std,
-            "dvl_time_offset": beside.time_offset,
-            "dvl_time_offset_std": beside.time_offset_std,
+            "scale_error_ahead": scale_delay.scale,
+            "scale_error_ahead_std": scale_delay.scale_std,
+            "dvl_time_offset": scale_delay.time_offset,
+            "dvl_time_offset_std": scale_delay.time_offset_std,
             "pose_covariance": mounting_pose(model, state, checked, turned).covariance.tolist(),
         },
         **({} if verification is None else {"verification": verification_document(verification)}),
@@ -232,10 +232,10 @@ def save_unless_worse(path: Path, document: Mapping[str, Any], n_backups: int = 
     better = _better(path, document) if document["used"] and own_stream(path) is None else None
     if better is None:
         return save_result(path, document, n_backups)
-    beside = path.with_name(f"{path.stem}.newer{path.suffix}")
-    save_result(beside, document, n_backups)
+    newer = path.with_name(f"{path.stem}.newer{path.suffix}")
+    save_result(newer, document, n_backups)
     before, now = _quality_in_words(better), _quality_in_words(document)
-    raise KeptError(str(finding("RESULT_WORSE", path=path, beside=beside, before=before, now=now)))
+    raise KeptError(str(finding("RESULT_WORSE", path=path, beside=newer, before=before, now=now)))
 
 
 def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:

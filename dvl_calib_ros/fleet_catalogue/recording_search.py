@@ -159,10 +159,10 @@ def _local_files(place: str, unread: list[str]) -> _Files:
 
 
 def _local_file(path: str) -> StoredFile:
-    told = os.stat(path)
-    if not stat.S_ISREG(told.st_mode):
+    status = os.stat(path)
+    if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "is no file")  # a pipe would block
-    return StoredFile(path, told.st_size, str(told.st_mtime_ns))
+    return StoredFile(path, status.st_size, str(status.st_mtime_ns))
 
 
 def _stored(place: str) -> _Files:
@@ -174,12 +174,12 @@ def _stored(place: str) -> _Files:
             f"{place}: cannot be listed ({type(error).__name__}: {error}); see to address and access"
         ) from error
     files: dict[str, list[StoredFile]] = {}
-    for path, told in sorted(found.items()):
+    for path, info in sorted(found.items()):
         where = store.unstrip_protocol(path)
         folder, _, name = where.rpartition("/")
         if _is_of_a_recording(name) and not name.startswith("."):
-            stamp = next((str(told[key]) for key in _VERSIONS if told.get(key) is not None), "")
-            files.setdefault(folder, []).append(StoredFile(where, int(told.get("size") or 0), stamp))
+            stamp = next((str(info[key]) for key in _VERSIONS if info.get(key) is not None), "")
+            files.setdefault(folder, []).append(StoredFile(where, int(info.get("size") or 0), stamp))
     is_file = list(found) == [root]
     place = store.unstrip_protocol(root)
     return place.rpartition("/")[0] if is_file else place.rstrip("/"), files

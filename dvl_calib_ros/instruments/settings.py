@@ -95,8 +95,8 @@ def instrument_settings(
     if name not in INSTRUMENTS:
         raise InputError(f"instrument {name!r} is not known; one of {', '.join(INSTRUMENTS)}")
     calibrated.check_applicable(force)
-    instrument, told = INSTRUMENTS[name], dict(now or {})
-    for key, value in told.items():
+    instrument, given = INSTRUMENTS[name], dict(now or {})
+    for key, value in given.items():
         if key not in instrument.ranges:
             raise InputError(f"{name} has no setting {key!r}; one of {', '.join(instrument.ranges)}")
         holds = instrument.ranges[key]
@@ -106,8 +106,8 @@ def instrument_settings(
                 "setting when the data were recorded"
             )
     delivered = {key: holds.delivered for key, holds in instrument.ranges.items() if holds.delivered is not None}
-    recorded = _recorded_sound(calibrated, instrument, told)
-    settings, text, notes = instrument.settings(calibrated, {**delivered, **recorded, **told})
+    recorded = _recorded_sound(calibrated, instrument, given)
+    settings, text, notes = instrument.settings(calibrated, {**delivered, **recorded, **given})
     if calibrated.cause_of_scale is not None:
         notes.append(printable(calibrated.cause_of_scale.sentence))
     for setting in settings:
@@ -118,7 +118,7 @@ def instrument_settings(
                 "current setting right?"
             )
     origins = {**dict.fromkeys(delivered, AS_DELIVERED), **dict.fromkeys(recorded, AS_RECORDED)}
-    marked = [replace(each, now_by="" if each.name in told else origins.get(each.name, "")) for each in settings]
+    marked = [replace(each, now_by="" if each.name in given else origins.get(each.name, "")) for each in settings]
     return InstrumentSettings(name, instrument.document, tuple(marked), text, tuple(notes))
 
 
@@ -152,8 +152,8 @@ def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[
     factor, scale = calibrated.speed_of_sound_factor, f"{100.0 * calibrated.scale_ahead:+.2f} %"
     if calibrated.model.scale_axes and now is not None:
         new = round(factor * now, 2)
-        said = f"scale {scale}: equals a speed of sound error of {now - new:+.1f} m/s. It changes with the water"
-        return [Setting(SPEED_OF_SOUND, now, new, "m/s")], [said]
+        note = f"scale {scale}: equals a speed of sound error of {now - new:+.1f} m/s. It changes with the water"
+        return [Setting(SPEED_OF_SOUND, now, new, "m/s")], [note]
     water = calibrated.water
     if water is not None and water.speed is not None and not math.isnan(water.salinity):
         middle, half = 0.5 * (water.speed.most + water.speed.least), 0.5 * (water.speed.most - water.speed.least)
@@ -162,15 +162,15 @@ def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[
             if now is not None
             else f"because the DVL's setting is unknown; if you know it, give --now {SPEED_OF_SOUND}=1500"
         )
-        said = f"{SPEED_OF_SOUND}: the water's, ±{half:.1f} m/s, {why}"
-        return [Setting(SPEED_OF_SOUND, now, round(middle, 1), "m/s")], [said]
+        note = f"{SPEED_OF_SOUND}: the water's, ±{half:.1f} m/s, {why}"
+        return [Setting(SPEED_OF_SOUND, now, round(middle, 1), "m/s")], [note]
     if not calibrated.model.scale_axes:
         return [], []
-    said = (
+    note = (
         f"{SPEED_OF_SOUND}: times {factor:.5f}; give its setting (--now {SPEED_OF_SOUND}=1500), for m/s. A wrong "
         "speed of sound causes this: correct the settings of temperature and salinity first"
     )
-    return [], [said]
+    return [], [note]
 
 
 def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
@@ -230,8 +230,8 @@ def _heading(calibrated: CalibratedMounting, now_deg: float) -> tuple[float, Arr
     The angle is from the vehicle's forward axis to the DVL's, and corrects the error found relative to the configured
     mounting.
     """
-    told = calibrated.parameters.rotation_dvl_from_body
-    found = told @ calibrated.rotation_body_from_dvl
+    configured = calibrated.parameters.rotation_dvl_from_body
+    found = configured @ calibrated.rotation_body_from_dvl
     if not _is_down(calibrated):
         found = FLU_FROM_FRD @ found @ FLU_FROM_FRD
     whole = found @ rotation_from_rpy(np.array([0.0, 0.0, math.radians(now_deg)]))
@@ -247,15 +247,15 @@ def _is_down(calibrated: CalibratedMounting) -> bool:
 
 def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
     roll_pitch = np.abs(rpy_from_rotation(swing)[:2])
-    said = ["URDF and parameters stay unchanged: do not write this result into them as well"]
+    notes = ["URDF and parameters stay unchanged: do not write this result into them as well"]
     if roll_pitch.max() <= SAID_FROM:
-        return said
+        return notes
     axes = swing if _is_down(calibrated) else FLU_FROM_FRD @ swing @ FLU_FROM_FRD
     mounting = calibrated.parameters.rotation_dvl_from_body.T @ axes
     of_frame = mounting @ FLU_FROM_FRD if calibrated.turned else mounting
     degrees = ", ".join(f"{math.degrees(each):.2f}°" for each in roll_pitch)
     return [
-        *said,
+        *notes,
         f"roll and pitch ({degrees}) are no setting of the instrument: with it set, give the URDF rpy="
         f'"{numbers(rpy_from_rotation(of_frame))}" (mounting_rpy {numbers(rpy_from_rotation(mounting))})',
     ]

@@ -101,8 +101,8 @@ class _Dvl:
             if not isinstance(answer, dict) or answer.get("response_to") != command["command"]:
                 continue
             if answer.get("success") is not True:
-                told = answer.get("error_message")
-                why = told[:LONGEST_REASON] if told and isinstance(told, str) else "no reason given"
+                message = answer.get("error_message")
+                why = message[:LONGEST_REASON] if message and isinstance(message, str) else "no reason given"
                 raise InputError(f"{self._address}: refuses {command['command']} ({why})")
             return answer.get("result")
 

@@ -336,7 +336,7 @@ class MessageDecoder:
     @property
     def frame_of_reference(self) -> VelocityFrame | None:
         """Frame of the first accepted reference message; None before."""
-        return next((said.frame for said in self._reference_frames.values() if said is not None), None)
+        return next((declared.frame for declared in self._reference_frames.values() if declared is not None), None)
 
     @property
     def frame_ids(self) -> tuple[str, str, str]:

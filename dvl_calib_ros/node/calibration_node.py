@@ -195,8 +195,8 @@ class CalibrationNode(AnsweringNode):
             self._warn(doubt)
         topics = discovery.topics
         names = {"dvl/twist": topics.dvl, "gnss/twist": topics.gnss, "imu/data": topics.imu}
-        there = {name for name, _ in self.get_topic_names_and_types()}
-        self._found_names = {own: name for own, name in names.items() if name in there}
+        present = {name for name, _ in self.get_topic_names_and_types()}
+        self._found_names = {own: name for own, name in names.items() if name in present}
         classes = {
             "dvl/twist": velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields),
             "gnss/twist": velocity_class("gnss_type", parameters.gnss_type),

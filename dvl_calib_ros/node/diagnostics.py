@@ -246,9 +246,9 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
 def _scale_and_delay_values(estimate: Estimate, parameters: Parameters) -> dict[str, str]:
     """Return scale and delay, which ~/mounting cannot hold. Keys of states begin with std, so these do not."""
     state = GaussianState(estimate.state, estimate.covariance)
-    beside = scale_and_delay(MODELS[estimate.model], state, parameters)
-    values = {"scale error ahead [%]": 100.0 * beside.scale, "dvl_time_offset [s]": beside.time_offset}
-    stds = (None if beside.scale_std is None else 100.0 * beside.scale_std, beside.time_offset_std)
+    scale_delay = scale_and_delay(MODELS[estimate.model], state, parameters)
+    values = {"scale error ahead [%]": 100.0 * scale_delay.scale, "dvl_time_offset [s]": scale_delay.time_offset}
+    stds = (None if scale_delay.scale_std is None else 100.0 * scale_delay.scale_std, scale_delay.time_offset_std)
     words = {name: f"{value:.4f}" for name, value in values.items()}
     for name, std in zip(values, stds, strict=True):
         words[f"sigma {name}"] = "not estimated" if std is None else f"{std:.4f}"

@@ -70,9 +70,9 @@ class Listener:
 
     def _on_answer(self, future: Any) -> None:
         error = future.exception()
-        said = future.result().message if error is None else printable(str(error))
+        text = future.result().message if error is None else printable(str(error))
         self.is_waiting = False
-        self.answer = f"{time.strftime('%H:%M:%S')} {said}"  # the time distinguishes equal answers
+        self.answer = f"{time.strftime('%H:%M:%S')} {text}"  # the time distinguishes equal answers
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

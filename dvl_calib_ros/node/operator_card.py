@@ -75,18 +75,18 @@ class RecentWorth:
         self._looks.append((now_s, drift))
         while self._looks[0][0] < now_s - STANDS_S:
             self._looks.popleft()
-        told = PredictedDrift(
+        predicted = PredictedDrift(
             *(sorted(each)[len(each) // 2] for each in zip(*(d for _, d in self._looks), strict=True))
         )
-        if self.is_good and told.both > TAKEN_BACK * target:
-            self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=told.both)
+        if self.is_good and predicted.both > TAKEN_BACK * target:
+            self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=predicted.both)
         if rejected or drift.both > target:
             self._within_since_s = None
         elif self._within_since_s is None:
             self._within_since_s = now_s
         elif self.seconds_left(now_s) == 0.0:
             self.is_good, self.taken_back = True, None
-        return told
+        return predicted
 
     def seconds_left(self, now_s: float) -> float:
         """Return the time (s) for which the drift must still stay within the goal."""
@@ -257,9 +257,9 @@ def _mounting(calibrator: Calibrator, estimate: Estimate) -> dict[str, str]:
     arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
     for index, axis in enumerate("xyz"):
         found[f"arm {axis}"] = (arm[index], math.nan if arm_std is None else arm_std[index], "m")
-    beside = scale_and_delay(model, GaussianState(estimate.state, estimate.covariance), parameters)
-    found["scale"] = (100.0 * beside.scale, 100.0 * (beside.scale_std or math.nan), "%")
-    found["delay"] = (beside.time_offset, beside.time_offset_std or math.nan, "s")
+    scale_delay = scale_and_delay(model, GaussianState(estimate.state, estimate.covariance), parameters)
+    found["scale"] = (100.0 * scale_delay.scale, 100.0 * (scale_delay.scale_std or math.nan), "%")
+    found["delay"] = (scale_delay.time_offset, scale_delay.time_offset_std or math.nan, "s")
     values = {}
     for name, (value, std, unit) in found.items():
         values[f"mounting {name} [{unit}]"] = f"{value:.3f}"

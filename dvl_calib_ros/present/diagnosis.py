@@ -218,8 +218,8 @@ def _numbers(d: Diagnosis) -> list[Number]:
     if d.effects:
         low, high = gap.interval
         found.append(Number("with the effects", f"{mm(gap.after)} mm/s", note="held-out rms, noise included"))
-        told = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
-        found.append(Number("closed", share(gap.closure), note=told))
+        note = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
+        found.append(Number("closed", share(gap.closure), note=note))
     claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
     slow = ", and slow noise due to the lag" if any(each.name == LAG for each in d.effects) else ""
     found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"estimated from high frequencies{slow}{claimed}"))
@@ -241,11 +241,11 @@ def _residual_items(d: Diagnosis) -> Iterator[Item]:
         return
     rest = series.rest
     if rest.found:
-        said = rest.follows.full_sentence.removesuffix(".")
+        text = rest.follows.full_sentence.removesuffix(".")
     else:
-        said = "Nothing in it follows motion or time more than chance would"
+        text = "Nothing in it follows motion or time more than chance would"
     p = p_value(math.exp(rest.log_p))
-    yield Sentence(f"{amount} {said} (p {p if p.startswith('<') else f'= {p}'}).")
+    yield Sentence(f"{amount} {text} (p {p if p.startswith('<') else f'= {p}'}).")
     if series.followed:
         where, followed = series.axes[series.followed.axis], series.followed
         yield figure(

@@ -131,11 +131,11 @@ def evaluation(e: Evaluation) -> Document:
 
 def _scores(e: Evaluation) -> Iterable[Item]:
     """Yield Avg.VRMSE by model and set, with the published figure and the ratio, and the error reduction by model."""
-    here, published = (np.vstack([each, each.mean(axis=0)]).T for each in (e.seed_mean, e.published_of_these))
-    ratio = here / published
+    ours, published = (np.vstack([each, each.mean(axis=0)]).T for each in (e.seed_mean, e.published_of_these))
+    ratio = ours / published
     kinds = np.searchsorted(WITHIN, np.abs(ratio - 1.0))  # nan sorts after all others
     rows: list[tuple[str | Cell, ...]] = []
-    for name, *of_sets in zip(e.columns, *map(np.ndarray.tolist, (here, published, ratio, kinds)), strict=True):
+    for name, *of_sets in zip(e.columns, *map(np.ndarray.tolist, (ours, published, ratio, kinds)), strict=True):
         cells = (
             Cell(number(value, 4), KINDS[kind], f"{known:.4f} ×{times:.2f}" if math.isfinite(times) else "")
             for value, known, times, kind in zip(*of_sets, strict=True)
@@ -156,11 +156,11 @@ def _scores(e: Evaluation) -> Iterable[Item]:
     yield Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
     base = e.columns.index(UNCALIBRATED)
     gone, gone_published = (1.0 - e.of_models(of) / of[:, [base]] for of in (e.seed_mean, e.published_of_these))
-    told = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gone.mean(axis=0), strict=True))
+    shares = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gone.mean(axis=0), strict=True))
     yield figure(
         "evaluation_figures.improvement_bars",
         "Improvement over uncalibrated",
-        f"Mean over the sets: {told}",
+        f"Mean over the sets: {shares}",
         e.models,
         gone,
         gone_published,
@@ -207,12 +207,12 @@ def _converging(e: Evaluation) -> Section:
         ("Pitch and yaw", [each.level_deg for each in shown]),
         ("The whole angle", [each.angle_deg for each in shown]),
     ):
-        told = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(shown, values, strict=True))
+        text = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(shown, values, strict=True))
         drawn.append(
             figure(
                 "evaluation_figures.misalignment_over_time",
                 f"{what}, error against time",
-                f"{what} against time; after {TIMES_S[-1]:g} s {told}",
+                f"{what} against time; after {TIMES_S[-1]:g} s {text}",
                 TIMES_S,
                 [each.name for each in shown],
                 [each.gnss_std for each in shown],

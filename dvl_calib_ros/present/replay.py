@@ -238,8 +238,8 @@ def _answer(verification: Verification | None) -> Answer:
     reasons = [*verification.reasons]
     if verification.mounting is not None and verification.verdict is not Severity.REJECT:
         reasons.append(verification.mounting)
-    said = [each.full_sentence for each in reasons]
-    return Answer(verification.verdict.value, verification.verdict, said, ADVICE[verification.verdict])
+    sentences = [each.full_sentence for each in reasons]
+    return Answer(verification.verdict.value, verification.verdict, sentences, ADVICE[verification.verdict])
 
 
 def _headline(run: Replayed, rejected: bool) -> str:
@@ -287,11 +287,11 @@ def _mounting(run: Replayed) -> Iterator[Item]:
 def _iac_sentence(result: Result) -> str:
     """Return the result of the paper's own selection for roll, pitch, yaw and scale."""
     found = quantities(replace(result, selected=result.iac_model))
-    said = ", ".join(
+    values = ", ".join(
         f"{each.name} {each.in_unit(each.value)} ± {each.in_unit(each.std)}" if each.shown else f"{each.name} not shown"
         for each in found[:4]
     )
-    return f"The paper's own selection (iac, {result.iac_model}): {said}."
+    return f"The paper's own selection (iac, {result.iac_model}): {values}."
 
 
 def _mounting_to_copy(run: Replayed) -> Commands:

@@ -279,8 +279,8 @@ def navigation_pictures(
     one: its reference and uncorrected track are drawn. corrected: tracks by their correction ('' for a single one); the
     first four are drawn. stamps_ns: of figures whose cursor the map follows.
     """
-    told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
-    alt = f"over {one.distance_m:.0f} m; error at the end: as mounted {one.before.end:.1f} m; {told}"
+    ends = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
+    alt = f"over {one.distance_m:.0f} m; error at the end: as mounted {one.before.end:.1f} m; {ends}"
     time = None if stamps_ns is None else TimeAxis(stamps_ns)
     figures = []
     if one.on_a_map:

@@ -269,13 +269,13 @@ class Collector:
         n = len(part)
         covariances, broken = Covariances.none(n), np.zeros(n, dtype=np.uint8)
         if kind is None:
-            values, beside = _imu(columns)
+            values, extra = _imu(columns)
             if math.isnan(self._heading_variance):
                 self._heading_variance = heading_variance(columns.orientation_covariance[0])
         else:
             velocity = kind.velocity(columns)
-            values, beside = _columns_of(velocity), beside_velocity(columns, self._msgtype)
-            beside = np.broadcast_to(beside, (n, beside.shape[1]))
+            values, extra = _columns_of(velocity), beside_velocity(columns, self._msgtype)
+            extra = np.broadcast_to(extra, (n, extra.shape[1]))
             covariances = _covariances(kind, columns)
             broken = _broken(kind, columns, self._parameters)
         self._world = self._world or frame_name(columns.header.frame_id[0].tobytes().decode("ascii"))
@@ -284,7 +284,7 @@ class Collector:
         if len(covariances.distinct):
             self._distinct.append(covariances.distinct)
             self._n_distinct += len(covariances.distinct)
-        rows = (part.arrival, part.log_ns, stamps_ns, values, self._frame(frame_ids), index, broken, beside)
+        rows = (part.arrival, part.log_ns, stamps_ns, values, self._frame(frame_ids), index, broken, extra)
         for column, each in zip(self._laid.values(), rows, strict=True):
             column.add(each)
 

@@ -368,8 +368,8 @@ def _restamped(columns: Mapping[str, TopicColumns], restamp: str, path: Path) ->
     found = {name.strip(): spelled(name.strip(), columns) for name in restamp.split(",")}
     for name, topic in found.items():
         if topic is None:
-            there = ", ".join((RESTAMP_ALL, *columns))
-            raise InputError(f"{path}: restamp: no topic {name!r} with stamps; there are {there}")
+            choices = ", ".join((RESTAMP_ALL, *columns))
+            raise InputError(f"{path}: restamp: no topic {name!r} with stamps; there are {choices}")
     return [topic for topic in found.values() if topic is not None]
 
 
@@ -413,11 +413,11 @@ def _map_types(bag: BagReader, text: str, where: str) -> None:
     """Register the message types that a field map fits. Raises InputError if there is none."""
     opened = {kind: bag.typestore(topic) for topic, kind in bag.topics.items() if may_be_mapped(kind)}
     stores = {kind: store for kind, store in opened.items() if store is not None}
-    said = {kind: misfit(text, store, kind) for kind, store in stores.items()}
-    for kind, why in said.items():
+    misfits = {kind: misfit(text, store, kind) for kind, store in stores.items()}
+    for kind, why in misfits.items():
         if not why:
             mapped_type(kind, text)
-    if all(said.values()):
+    if all(misfits.values()):
         # a type with a suggested field map is the most likely one
-        nearest = min(said, key=lambda kind: not suggested(stores[kind], kind), default="")
-        raise InputError(f"{where}: dvl_fields: {said.get(nearest) or 'no topic is of a type that is not listed'}")
+        nearest = min(misfits, key=lambda kind: not suggested(stores[kind], kind), default="")
+        raise InputError(f"{where}: dvl_fields: {misfits.get(nearest) or 'no topic is of a type that is not listed'}")

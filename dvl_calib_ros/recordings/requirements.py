@@ -53,14 +53,14 @@ def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> N
         held = recording.held.get(name)
         if held is None:
             continue
-        said = " and ".join(sorted(held.types))
+        types = " and ".join(sorted(held.types))
         if held.types - wanted:
             expected = " or ".join(wanted)
-            raise InputError(f"{recording.where}: topic {name} holds {said}, expected {expected}; set --{role}-topic")
+            raise InputError(f"{recording.where}: topic {name} holds {types}, expected {expected}; set --{role}-topic")
         if len(held.types) > 1:
-            raise InputError(f"{recording.where}: topic {name} holds {said}; replay bags of one type together")
+            raise InputError(f"{recording.where}: topic {name} holds {types}; replay bags of one type together")
         if held.lacks_definition:
-            found.append(finding("BAG_NO_DEFINITION", type=said))
+            found.append(finding("BAG_NO_DEFINITION", type=types))
 
 
 _WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}

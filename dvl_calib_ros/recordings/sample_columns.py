@@ -154,11 +154,11 @@ def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBloc
         codes = np.zeros(len(laid.frames), dtype=np.uint8)
         axes: dict[Axes, Mask] = {}
         for place, name in names.items():
-            said = decoder.reference_frame(name)
-            is_other[place] = said is None
-            codes[place] = 0 if said is None else FRAME_CODES[said.frame]
-            if said is not None and said.axes is not AS_SENT:
-                axes.setdefault(said.axes, np.zeros(len(laid.frames), dtype=bool))[place] = True
+            declared = decoder.reference_frame(name)
+            is_other[place] = declared is None
+            codes[place] = 0 if declared is None else FRAME_CODES[declared.frame]
+            if declared is not None and declared.axes is not AS_SENT:
+                axes.setdefault(declared.axes, np.zeros(len(laid.frames), dtype=bool))[place] = True
         frames = codes[laid.frame]
         for own, of_frame in axes.items():
             values, covariances = _turned(own, values, covariances, of_frame[laid.frame])

@@ -146,18 +146,18 @@ class _Compared:
     def effect(self, name: str, p: float) -> ComparedEffect:
         """Compare an effect that both sides can be tested for. p: adjusted."""
         vehicle, simulator = self.sizes[name]
-        there = is_there(vehicle, simulator), is_there(simulator, vehicle)
-        status = _status(there, p < LEVEL)
+        is_present = is_there(vehicle, simulator), is_there(simulator, vehicle)
+        status = _status(is_present, p < LEVEL)
         needs = ""
         if status is ComparisonStatus.CANNOT_TELL:
-            blind = "simulator" if there[0] else "vehicle"
+            blind = "simulator" if is_present[0] else "vehicle"
             least = smallest_difference(vehicle, simulator, len(self.p))
             smallest = ", ".join(f"{key} {value:.2g}" for key, value in least.items())
             needs = (
                 f"the two logs together would show a difference of {smallest}; with the {blind}: "
                 f"{self._effects[name].manoeuvre}"
             )
-        side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not there[0] else 0
+        side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not is_present[0] else 0
         trace = trace_of(self._selections[side], self._fits[side], self.sizes[name][side].effect)
         adds = float(np.sqrt((trace**2).sum(axis=1).mean()))
         where = lies(self._selections[side], self._fits[side], trace)

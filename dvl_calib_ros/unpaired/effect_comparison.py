@@ -142,13 +142,13 @@ def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str
     """
     own = [{each.name: each.equivalent_to for each in log.diagnosis.effects} for log in (vehicle, simulator)]
     names: list[dict[str, str]] = [{name: name for name in side} for side in own]
-    for here, there in ((0, 1), (1, 0)):
-        for name, equivalent in own[here].items():
-            if name in own[there] or names[here][name] != name:
+    for one, other_side in ((0, 1), (1, 0)):
+        for name, equivalent in own[one].items():
+            if name in own[other_side] or names[one][name] != name:
                 continue
-            shared = [other for other in equivalent if other in own[there] and other not in own[here]]
+            shared = [other for other in equivalent if other in own[other_side] and other not in own[one]]
             if shared:
-                names[here][name] = shared[0]
+                names[one][name] = shared[0]
     return names[0], names[1]
 
 

@@ -169,7 +169,7 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
         if not all(name in each for each in slopes):
             continue
         (a, std_a), (b, std_b) = (each[name] for each in slopes)
-        there = tuple(_is_significant(each, name) for each in slopes)
+        is_present = tuple(_is_significant(each, name) for each in slopes)
         p = float(2.0 * norm.sf(abs(a - b) / np.hypot(std_a, std_b)))
         found.append(
             Candidate(
@@ -178,8 +178,8 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
                 around(a, std_a),
                 around(b, std_b),
                 p,
-                (there[0], there[1]),
-                matters=any(there),
+                (is_present[0], is_present[1]),
+                matters=any(is_present),
             )
         )
     return found

@@ -124,8 +124,8 @@ def _times(name: str, vehicle: Array, simulator: Array, worth: float) -> Candida
     if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
         return None
     shown: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
-    there = tuple(abs(float(each.mean())) > worth for each in (vehicle, simulator))
+    is_present = tuple(abs(float(each.mean())) > worth for each in (vehicle, simulator))
     apart = abs(float(vehicle.mean() - simulator.mean()))
     return Candidate(
-        name, "s", shown[0], shown[1], welch(vehicle, simulator), (there[0], there[1]), matters=apart > worth
+        name, "s", shown[0], shown[1], welch(vehicle, simulator), (is_present[0], is_present[1]), matters=apart > worth
     )

@@ -219,15 +219,15 @@ def _indexed_starts(file: BinaryIO, index: ChunkIndex) -> NDArray[np.uint64] | N
     file.seek(index.chunk_start_offset + index.chunk_length)
     content = file.read(index.message_index_length)
     starts = []
-    here = 0
-    while here + _INDEX_HEAD.size <= len(content):
-        opcode, length, _, size = _INDEX_HEAD.unpack_from(content, here)
-        end = here + RECORD_HEAD.size + length
-        if opcode != Opcode.MESSAGE_INDEX or end != here + _INDEX_HEAD.size + size or size % 16 or end > len(content):
+    at = 0
+    while at + _INDEX_HEAD.size <= len(content):
+        opcode, length, _, size = _INDEX_HEAD.unpack_from(content, at)
+        end = at + RECORD_HEAD.size + length
+        if opcode != Opcode.MESSAGE_INDEX or end != at + _INDEX_HEAD.size + size or size % 16 or end > len(content):
             return None
-        starts.append(np.frombuffer(content, "<u8", size // 8, here + _INDEX_HEAD.size)[1::2])
-        here = end
-    return np.concatenate(starts) if starts and here == len(content) else None
+        starts.append(np.frombuffer(content, "<u8", size // 8, at + _INDEX_HEAD.size)[1::2])
+        at = end
+    return np.concatenate(starts) if starts and at == len(content) else None
 
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:
@@ -314,16 +314,16 @@ class _FileWalk:
         has_ended: set at the end of the data. held: messages of the record at `at` itself, which count only if the
         record leads on to another.
         """
-        found, self.held, here = self.held, [], None
+        found, self.held, before = self.held, [], None
         try:
-            self.held, end, here = self._record(at)
+            self.held, end, before = self._record(at)
         except DamagedError as error:
             place, is_before_damaged = self._resumed(at)
             if is_before_damaged and self._before is not None:
                 found, at = [], self._before
             self._damage.note(str(error), place - at)
             end = place
-        self._before = here
+        self._before = before
         return found, end
 
     def _record(self, at: int) -> tuple[list[Found], int, int | None]:

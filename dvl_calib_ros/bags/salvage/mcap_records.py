@@ -152,8 +152,8 @@ def search(
     for window in range(start, size, _WINDOW):
         file.seek(window)
         data = np.frombuffer(file.read(_WINDOW + RECORD_HEAD.size - 1), dtype=np.uint8)
-        here = data[: max(len(data) - RECORD_HEAD.size + 1, 0)]
-        places = np.flatnonzero((here >= opcodes[0]) & (here <= opcodes[1]))
+        first_bytes = data[: max(len(data) - RECORD_HEAD.size + 1, 0)]
+        places = np.flatnonzero((first_bytes >= opcodes[0]) & (first_bytes <= opcodes[1]))
         for high in range(5, RECORD_HEAD.size):  # the upper half of the length
             places = places[data[places + high] == 0]
         for place in places.tolist():
@@ -287,15 +287,15 @@ def message_head(
 
 def places_of(records: bytes, tables: Tables) -> Places | None:
     """Return the messages of sound records in order; None if something is wrong, to be handled by `messages_of`."""
-    places, here, n = [], 0, len(records)
+    places, at, n = [], 0, len(records)
     head = RECORD_HEAD.unpack_from
     try:
-        while here < n:
-            places.append(here)
-            here += 9 + head(records, here)[1]
+        while at < n:
+            places.append(at)
+            at += 9 + head(records, at)[1]
     except struct.error:
         return None
-    if here != n or n < _HEAD_AT.itemsize:
+    if at != n or n < _HEAD_AT.itemsize:
         return None
     start = np.array(places, dtype=np.intp)
     end = np.append(start[1:], n)
