@@ -130,8 +130,8 @@ def cores() -> int:
 def _as_done_on_cores(
     work: Callable[[Item], Outcome], items: Iterable[Item], jobs: int
 ) -> Iterator[tuple[int, Outcome | Lost]]:
-    left = enumerate(items)
-    while suspects := (yield from _until_one_dies(work, left, jobs)):
+    remaining = enumerate(items)
+    while suspects := (yield from _until_one_dies(work, remaining, jobs)):
         for suspect in suspects:
             if (yield from _until_one_dies(work, iter([suspect]), 1)):
                 yield suspect[0], Lost("the process that worked on it was killed, perhaps for want of memory")

@@ -195,12 +195,12 @@ def _days_by_recording(days: Sequence[Day], recording: Recording) -> tuple[Day, 
     """Name days by their first recording if each has its own, else by date."""
     names = []
     for day in days:
-        own = [
+        names_of_day = [
             path.name
             for path, span_ns in zip(recording.paths, recording.path_spans_ns, strict=True)
             if span_ns is not None and span_ns[0] - SHORTEST_PAUSE_NS <= day.first_ns <= span_ns[1]
         ]
-        names.append(own[0] if own else "")
+        names.append(names_of_day[0] if names_of_day else "")
     if len(set(names)) < len(days) or not all(names):
         return tuple(days)
     return tuple(replace(day, name=name) for day, name in zip(days, names, strict=True))
@@ -289,8 +289,8 @@ def _in_body(reference: SampleBlock, attitude: SampleBlock) -> Array:
         return reference.values[is_body]
     enu = np.where(is_ned[:, None], reference.values @ ENU_FROM_NED.T, reference.values)
     rotation_enu_from_body = rotation_from_quaternion(unit_quaternions(attitude.orientation))[before]
-    turned = np.matmul(enu[:, None], rotation_enu_from_body)[:, 0]
-    velocity: Array = np.where(is_body[:, None], reference.values, turned)[is_body | (before >= 0)]
+    rotated = np.matmul(enu[:, None], rotation_enu_from_body)[:, 0]
+    velocity: Array = np.where(is_body[:, None], reference.values, rotated)[is_body | (before >= 0)]
     return velocity
 
 

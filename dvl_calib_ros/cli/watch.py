@@ -222,8 +222,8 @@ class View:
         if _is_usable(status) or not ("REJECTED" in code or "GOOD" in code):
             seconds = status.get("seconds")
             spread = status.values.get("seconds spread", "-")
-            left = " ± ".join(_duration(each, rough=True) for each in (seconds, spread))
-            about = "" if seconds == "-" else f", about {left} until good enough"
+            remaining = " ± ".join(_duration(each, rough=True) for each in (seconds, spread))
+            about = "" if seconds == "-" else f", about {remaining} until good enough"
             following = f"next: {status.get('next')}{about}"
         lines = 1 if width >= WIDE else 2
         return [

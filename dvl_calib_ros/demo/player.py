@@ -35,8 +35,8 @@ def sensors_of(bag: BagReader) -> dict[str, str]:
 
 def wait_until(time_s: float, has_ended: Callable[[], bool]) -> None:
     """Wait until a time of `time.monotonic`, or until `has_ended`."""
-    while (left := time_s - time.monotonic()) > 0.0 and not has_ended():
-        time.sleep(min(left, BREATH_S))
+    while (remaining := time_s - time.monotonic()) > 0.0 and not has_ended():
+        time.sleep(min(remaining, BREATH_S))
 
 
 class BagPlayer:

@@ -214,22 +214,22 @@ class _Search:
             chosen = self._fit(frames, dvl, reference, imu, known, placed)
         taken = frames.imu if chosen is None else chosen.imu
         self._use_base_axes(taken is not None and taken.z_down)
-        turned = frames.dvl_is_turned(self._is_z_down)
+        is_turned = frames.dvl_is_turned(self._is_z_down)
         if chosen is not None and reference is not None:
             agreement = self._chosen = chosen.agreement
-            turned = agreement.reading.turned
+            is_turned = agreement.reading.turned
             self._contradictions += chosen.says
             self._use_reading(agreement, known, reference, imu)
             self._measure_noise(agreement, known, dvl, reference)
         elif reference is None:
-            self._mounting_from_motion(dvl, turned, known)
+            self._mounting_from_motion(dvl, is_turned, known)
         if taken is not None:
             self._use_imu(taken.frame)
         parameters = self._parameters.replace(base_axes=FRD if self._is_z_down else FLU)
-        if parameters.dvl_axes == FROM_MESSAGE and turned != turns_dvl(
+        if parameters.dvl_axes == FROM_MESSAGE and is_turned != turns_dvl(
             VELOCITY_TYPES[dvl.msgtype], dvl.frame_id, parameters
         ):
-            axes = self._values["dvl_axes"] = FRD if turned != self._is_z_down else FLU
+            axes = self._values["dvl_axes"] = FRD if is_turned != self._is_z_down else FLU
             which = "forward-right-down" if axes == FRD else "forward-left-up"
             self._found.append(f"the DVL's data are used as {which} (dvl_axes {axes})")
         if known is not None and not self._is_given("mounting_rpy"):
@@ -399,9 +399,9 @@ class _Search:
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
         if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
-            left = self._readings.registered(reading, np.eye(3)).left
+            residual = self._readings.registered(reading, np.eye(3)).left
             turned_left, rotation, *_ = self._readings.registered(reading, None)
-            if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(left):
+            if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(residual):
                 agree = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)
@@ -418,15 +418,15 @@ class _Search:
         if self._readings.beside_noise(chosen.best_left) > FITS:
             return
         is_position = VELOCITY_TYPES[reference.msgtype].position is not None
-        own = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
-        too_little = not is_position and own > CLAIMS_TOO_LITTLE * reference.claimed_std
+        measured_std = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
+        too_little = not is_position and measured_std > CLAIMS_TOO_LITTLE * reference.claimed_std
         # part of it is due to lever arm and delay, which are estimated later
         least = 0.5 * chosen.best_left
         per_axis = dvl.speed / (math.sqrt(3.0) * TRIMMED)
         claims = [reference.claimed_std] if is_position else [reference.claimed_std, dvl.claimed_std]
         claimed = math.hypot(*np.nan_to_num(claims))  # both are part of the predicted residual
         most = claimed / (CLAIMS_TOO_MUCH if is_position else CLAIMS_FAR_TOO_MUCH)
-        may_claim_less = is_position or says_nothing or own > NOISIER * math.sqrt(white_noise(dvl.values))
+        may_claim_less = is_position or says_nothing or measured_std > NOISIER * math.sqrt(white_noise(dvl.values))
         claims_none = math.isnan(reference.claimed_std)
         if not (
             too_little or claims_none or says_nothing or (may_claim_less and most > max(least * per_axis, QUIETEST))

@@ -247,9 +247,9 @@ def _temporary_file(target: Path, content: bytes) -> Iterator[str]:
 
 
 def _write(handle: int, content: bytes) -> None:
-    left = memoryview(content)
-    while left:
-        left = left[os.write(handle, left) :]
+    remaining = memoryview(content)
+    while remaining:
+        remaining = remaining[os.write(handle, remaining) :]
 
 
 @contextmanager

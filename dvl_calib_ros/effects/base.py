@@ -245,8 +245,8 @@ class EffectWithMemory(Effect):
 
         velocity: (N, 3) m/s, body frame, or several (N, 3, p).
         """
-        left: Array = velocity - self.filtered(motion, velocity, values)
-        return left - self.of_before(motion, left, values)
+        residual: Array = velocity - self.filtered(motion, velocity, values)
+        return residual - self.of_before(motion, residual, values)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return the filter's addition to the motion's own velocity."""

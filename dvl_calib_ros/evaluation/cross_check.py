@@ -148,8 +148,8 @@ def cross_check(
 
 def _with_own_delay(terms: Terms, verified: _Replayed) -> Terms:
     """Replace the delay by the verifying bag's, because clocks are synchronised anew in each recording."""
-    own = next(iter(verified.delayed.values()), None)
-    return terms if own is None else terms._replace(time_offset=own.time_offset)
+    delayed = next(iter(verified.delayed.values()), None)
+    return terms if delayed is None else terms._replace(time_offset=delayed.time_offset)
 
 
 def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> float:

@@ -272,8 +272,8 @@ def _legs(run: Trajectory) -> list[tuple[str, int, int]]:
     start = 0
     while start + LEG_SAMPLES <= len(heading):
         stretch = heading[start:]
-        turned = np.maximum.accumulate(stretch) - np.minimum.accumulate(stretch) > LEG_HEADING_RANGE
-        length = int(np.argmax(turned)) if turned.any() else len(stretch)
+        has_turned = np.maximum.accumulate(stretch) - np.minimum.accumulate(stretch) > LEG_HEADING_RANGE
+        length = int(np.argmax(has_turned)) if has_turned.any() else len(stretch)
         if length >= LEG_SAMPLES:
             legs.append((run.name, start, start + length))
             start += length

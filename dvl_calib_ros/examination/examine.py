@@ -222,9 +222,9 @@ def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> 
     """Return the DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
     values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
     values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]
-    turned = turns_dvl(VELOCITY_TYPES[dvl.msgtype], "" if look is None else look.frame_id, parameters)
-    own = values @ FLU_FROM_FRD if turned else values
-    return own @ rotation_from_rpy(parameters.mounting_rpy).T
+    is_turned = turns_dvl(VELOCITY_TYPES[dvl.msgtype], "" if look is None else look.frame_id, parameters)
+    dvl_velocity = values @ FLU_FROM_FRD if is_turned else values
+    return dvl_velocity @ rotation_from_rpy(parameters.mounting_rpy).T
 
 
 def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Reason]:

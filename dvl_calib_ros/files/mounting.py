@@ -135,7 +135,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         parameters = Parameters.from_mapping(content["parameters"])
         saved = rotation_from_rpy(np.array(content["mounting"]["corrected_rpy"], dtype=float).reshape(3))
         frames = (str(content["mounting"]["frame_id"]), str(content["mounting"]["child_frame_id"]))
-        turned = content["mounting"].get("dvl_data_axes") == FRD
+        is_turned = content["mounting"].get("dvl_data_axes") == FRD
         in_result = {
             name: np.array(content["mounting"][name], dtype=float).reshape(3)
             for name in ("lever_arm", "position")
@@ -170,8 +170,8 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         of_recording = load_result(path, of_recording=True)[1][model.name]
         of_scale = cause_of_scale(model, of_recording, parameters, water)
     return CalibratedMounting(
-        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, arm, delay, position, water,
-        of_scale,
+        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, is_turned, arm, delay, position,
+        water, of_scale,
     )  # fmt: skip
 
 
@@ -265,8 +265,8 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
     """
     values = calibrated.compensating
     if not path.exists():
-        own = calibrated.parameters.replace(result_file="", initial_calibration="")
-        return new_file(own, values, _origin(calibrated))
+        parameters = calibrated.parameters.replace(result_file="", initial_calibration="")
+        return new_file(parameters, values, _origin(calibrated))
     in_file, default = load_parameters(path), Parameters()
     if in_file.initial_calibration:
         raise InputError(
@@ -341,7 +341,7 @@ def fusion_file(calibrated: CalibratedMounting) -> str:
     """Return one ROS 2 parameter file for robot_localization and for our node."""
     base, dvl, name = printable(calibrated.base_frame), printable(calibrated.dvl_frame), calibrated.model.name
     used = [index in (6, 7, 8) for index in range(15)]  # x y z, roll pitch yaw, vx vy vz, their rates, accelerations
-    own = {
+    settings = {
         **{key: value for key, value in changed_parameters(calibrated.parameters).items() if key != "result_file"},
         "model": name,
         "initial_calibration": str(calibrated.path.resolve()),
@@ -363,7 +363,7 @@ def fusion_file(calibrated: CalibratedMounting) -> str:
             "    twist0_queue_size: 10",
             f"{NODE_NAME}:",
             "  ros__parameters:",
-            *(f"    {key}: {as_yaml(value)}" for key, value in own.items()),
+            *(f"    {key}: {as_yaml(value)}" for key, value in settings.items()),
             *_comment(
                 f"B. The driver's own topic (a TwistWithCovarianceStamped), in frame {dvl}, rotated by TF (URDF or "
                 "static transform, calibrated), which has the lever arm, too. Our node does not run. Corrected in "

@@ -136,16 +136,16 @@ def _own_sections(
     if not isinstance(content, dict):
         raise InputError(f"{path}: no ROS 2 parameter file; it begins with '/**:', then 'ros__parameters:'")
     sections = [found for key, section in content.items() for found in _sections(str(key), section)]
-    own = [(name, body) for name, body in sections if is_own(name)]
-    for name, body in own:
+    own_sections = [(name, body) for name, body in sections if is_own(name)]
+    for name, body in own_sections:
         if not isinstance(body, dict):
             raise InputError(f"{path}: ros__parameters of {name} is not a list of name: value")
     if not sections:
         raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
-    if not own:  # ROS would silently use the defaults
+    if not own_sections:  # ROS would silently use the defaults
         others = ", ".join(name for name, _ in sections)
         raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; use '/**:' or the name")
-    return [(name, _flat(body)) for name, body in own]
+    return [(name, _flat(body)) for name, body in own_sections]
 
 
 def _names_for_all_nodes(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> set[str]:

@@ -324,13 +324,13 @@ def _backups_to_keep(new: _ResultValue, n_backups: int, before: Sequence[Path]) 
     worth = {path: _ResultValue.of_file(path) for path in before}
     kept: list[Path] = []
     for path in before:
-        own = worth[path]
-        if own is not None and (not own.used or (path != before[0] and own.continued_by(new))):
+        current = worth[path]
+        if current is not None and (not current.used or (path != before[0] and current.continued_by(new))):
             continue
         kept.append(path)
-        new = own or new
+        new = current or new
     first, rest = kept[:1], kept[1:]
-    rest.sort(key=lambda path: -1 if (own := worth[path]) is None else own.convergence, reverse=True)  # stable
+    rest.sort(key=lambda path: -1 if (current := worth[path]) is None else current.convergence, reverse=True)  # stable
     best = rest[: n_backups - len(first)]
     return [*first, *(path for path in before if path in best)]
 
@@ -424,8 +424,8 @@ def _gaussian(where: str, name: str, saved: Any, of_recording: bool) -> Gaussian
     published = _with_covariance(where, name, saved, "covariance")
     if "covariance_of_recording" not in saved:  # older files have only one covariance
         return published
-    own = _with_covariance(where, name, saved, "covariance_of_recording")
-    return own if of_recording else published
+    recorded = _with_covariance(where, name, saved, "covariance_of_recording")
+    return recorded if of_recording else published
 
 
 def _with_covariance(where: str, name: str, saved: Any, key: str) -> GaussianState:

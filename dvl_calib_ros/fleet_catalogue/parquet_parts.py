@@ -94,8 +94,8 @@ class Catalogue:
     def rename(self, part: CataloguePart, vehicle: str) -> None:
         """Change the vehicle in the rows of a recording."""
         rows = self.rows_of(part.recording)
-        own = CataloguePart(part.recording, vehicle, part.fingerprint, part.extrinsics)
-        self._save(own, [{**row, "vehicle": vehicle} for row in rows])
+        renamed = CataloguePart(part.recording, vehicle, part.fingerprint, part.extrinsics)
+        self._save(renamed, [{**row, "vehicle": vehicle} for row in rows])
 
     def parts(self) -> Iterator[CataloguePart]:
         """Yield each recording's part, and set faulty files aside; parts of another schema are skipped.
@@ -180,8 +180,8 @@ def _with_checksum(content: bytes) -> bytes:
 
 def _stamped(row: Row) -> Row:
     """Convert stamps to times."""
-    own = {name: value for name, value in row.items() if not name.endswith("_ns")}
-    return own | {name: row.get(f"{name}_ns") for name in ("first", "last")}
+    values = {name: value for name, value in row.items() if not name.endswith("_ns")}
+    return values | {name: row.get(f"{name}_ns") for name in ("first", "last")}
 
 
 def _arrow() -> Any:

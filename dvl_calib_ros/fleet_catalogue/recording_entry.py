@@ -158,10 +158,10 @@ def _heading(estimate: Estimate) -> list[Row]:
         return []
     value, std = estimate.heading_deviation.x, np.sqrt(np.diag(estimate.heading_deviation.p))
     rows = []
-    for name, each, own in zip(HEADING_ERRORS, np.degrees(value), np.degrees(std), strict=True):
+    for name, each, each_std in zip(HEADING_ERRORS, np.degrees(value), np.degrees(std), strict=True):
         factor, unit = (3600.0, "deg/h") if name == "heading_drift" else (1.0, "deg")
         rows.append(
-            {"parameter": name, "unit": unit, "value": factor * float(each), "std_recording": factor * float(own)}
+            {"parameter": name, "unit": unit, "value": factor * float(each), "std_recording": factor * float(each_std)}
         )
     return rows
 

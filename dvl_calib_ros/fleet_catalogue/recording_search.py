@@ -149,8 +149,8 @@ def _local_files(place: str, unread: list[str]) -> _Files:
             continue
         seen.add(real)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        own = [name for name in sorted(names) if _is_of_a_recording(name) and not name.startswith(".")]
-        for name in own:
+        recording_files = [name for name in sorted(names) if _is_of_a_recording(name) and not name.startswith(".")]
+        for name in recording_files:
             try:
                 files.setdefault(folder, []).append(_local_file(os.path.join(folder, name)))
             except OSError as error:  # a dangling link
@@ -213,12 +213,12 @@ def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterato
             continue
         for each in storage:
             name = each.where.rpartition("/")[2]
-            own = [file for file in files if file.where in (each.where, *(each.where + end for end in _JOURNALS))]
-            yield StoredRecording(each.where, f"{inside}/{name}".strip("/"), place, tuple(own))
+            parts = [file for file in files if file.where in (each.where, *(each.where + end for end in _JOURNALS))]
+            yield StoredRecording(each.where, f"{inside}/{name}".strip("/"), place, tuple(parts))
 
 
 def _is_bag(folder: str, files: Sequence[StoredFile], storage: Sequence[StoredFile]) -> bool:
     if any(each.where.endswith(f"/{METADATA}") for each in files):
         return True
-    own = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # rosbag2's numbering of files
-    return all(own.match(each.where.rpartition("/")[2]) for each in storage)
+    numbered = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # rosbag2's numbering of files
+    return all(numbered.match(each.where.rpartition("/")[2]) for each in storage)

@@ -140,9 +140,9 @@ def _recorded_sound(
 
 def _water_linked(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
     offset, swing = _heading(calibrated, now["mounting_rotation_offset"])
-    turned = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
+    angle = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
     sound, of_sound = _speed_of_sound(calibrated, now.get(SPEED_OF_SOUND))
-    settings, notes = [turned, *sound], [*_residual_notes(calibrated, swing), *_delay(calibrated), *of_sound]
+    settings, notes = [angle, *sound], [*_residual_notes(calibrated, swing), *_delay(calibrated), *of_sound]
     command = {"command": "set_config", "parameters": {each.name: each.new for each in settings}}
     return settings, json.dumps(command) + "\n", notes
 

@@ -108,10 +108,10 @@ class _Dvl:
 
     def _line(self, until: float) -> bytes:
         while b"\n" not in self._pending:
-            left = until - time.monotonic()
-            if left <= 0.0 or len(self._pending) > LONGEST_LINE:
+            remaining = until - time.monotonic()
+            if remaining <= 0.0 or len(self._pending) > LONGEST_LINE:
                 raise TimeoutError("no answer")
-            self._connection.settimeout(left)
+            self._connection.settimeout(remaining)
             got = self._connection.recv(1 << 16)
             if not got:
                 raise ConnectionResetError(0, "it closed the connection")

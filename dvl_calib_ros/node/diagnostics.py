@@ -168,10 +168,10 @@ def diagnose(
     found += message_warnings(grown) + recording_warnings(grown) + dvl_type.advice(grown["dvl"])
     found += gate_warnings(estimate) + consistency_warnings(estimate)
     found += reference_warnings(estimate)
-    if says := calibrator.suggestion_so_far:
-        found.append(finding("CONFIGURATION_WRONG", says=says))
+    if suggestion := calibrator.suggestion_so_far:
+        found.append(finding("CONFIGURATION_WRONG", says=suggestion))
     doubts = calibrator.doubts_so_far
-    rejected = bool(says) or any(each.severity is Severity.REJECT for each in doubts)
+    rejected = bool(suggestion) or any(each.severity is Severity.REJECT for each in doubts)
     verdict = Severity.REJECT if rejected else calibrator.verdict_so_far
     # a reason to reject in a replay is an error here
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]

@@ -55,8 +55,8 @@ class Listener:
     def latest(self, wait_s: float) -> Status | None:
         """Listen for `wait_s` seconds and return the latest status, also an earlier one."""
         deadline = time.monotonic() + wait_s
-        while (left := deadline - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=left)
+        while (remaining := deadline - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=remaining)
         return self._latest
 
     def call(self, service: str) -> None:

@@ -113,14 +113,14 @@ class RemainingTime:
         while self._ends_s[0][0] < now_s - STANDS_S:
             self._ends_s.popleft()
         end_s = sorted(end for _, end in self._ends_s)[len(self._ends_s) // 2]
-        left = max(end_s - now_s, 0.0)
-        latest_s = end_s + SPREAD * left
+        remaining = max(end_s - now_s, 0.0)
+        latest_s = end_s + SPREAD * remaining
         if end_s > self._latest_s:
             code = "LONGER_AS_DRIFT_GREW" if drift > self._promised_at else "LONGER_AS_LITTLE_SHOWN"
             self.longer, self._longer_since_s = finding(code, before=self._promised_at, now=drift), now_s
         if latest_s < self._latest_s or end_s > self._latest_s:
             self._latest_s, self._promised_at = latest_s, drift
-        return left if math.isfinite(left) else None
+        return remaining if math.isfinite(remaining) else None
 
 
 class Card:
@@ -196,11 +196,11 @@ class Card:
             found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(self._shown_s))
         else:
             found = self._suggestion(calibrator, estimate, motion, now_s)
-        left = None
+        remaining = None
         if rejected or worth.is_good:
             self._remaining = RemainingTime()
         elif found.next.code != "NEXT_WAIT":  # a standing vehicle keeps its last prediction
-            left = self._remaining.look(found.seconds, drift.both, self._shown_s)
+            remaining = self._remaining.look(found.seconds, drift.both, self._shown_s)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
             "side": _progress_percent(drift.side, unknown[0], target / math.sqrt(2.0)),
@@ -216,8 +216,8 @@ class Card:
             "taken back": "" if worth.taken_back is None else worth.taken_back.sentence,
             "next": found.next.sentence,
             "next code": found.next.code,
-            "seconds": "-" if left is None else f"{left:.0f}",
-            "seconds spread": "-" if left is None else f"{SPREAD * left:.0f}",
+            "seconds": "-" if remaining is None else f"{remaining:.0f}",
+            "seconds spread": "-" if remaining is None else f"{SPREAD * remaining:.0f}",
             "longer": "" if self._remaining.longer is None else self._remaining.longer.sentence,
         }
 

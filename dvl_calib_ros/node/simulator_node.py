@@ -180,8 +180,8 @@ def _play(
     began = time.monotonic()
     for sample in shifted(samples, start_ns - START_NS):
         due = began + 1e-9 * (sample.stamp_ns - start_ns) / speed
-        while (left := due - time.monotonic()) > 0.0 and not ending.requested:
-            executor.spin_once(timeout_sec=min(left, BREATH_S))
+        while (remaining := due - time.monotonic()) > 0.0 and not ending.requested:
+            executor.spin_once(timeout_sec=min(remaining, BREATH_S))
         if ending.requested:
             return
         node.publish([sample])

@@ -65,7 +65,7 @@ def comparison(result: Comparison) -> Document:
             ),
         ),
     }
-    own = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
+    own_values = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
     return Document(
         title="DVL calibrations compared",
         subtitle=", ".join(each.name for each in ordered),
@@ -80,7 +80,7 @@ def comparison(result: Comparison) -> Document:
                 ],
                 Where.PAGE,
             ),
-            Section("Calibrations", [own]),
+            Section("Calibrations", [own_values]),
             Section(
                 "Differences, the later less the earlier",
                 [_differences(pairs, by_name)],
@@ -97,7 +97,7 @@ def comparison(result: Comparison) -> Document:
 
 def shown_quantities(result: Comparison) -> list[ComparedQuantity]:
     """Return the quantities that were observable in at least two calibrations."""
-    return [each for each in QUANTITIES if sum(own.shown[each.component] for own in result.calibrations) > 1]
+    return [each for each in QUANTITIES if sum(one.shown[each.component] for one in result.calibrations) > 1]
 
 
 DIFFERENCES_NOTE = (

@@ -26,8 +26,8 @@ RESAMPLES = 500
 
 def _stamps(series: DiagnosisSeries) -> Array:
     """Return stamps (M,) ns that put the recordings one after the other, with gaps that the time axis cuts out."""
-    apart = CUT_FROM_S + float(series.time.max()) * len(series.recordings)
-    return np.asarray(1e9 * (series.time + series.recording_of * (series.time.max() + apart)), dtype=np.int64)
+    spacing = CUT_FROM_S + float(series.time.max()) * len(series.recordings)
+    return np.asarray(1e9 * (series.time + series.recording_of * (series.time.max() + spacing)), dtype=np.int64)
 
 
 def _window(series: DiagnosisSeries) -> int:

@@ -155,15 +155,15 @@ def _scores(e: Evaluation) -> Iterable[Item]:
         )
     yield Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
     base = e.columns.index(UNCALIBRATED)
-    gone, gone_published = (1.0 - e.of_models(of) / of[:, [base]] for of in (e.seed_mean, e.published_of_these))
-    shares = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gone.mean(axis=0), strict=True))
+    gains, gains_published = (1.0 - e.of_models(of) / of[:, [base]] for of in (e.seed_mean, e.published_of_these))
+    text = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gains.mean(axis=0), strict=True))
     yield figure(
         "evaluation_figures.improvement_bars",
         "Improvement over uncalibrated",
-        f"Mean over the sets: {shares}",
+        f"Mean over the sets: {text}",
         e.models,
-        gone,
-        gone_published,
+        gains,
+        gains_published,
     )
 
 
@@ -343,14 +343,14 @@ def _held_out(held_out: Sequence[HeldOut]) -> Section:
     )
     drawn = []
     for name in sets:
-        own = [each for each in held_out if each.set_name == name]
+        of_set = [each for each in held_out if each.set_name == name]
         drawn.append(
             figure(
                 "replay_figures.held_out_errors",
                 f"{name}: error on held-out data",
-                "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in own),
-                [each.model for each in own],
-                *(np.array([getattr(each, kind) for each in own]) for kind in HELD_OUT_KINDS),
+                "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in of_set),
+                [each.model for each in of_set],
+                *(np.array([getattr(each, kind) for each in of_set]) for kind in HELD_OUT_KINDS),
             )
         )
     return section("Held-out verification", Table(("model", *sets), rows, notes=notes), *drawn)

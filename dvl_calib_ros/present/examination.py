@@ -30,7 +30,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     lead, found = (found[0], found[1:]) if found and found[0].code.startswith(NO_IMU) else (None, found)
     found = (*found, *examined.against)
     notes = (note.sentence for note in discovery.notes)
-    notes_found = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
+    lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"
     also = "else " if lead or examined.notes else ""
     nothing = "Without a reference only pitch is observable, and yaw on opposite headings."
@@ -40,9 +40,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
         answer=Answer(examined.verdict, severity, [f"{answer} {examined.why}".rstrip()]),
         warnings=examined.notes,
         sections=[
-            Section(
-                f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *notes_found]
-            ),
+            Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *lines]),
             Section(
                 f"Findings: {len(found)}" if found else f"Nothing {also}wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],

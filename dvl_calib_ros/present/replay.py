@@ -165,7 +165,7 @@ def replayed(
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
     first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
     notes = [note for note in run.notes if first is None or note != str(first)]
-    own = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
+    shown_warnings = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
     where = Where.BOTH if details else Where.PAGE
     streams = [(name, result.counts[key]) for key, name in _STREAMS]
     # an angle that is not observable must not be put on a vehicle
@@ -175,7 +175,7 @@ def replayed(
         title="DVL calibration",
         subtitle=", ".join(map(str, bags)),
         answer=_answer(verification),
-        warnings=own,
+        warnings=shown_warnings,
         sections=[
             section(
                 "",
@@ -300,13 +300,13 @@ def _mounting_to_copy(run: Replayed) -> Commands:
     parameters = Parameters.from_mapping(result.parameters)
     rotation = result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
     mounting = result_document(result, run.dvl_frame, run.turned)["mounting"]
-    static, own = mounting["static_transform_publisher"], mounting["urdf_origin"]
-    lines = [("URDF", own)]
+    static, origin = mounting["static_transform_publisher"], mounting["urdf_origin"]
+    lines = [("URDF", origin)]
     if run.turned:
         tag = origin_tag(result.position_in_body, rpy_from_rotation(rotation))
         lines = [
             ("URDF", f"{tag}  (forward-left-up axes)"),
-            ("", f"{own}  ({run.dvl_frame} of the driver: forward-right-down)"),
+            ("", f"{origin}  ({run.dvl_frame} of the driver: forward-right-down)"),
         ]
     return Commands(lines, on_page=[("tf", static)] if static else [])
 

@@ -123,8 +123,8 @@ def selection_over_time(
     names = list(dict.fromkeys(name for name, _, _ in segments))
     figure, axes = new_figure(height=1.0 + 0.36 * (len(names) + 1))
     for name, start, end in segments:
-        left, right = time([start, end])
-        axes.barh(names.index(name) + 1, right - left, left=left, height=0.62, color=MODEL_STYLES[name].color)
+        begin, end_shown = time([start, end])
+        axes.barh(names.index(name) + 1, end_shown - begin, left=begin, height=0.62, color=MODEL_STYLES[name].color)
     edges = time(stamps_ns)
     if len(edges) > 1:
         share = _filled_from_next(paired_share[1:])[None]
@@ -170,10 +170,10 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
     """Draw bars of the DVL samples that each model used, gated, or was not given, by reason."""
     colours = (GOOD, BAD, WARNING, FAINT, "#8d99a6", "#d8dde1")
     figure, axes = new_figure(height=1.1 + 0.28 * len(models))
-    left = np.zeros(len(models))
+    bar_start = np.zeros(len(models))
     for (reason, values), colour in zip(counts.items(), colours, strict=False):
-        axes.barh(models, values, left=left, color=colour, height=0.7, label=reason)
-        left += np.asarray(values, dtype=float)
+        axes.barh(models, values, left=bar_start, color=colour, height=0.7, label=reason)
+        bar_start += np.asarray(values, dtype=float)
     axes.invert_yaxis()
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -381,15 +381,15 @@ def calibration_figure(replayed: Replayed) -> Figure:
     angles, errors = figure.subplots(2, 1, sharex=True)
     time = 1e-9 * (history.stamps_ns - first_ns)
     phi = model.state[:, :3]
-    turned = np.degrees([corrected_rpy(each, parameters) for each in phi]) - np.degrees(parameters.mounting_rpy)
+    change = np.degrees([corrected_rpy(each, parameters) for each in phi]) - np.degrees(parameters.mounting_rpy)
     std = np.degrees([rpy_std(*each, parameters) for each in zip(phi, model.misalignment_covariance, strict=True)])
     settled = slice(int(_SETTLING * len(time)), None)
     for axis, found in enumerate(quantities(result)[:3]):  # σ includes the change to the next recording
-        value, sleeve = turned[:, axis], std[:, axis]
+        value, sleeve = change[:, axis], std[:, axis]
         label = f"{found.name} {value[-1]:+.2f}° ± {found.in_unit(found.std)}"
         angles.fill_between(time, value - sleeve, value + sleeve, color=_COLOURS[axis], alpha=0.15, linewidth=0)
         angles.plot(time, value, color=_COLOURS[axis], label=label)
-    span = turned[settled]
+    span = change[settled]
     margin = 0.2 * float(np.ptp(span)) + 0.1
     angles.set_ylim(float(span.min()) - margin, float(span.max()) + margin)
     angles.set_ylabel("correction of the mounting, °")

@@ -147,12 +147,12 @@ class Singles:
             return self.log_ns
         stamps_ns = np.zeros(len(self), dtype=np.int64)
         for number, channel in enumerate(self.channels):
-            own = np.flatnonzero(self.channel == number)
+            of_channel = np.flatnonzero(self.channel == number)
             kind = VELOCITY_TYPES.get(channel.msgtype)
             if kind is not None and kind.adapted is not None:  # a message without header
-                stamps_ns[own] = [_stamp_or_none(message) for _, _, message, _ in self.messages(own)]
+                stamps_ns[of_channel] = [_stamp_or_none(message) for _, _, message, _ in self.messages(of_channel)]
             else:
-                stamps_ns[own] = self._header_stamps_ns(own)
+                stamps_ns[of_channel] = self._header_stamps_ns(of_channel)
         return stamps_ns
 
     def _header_stamps_ns(self, at: Index) -> Stamps:
@@ -162,12 +162,12 @@ class Singles:
         head = self.content[np.where(whole, starts, 0)[:, None] + np.arange(STAMP_END if whole.any() else 0)]
         stamps_ns = np.zeros(len(at), dtype=np.int64)
         for order, number in (("<", 1), (">", 0)):
-            own = whole & ((head[:, :1] == 0) & (head[:, 1:2] == number)).any(axis=1)
+            readable = whole & ((head[:, :1] == 0) & (head[:, 1:2] == number)).any(axis=1)
             seconds, nanoseconds = (
-                np.ascontiguousarray(head[own, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
+                np.ascontiguousarray(head[readable, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
                 for first, kind in ((STAMP_END - 8, "i"), (STAMP_END - 4, "u"))
             )
-            stamps_ns[own] = seconds * 1_000_000_000 + nanoseconds
+            stamps_ns[readable] = seconds * 1_000_000_000 + nanoseconds
         return stamps_ns
 
 

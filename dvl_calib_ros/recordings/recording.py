@@ -240,7 +240,7 @@ def together(each: Sequence[Recording]) -> Recording:
         tuple(path for one in each for path in one.paths),
         {name: kind for one in each for name, kind in one.types.items()},
         {
-            name: Held(frozenset().union(*(own.types for own in owns)), any(own.lacks_definition for own in owns))
+            name: Held(frozenset().union(*(held.types for held in owns)), any(held.lacks_definition for held in owns))
             for name, owns in held.items()
             if owns
         },
@@ -262,8 +262,8 @@ def _joined_waters(each: Sequence[Recording]) -> tuple[OfWater, ...]:
     for reading in (reading for one in each for reading in one.waters):
         found.setdefault((reading.topic, reading.kind), []).append(reading)
     return tuple(
-        own[0]._replace(values=np.concatenate([part.values for part in own]), std=max(part.std for part in own))
-        for own in found.values()
+        parts[0]._replace(values=np.concatenate([part.values for part in parts]), std=max(part.std for part in parts))
+        for parts in found.values()
     )
 
 
@@ -312,7 +312,7 @@ def _read(
     collectors = {
         topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(moving)
     }
-    left = dict.fromkeys(static, MOST_STATIC)
+    still_to_read = dict.fromkeys(static, MOST_STATIC)
     transforms: list[Any] = []
     descriptions: list[str] = []
     start_ns, end_ns = bag.span_ns
@@ -328,8 +328,8 @@ def _read(
             if topic in collectors:
                 collectors[topic].take(part)
                 continue
-            for message, _ in islice(part.messages(), left[topic]):
-                left[topic] -= 1
+            for message, _ in islice(part.messages(), still_to_read[topic]):
+                still_to_read[topic] -= 1
                 if message is not None and types[topic] == TF_TYPE:
                     transforms += list(message.transforms)
                 elif message is not None:
@@ -339,13 +339,13 @@ def _read(
     for topic in _restamped(columns, parameters.restamp, path):
         columns[topic] = columns[topic].restamped()
     kept, file_spans_ns, aside = without_far(columns, bag.file_spans_ns)
-    counts.subtract({topic: len(columns[topic]) - len(own) for topic, own in kept.items()})
+    counts.subtract({topic: len(columns[topic]) - len(column) for topic, column in kept.items()})
     held = {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types}
-    imus = [own for own in kept.values() if own.msgtype == IMU_TYPE]
-    if not any(len(own.singles) or hold_orientations(own.laid.values) for own in imus):
-        for own in filter(None, map(orientations_of, list(kept.values()))):
-            kept[own.topic], counts[own.topic] = own, len(own)
-            types, held[own.topic] = {**types, own.topic: IMU_TYPE}, Held(frozenset({IMU_TYPE}), False)
+    imus = [column for column in kept.values() if column.msgtype == IMU_TYPE]
+    if not any(len(column.singles) or hold_orientations(column.laid.values) for column in imus):
+        for column in filter(None, map(orientations_of, list(kept.values()))):
+            kept[column.topic], counts[column.topic] = column, len(column)
+            types, held[column.topic] = {**types, column.topic: IMU_TYPE}, Held(frozenset({IMU_TYPE}), False)
     return Recording(
         (path,),
         types,
@@ -353,7 +353,7 @@ def _read(
         counts,
         file_spans_ns,
         (*bag.notes, *map(str, aside)),
-        {topic: (own,) for topic, own in kept.items()},
+        {topic: (column,) for topic, column in kept.items()},
         tuple(transforms),
         tuple(dict.fromkeys(descriptions)),
         waters=tuple(reading for each in waters.values() for reading in each.readings()),

@@ -132,8 +132,8 @@ def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
     arm = found.get("lever_arm", {})
     bias = found.get("velocity_bias", {})
     phi, scale = (_values(document["calibration"][name]) for name in ("phi_rad", "delta_k"))
-    turned = Rotation.from_rotvec([phi.get(axis, 0.0) for axis in "xyz"]).as_matrix()
-    body_from_dvl = rotation_from_rpy(_three(dvl["mounting_rpy"])) @ turned.T
+    rotation = Rotation.from_rotvec([phi.get(axis, 0.0) for axis in "xyz"]).as_matrix()
+    body_from_dvl = rotation_from_rpy(_three(dvl["mounting_rpy"])) @ rotation.T
     return DvlDescription(
         source=str(path),
         mounting_rpy=_three(rpy_from_rotation(body_from_dvl)),

@@ -98,8 +98,8 @@ class ClosedGap(Answering):
         outcome = finding("SIMULATOR_ROUNDS", round=self.best, before=before, after=after, floor=floor)
         if self.best == 0:
             outcome = finding("SIMULATOR_ROUNDS_IN_VAIN", before=before, floor=floor)
-        left = tuple(each for each in best.comparison.reasons if each.code != "SIMULATOR_PUT_RIGHT")
-        return (outcome, *left)
+        other_reasons = tuple(each for each in best.comparison.reasons if each.code != "SIMULATOR_PUT_RIGHT")
+        return (outcome, *other_reasons)
 
 
 def close_gap(

@@ -90,9 +90,9 @@ def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
     rates = [1.0 / float(np.median([f.interval for f in log.facts])) for log in (vehicle, simulator)]
     if not np.isfinite(rates).all():
         return None
-    apart = abs(rates[0] / rates[1] - 1.0)
+    change = abs(rates[0] / rates[1] - 1.0)
     shown: list[Triple] = [(rate, rate * (1.0 - 0.5 * RATE_SHARE), rate * (1.0 + 0.5 * RATE_SHARE)) for rate in rates]
-    return Candidate("rate", "Hz", shown[0], shown[1], 0.0 if apart > RATE_SHARE else 1.0, matters=apart > RATE_SHARE)
+    return Candidate("rate", "Hz", shown[0], shown[1], 0.0 if change > RATE_SHARE else 1.0, matters=change > RATE_SHARE)
 
 
 def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
@@ -125,7 +125,7 @@ def _times(name: str, vehicle: Array, simulator: Array, worth: float) -> Candida
         return None
     shown: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
     is_present = tuple(abs(float(each.mean())) > worth for each in (vehicle, simulator))
-    apart = abs(float(vehicle.mean() - simulator.mean()))
+    gap = abs(float(vehicle.mean() - simulator.mean()))
     return Candidate(
-        name, "s", shown[0], shown[1], welch(vehicle, simulator), (is_present[0], is_present[1]), matters=apart > worth
+        name, "s", shown[0], shown[1], welch(vehicle, simulator), (is_present[0], is_present[1]), matters=gap > worth
     )

@@ -104,13 +104,13 @@ class Tables:
 
     def note(self, at: int, opcode: int, content: bytes) -> None:
         """Note a schema or channel. Raises DamagedError if it is invalid or contradicts the known one."""
-        kind, known, says = _DEFINITIONS[opcode]
+        kind, known, meaning = _DEFINITIONS[opcode]
         table = getattr(self, known)
         try:
             record = kind.read(ReadDataStream(BytesIO(content)))
         except PARSING as error:
             raise DamagedError(f"the record at byte {at} is damaged") from error
-        if (opcode, record.id) in self._met and says(table[record.id]) != says(record):
+        if (opcode, record.id) in self._met and meaning(table[record.id]) != meaning(record):
             raise DamagedError(f"the record at byte {at} contradicts others about {known} {record.id}")
         self._met.add((opcode, record.id))
         table[record.id] = record
