@@ -199,6 +199,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 def _as_done_on_dask(
     work: Callable[[Item], Outcome], items: Sequence[Item], address: str
 ) -> Iterator[tuple[int, Outcome | Lost]]:
+    """Yield outcomes from a Dask cluster as they come. Raises InputError without scheduler or workers."""
     try:
         from distributed import Client
         from distributed.comm.core import CommClosedError

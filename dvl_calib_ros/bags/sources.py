@@ -347,6 +347,7 @@ def _count_valid(log_ns: Sequence[Any], data: Sequence[Any]) -> int:
 
 
 def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
+    """Return topics by number, with types and definitions. Raises DamagedError without the tables."""
     tables = {name for (name,) in _rows(connection, "SELECT name FROM sqlite_master WHERE type = 'table'", (str,))}
     if not {"topics", "messages"} <= tables:
         raise DamagedError("its tables of topics and messages are missing")

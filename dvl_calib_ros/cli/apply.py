@@ -147,6 +147,7 @@ def _settings_lines(chosen: InstrumentSettings) -> list[str]:
 
 
 def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
+    """Return the calibrated mounting as lines to print."""
     import numpy as np
 
     from ..files.mounting import POSITION_UNKNOWN, scale_advice

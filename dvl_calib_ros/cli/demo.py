@@ -122,6 +122,7 @@ def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
 
 
 def _compare(out: Any, saved: Path, offline: Result) -> bool:
+    """Print live and replayed estimates; return whether they agree to rounding."""
     import numpy as np
 
     from ..disk.yaml_files import load_yaml

@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _print(exported: Export, arguments: argparse.Namespace) -> None:
+    """Print which settings were written, and which errors the simulator cannot represent."""
     from ..present.document import Table
     from ..present.terminal import rich_table
 

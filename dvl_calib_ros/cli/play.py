@@ -135,10 +135,7 @@ def _description(bag: BagReader, static: Sequence[str], played: Mapping[str, str
 
 
 def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Map topics of the bags to published names, and list the static transforms that cannot be published.
-
-    Raises InputError.
-    """
+    """Map topics to published names; list static transforms that cannot be published. Raises InputError."""
     from ..errors import InputError
     from ..node.message_types import message_class
     from ..recordings.recording import is_static

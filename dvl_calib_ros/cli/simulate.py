@@ -160,6 +160,7 @@ def _defaults() -> argparse.Namespace:
 
 
 def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace, scenario: Scenario) -> Scenario:
+    """Give the scenario the DVL found by a diagnosis. Raises InputError if options contradict it."""
     from ..errors import InputError
     from ..simulation.found_effects import with_dvl
     from ..simulator_export.dvl_description import load_description

@@ -214,6 +214,7 @@ class View:
         yield from lines[:height]
 
     def _fixed(self, status: Status, width: int) -> list[Row]:
+        """Return the rows that are always shown: model, goal, next step, keys, last event."""
         silent, code = self.now_s - status.received_s, status.get("next code")
         state = Row(f"model {status.get('model')}   {_duration(status.get('elapsed [s]'))}", "bold", most=1)
         if silent > SILENCE_S:

@@ -109,6 +109,7 @@ def find_clocks(
 def _find_in_recording(
     recording: Recording, topics: Topics, parameters: Parameters, knows_mounting: bool, given: frozenset[str]
 ) -> FoundClocks | None:
+    """Estimate the clock offsets under each frame hypothesis; None if none fits better than noise permits."""
     best: tuple[Registration, Parameters] | None = None
     epoch_ns, residual = 0, math.inf
     for hypothesis in _hypotheses(parameters, given):

@@ -118,6 +118,7 @@ class _Search:
         self._readings: Readings  # of DVL and reference, set when they are compared
 
     def run(self) -> Discovery:
+        """Choose topics, then the frames of the DVL, if it has data."""
         topics = self._topics()
         looks = self._seen.looks
         dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
@@ -138,6 +139,7 @@ class _Search:
         )
 
     def _topics(self) -> Topics:
+        """Choose the three topics: given ones, otherwise by type, name and motion."""
         given, default = self._given, Topics()
         dvl = self._named("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._seen, default.dvl, self._where)
         self._notes += topic_choice.other_dvls(self._seen, dvl, difference_of)
@@ -173,6 +175,7 @@ class _Search:
         )
 
     def _topics_said(self, topics: Topics) -> str:
+        """Describe the chosen topics with type, frame and rate, for the first line of the output."""
         parts = []
         for role, name in (("DVL", topics.dvl), ("reference", topics.gnss), ("IMU", topics.imu)):
             kind = self._seen.topics.get(name)
@@ -194,6 +197,7 @@ class _Search:
         return name in self._given.parameters
 
     def _frames(self, dvl: Look, reference: Look | None, imu: Look | None) -> None:
+        """Choose mounting, axes and frames from transforms, motion and gravity; note what was found."""
         placed = self._place_dvl(dvl)
         known = self._parameters.rotation_dvl_from_body.T if self._is_given("mounting_rpy") else None
         if known is None and placed is not None:
@@ -308,6 +312,7 @@ class _Search:
         return np.zeros(3) if in_body and says_body else None
 
     def _place_dvl(self, dvl: Look) -> Placed | None:
+        """Return the DVL's mounting by transforms; with an unknown frame, by a frame whose name indicates a DVL."""
         base_frame = self._parameters.base_frame
         frame = self._parameters.dvl_frame or dvl.frame_id
         if self._is_body_or_earth(dvl.frame_id) and not self._parameters.dvl_frame:
@@ -362,6 +367,7 @@ class _Search:
         known: Array | None,
         placed: Placed | None,
     ) -> FrameChoice | None:
+        """Choose the frames under which DVL and reference agree best; None without common motion."""
         position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
         motion = compared_motion(dvl, reference, imu)
         if motion is None:

@@ -160,6 +160,7 @@ class FrameChooser:
         return self._parameters.is_z_down or self._base_frame.lower().endswith(("_frd", "_ned"))
 
     def _imu_hypotheses(self) -> list[ImuHypothesis]:
+        """Return the possible frames of the IMU, each with a penalty for being unusual or contradicting gravity."""
         imu, placed = self._imu, self._imu_placed
         if imu is None:
             return []

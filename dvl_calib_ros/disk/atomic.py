@@ -136,10 +136,7 @@ def backups_of(path: Path) -> list[Path]:
 
 
 def own_stream(path: Path) -> int | None:
-    """Return the file descriptor of this process that a path names (/dev/stdout, /dev/fd/3), else None.
-
-    /dev/null gives -1.
-    """
+    """Return the descriptor of this process that a path names (/dev/fd/3), -1 for /dev/null, else None."""
     target = os.path.abspath(path)
     for _ in range(40):  # the kernel follows at most 40 links
         folder, name = os.path.split(target)

@@ -190,6 +190,7 @@ def _replay_or_nothing(parameters: Parameters, models: Sequence[str], given: Giv
 
 
 def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
+    """Replay one bag and collect its corrections and the moments of its paired velocities."""
     opened = open_recording([bag], None, named)
     discovery = discover(opened, named, given)
     topics, parameters = discovery.topics, discovery.parameters

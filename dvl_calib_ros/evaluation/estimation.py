@@ -170,6 +170,7 @@ def _estimate(
 def _estimate_one(
     model: Model, seen: Observations, variants: AlignedVariants, parameters: Parameters, ends: Sequence[int]
 ) -> GaussianState:
+    """Return a model's estimates for all variants at the ends of their data."""
     assembler = Assembler([model], parameters)
     if model.uses_height:
         seen = replace(seen, height=_heights(seen, variants, variants.has[model.needs]))

@@ -34,10 +34,7 @@ NOISE_STUDY_SMALLEST_STD = 0.01
 
 @dataclass(frozen=True)
 class Procedure:
-    """Configuration of a run.
-
-    models: names. runs: trajectories by name. studies: False for the published procedure only.
-    """
+    """Configuration of a run. runs: trajectories by name. studies: False for the published procedure only."""
 
     runs: Mapping[str, Trajectory]
     models: tuple[str, ...]

@@ -87,6 +87,7 @@ def _difference(path: Path, before: bytes, after: bytes) -> str:
 
 
 def _contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> tuple[dict[Path, bytes], list[str]]:
+    """Return new contents by file, and notes."""
     contents: dict[Path, bytes] = {}
     notes = []
     if targets.urdf is not None:

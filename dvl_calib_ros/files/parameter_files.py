@@ -132,6 +132,7 @@ def names_of_others(path: Path, node: str) -> set[str]:
 def _own_sections(
     path: Path, node: str, is_own: Callable[[str], bool], text: str | None = None
 ) -> list[tuple[str, dict[str, Any]]]:
+    """Return the parameters that apply to the node, by section. Raises InputError if there are none."""
     content = load_yaml(path, "ROS 2 parameter file", text)
     if not isinstance(content, dict):
         raise InputError(f"{path}: no ROS 2 parameter file; it begins with '/**:', then 'ros__parameters:'")

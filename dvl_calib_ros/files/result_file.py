@@ -429,6 +429,7 @@ def _gaussian(where: str, name: str, saved: Any, of_recording: bool) -> Gaussian
 
 
 def _with_covariance(where: str, name: str, saved: Any, key: str) -> GaussianState:
+    """Return a saved state with one of its covariances, both checked. Raises InputError."""
     model = MODELS[name]
     try:
         x = np.array(saved["state"], dtype=float)

@@ -130,6 +130,7 @@ _Files = tuple[str, dict[str, list[StoredFile]]]
 
 
 def _local_files(place: str, unread: list[str]) -> _Files:
+    """Return root and files by folder of a local place; unreadable ones are added to `unread`."""
     root = os.path.abspath(place.removeprefix("file://"))
     if os.path.isfile(root):
         folder, name = os.path.split(root)
@@ -166,6 +167,7 @@ def _local_file(path: str) -> StoredFile:
 
 
 def _stored(place: str) -> _Files:
+    """Return root and files by folder of an object store. Raises InputError."""
     store, root = _store(place)
     try:
         found: Mapping[str, Mapping[str, Any]] = store.find(root, detail=True)
@@ -199,6 +201,7 @@ def _store(place: str) -> tuple[Any, str]:
 
 
 def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterator[StoredRecording]:
+    """Yield bags and single files: a folder is one bag if its files are numbered as rosbag2 does."""
     bags: list[str] = []
     for folder, files in sorted(folders.items()):
         if any(folder.startswith(f"{bag}/") for bag in bags[-1:]):

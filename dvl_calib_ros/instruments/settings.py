@@ -188,6 +188,7 @@ def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple
 
 
 def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
+    """Return settings, parameter file and notes for ArduPilot. Raises InputError if not near a quarter turn."""
     settings, notes = [], []
     if calibrated.position is None:
         notes.append(f"VISO_POS_X, _Y, _Z are not set: {POSITION_UNKNOWN}")

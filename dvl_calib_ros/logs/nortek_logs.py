@@ -88,6 +88,7 @@ def _sum(data: bytes) -> int:
 
 
 def _sample(data: bytes) -> DvlSample | None:
+    """Return a record's velocity, with the mean of its valid vertical velocities; None without bottom lock."""
     _, _, _, year, month, day, hour, minute, second, fraction, _, _, status, *_ = _LEADER.unpack_from(data)
     values = np.array(_BY_AXIS.unpack_from(data, _LEADER.size + _BY_BEAM.size), dtype=float).reshape(3, 4)
     velocity, noise, late = values

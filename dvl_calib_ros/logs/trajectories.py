@@ -80,6 +80,7 @@ def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
 
 
 def _check_header(path: Path, header: list[str], unit: str) -> None:
+    """Check number, units and order of columns, as far as their names indicate them. Raises InputError."""
     if len(header) != N_COLUMNS:
         names = ", ".join(cell.strip() for cell in header)[:SHOWN]
         raise InputError(

@@ -29,10 +29,7 @@ _SURFACE_PA, _PA_PER_M = 101_325.0, 1025.0 * 9.81
 
 
 class OfWater(NamedTuple):
-    """Readings of one topic.
-
-    kind: temperature, salinity, pressure or used. values: (N,) °C, PSU, Pa or m/s. std: of each.
-    """
+    """Readings of a topic. kind: temperature, salinity, pressure, used. values: (N,) °C, PSU, Pa, m/s. std: of each."""
 
     topic: str
     kind: str

@@ -395,6 +395,7 @@ class CalibrationNode(AnsweringNode):
         return self._correction
 
     def _publish_corrected(self, sample: DvlSample) -> None:
+        """Publish the velocity corrected by the selected model, at the reference point if the lever arm is known."""
         calibrator = self._calibrator
         name = calibrator.selected
         correction = self._correction
@@ -441,6 +442,7 @@ class CalibrationNode(AnsweringNode):
             self._feed.kept.forget()
 
     def _publish_diagnostics(self) -> None:
+        """Publish estimate, problems and progress; also rediscovers topics and publishes the mounting."""
         self._discover()
         self._publish_mounting()
         self._publish_iac()
@@ -491,6 +493,7 @@ class CalibrationNode(AnsweringNode):
     def _on_save(
         self, request: Trigger.Request, response: Trigger.Response, save: Callable[..., None] = save_unless_worse
     ) -> Trigger.Response:
+        """Save the result when the service is called, unless the saved one is better."""
         path = self._calibrator.parameters.result_file
         if not path:
             response.message = "parameter result_file is not set: dvl-calib param set result_file FILE"

@@ -213,6 +213,7 @@ def _restart_advice(counts: Counts) -> list[Reason]:
 
 
 def _estimate_values(estimate: Estimate) -> dict[str, str]:
+    """Return value, σ and progress of each parameter, and the consistency (NIS), as text."""
     values = {}
     model, std = MODELS[estimate.model], estimate.std
     by_filter = dict(zip(estimate.state_names, estimate.filter_std.tolist(), strict=True))

@@ -177,6 +177,7 @@ class Card:
         return min(max(1e-9 * (newest_ns - before_ns), 0.0), STANDS_S / LEAST_LOOKS)
 
     def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float, rejected: bool) -> dict[str, str]:
+        """Update drift, goals and remaining time; return them as values of the diagnostics."""
         parameters, model = calibrator.parameters, MODELS[estimate.model]
         motion, step = calibrator.latest_motion(), self._dvl_time_step(calibrator.last_ns)
         self._shown_s += step

@@ -116,6 +116,7 @@ class SimulatorNode(AnsweringNode):
         subscription = self.create_subscription(Odometry, topic, self._on_odometry, profile, event_callbacks=events)
 
     def _on_odometry(self, message: Any) -> None:
+        """Publish the samples that a new odometry message makes computable; restart if its time goes back."""
         now_ns = stamp_ns(message.header.stamp)
         orientation = message.pose.pose.orientation
         q = unit_quaternion((orientation.x, orientation.y, orientation.z, orientation.w))

@@ -56,6 +56,7 @@ class TopicRecorder:
         return len(self._subscriptions) > before
 
     def _subscribe(self, topic: str, kind: str) -> None:
+        """Subscribe with the publishers' QoS, to record serialized messages."""
         publishers = self._node.get_publishers_info_by_topic(topic)
         if is_static(topic, kind) or not publishers:
             self._static.add(topic)

@@ -22,10 +22,7 @@ _DEGREE = math.degrees(1.0)
 
 
 class ComparedQuantity(NamedTuple):
-    """Quantity of a comparison.
-
-    component: its index in `COMPONENTS`. factor: from SI. changes: attribute of `Comparison`.
-    """
+    """Compared quantity. component: index in `COMPONENTS`. factor: from SI. changes: attribute of `Comparison`."""
 
     component: int
     name: str
@@ -107,6 +104,7 @@ DIFFERENCES_NOTE = (
 
 
 def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Table:
+    """Return the table of differences between calibrations, with σ and p of the mounting."""
     shown = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
     columns: Columns[tuple[str, Difference, float]] = {
         "": lambda each: each[0],

@@ -257,6 +257,7 @@ def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
 
 
 def _pull(study: ErrorsInVariables) -> Section:
+    """Lay out the scale error caused by noise in the reference, predicted and measured."""
     rows = [
         (
             f"{std:g}",
@@ -289,6 +290,7 @@ def _pull(study: ErrorsInVariables) -> Section:
 
 
 def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
+    """Lay out the scores of calibrations on each single run."""
     rows = []
     for run, label, values, observed in zip(
         study.runs, study.run_names, study.seed_mean.tolist(), study.yaw_observed.tolist(), strict=True
@@ -325,6 +327,7 @@ def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
 
 
 def _held_out(held_out: Sequence[HeldOut]) -> Section:
+    """Lay out error and verdict on held-out data, by set and model."""
     sets = list(dict.fromkeys(each.set_name for each in held_out))
     models = list(dict.fromkeys(each.model for each in held_out))
     cells = {

@@ -231,6 +231,7 @@ def mounting_pictures(result: Result) -> list[Picture]:
 
 
 def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float], down: bool) -> Figure:
+    """Draw the DVL's axes on the hull in one view, as configured and as found."""
     across, up, name = axes_of
     figure, axes = new_figure(height=2.6)
     length = max(_LENGTH, 2.4 * float(np.abs(place).max()))

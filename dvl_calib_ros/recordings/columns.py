@@ -228,10 +228,7 @@ def is_kept(msgtype: str) -> bool:
 
 
 class Collector:
-    """Collector of a topic's messages while they are read.
-
-    expected: number of messages. parameters: used by the type's validity rules.
-    """
+    """Collector of a topic's messages. expected: number of messages. parameters: for the type's validity rules."""
 
     def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
         self._topic, self._msgtype, self._parameters, self._decoder = topic, msgtype, parameters, decoder
@@ -259,6 +256,7 @@ class Collector:
             self._take_singly(part)
 
     def _take_columns(self, part: Part) -> None:
+        """Store a part's columns. Raises ValueError, storing nothing, if its messages have no common layout."""
         columns = part.columns
         if columns is None:
             raise ValueError("not laid out alike")

@@ -298,6 +298,7 @@ _NOTHING = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 def _read(
     path: Path, bag: BagReader, topics: Topics | None, parameters: Parameters, on_progress: Callable[[float], None]
 ) -> Recording:
+    """Read a bag window by window: columns of moving topics, static transforms, descriptions, water readings."""
     types = bag.topics
     moving = {topic for topic, kind in types.items() if is_kept(kind)}
     static = {topic for topic, kind in types.items() if is_static(topic, kind)}

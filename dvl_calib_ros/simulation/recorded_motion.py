@@ -101,6 +101,7 @@ def recorded_motion(recording: MotionSource, rate_hz: float, seconds: float | No
 
 
 def _read(recording: MotionSource) -> _Samples:
+    """Read valid reference velocities and attitudes. Raises InputError for less than two."""
     opened = recording.opened
     topics = recording.topics.found_in(opened.types)
     _check_topics(recording, topics, opened.types)

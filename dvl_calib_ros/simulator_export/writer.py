@@ -89,6 +89,7 @@ def export_document(export: Export, description: DvlDescription, version: str) -
 
 
 def _missing(title: str, settings: Settings, description: DvlDescription) -> list[Missing]:
+    """Return what the settings cannot represent, each with size and reason."""
     why = _WHY_NOT.format(title)
     found = []
     bias = description.velocity_bias

@@ -52,10 +52,7 @@ def compare(
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> UnpairedComparison:
-    """Compare bags of a vehicle with bags of a simulator, from any motions.
-
-    Raises InputError if they cannot be compared.
-    """
+    """Compare bags of a vehicle with bags of a simulator. Raises InputError if they cannot be compared."""
     real = read_log(vehicle, lambda share: on_progress(0.4 * share), effects, with_series)
     made = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
     comparison = compare_logs(real, made, effects)

@@ -83,6 +83,7 @@ def read_summary(path: Path) -> Summary | None:
 
 
 def _summary(file: BinaryIO) -> Summary | None:
+    """Return the summary at the end of the file. Raises DamagedError."""
     size = file.seek(0, os.SEEK_END)
     if size < _FOOTER.size:
         raise DamagedError("it is cut off")
@@ -190,6 +191,7 @@ def _overlapping(indexes: Collection[ChunkIndex], wanted: Collection[int]) -> It
 def _whole_chunk(
     file: BinaryIO, size: int, index: ChunkIndex, tables: Tables, channels: Mapping[int, Channel]
 ) -> Batch:
+    """Return an undamaged chunk's messages, by its index if possible. Raises DamagedError."""
     at = index.chunk_start_offset
     opcode, length = record_head(file, at)
     if opcode != Opcode.CHUNK:

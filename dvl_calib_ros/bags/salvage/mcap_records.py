@@ -434,10 +434,7 @@ class ChunkHead(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Unpacked chunk. damage: '' if complete. is_believed: no sign of wrong records.
-
-    holes: unreadable parts of the records.
-    """
+    """Unpacked chunk. damage: '' if complete. is_believed: no sign of wrong records. holes: unreadable parts."""
 
     records: bytes
     damage: str
@@ -497,6 +494,7 @@ def open_chunk(file: BinaryIO, at: int, length: int, size: int, index: ChunkInde
 
 
 def _unpack_chunk(file: BinaryIO, at: int, start: int, head: ChunkHead, packed_size: int, size: int) -> Chunk:
+    """Decompress a chunk as far as readable, and note its damage."""
     file.seek(start)
     packed = file.read(packed_size)
     is_cut = len(packed) < packed_size
