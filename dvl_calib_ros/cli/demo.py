@@ -198,6 +198,7 @@ def give_back(domain: int) -> None:
 
 
 def _take(domain: int) -> bool:
+    """Claim a ROS domain for this process; return whether it was free."""
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         claim.bind(f"\0dvl_calib_ros/domain/{domain}")

@@ -454,6 +454,7 @@ class _Search:
         )
 
     def _use_imu(self, frame: ImuFrame) -> None:
+        """Set the IMU's orientation and world frame as chosen, unless given or default."""
         if self._is_given("imu_rpy") or self._is_given("imu_frame"):
             return
         rpy = tuple((rpy_from_rotation(frame.rotation_body_from_imu) + 0.0).tolist())
@@ -498,6 +499,7 @@ class _Search:
         return np.zeros(3) if placed is None else placed.position
 
     def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
+        """Set the lever arm by the transforms, from the reference's position; note the source."""
         given_mounting = self._is_given("mounting_rpy")
         parts = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]
         if placed.is_located and not self._is_given("lever_arm"):

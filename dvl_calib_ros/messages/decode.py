@@ -353,6 +353,7 @@ class MessageDecoder:
         return self._reference_frames[frame_id]
 
     def _frame_named(self, frame_id: str) -> DeclaredFrame | None:
+        """Return the reference's frame, by parameter, type or frame_id; None, with a note, if unknown."""
         p = self.parameters
         if p.gnss_frame != FROM_FRAME_ID:
             return DECLARED_FRAMES[p.gnss_frame].in_base(p)

@@ -120,6 +120,7 @@ def _middle(readings: Sequence[OfWater]) -> float:
 
 
 def _in_water(readings: Sequence[OfWater]) -> OfWater | None:
+    """Return the readings of the thermometer in the water; None if it is unclear which that is."""
     words = [set(re.split("[^a-z]+", each.topic.lower())) for each in readings]
     maybe = [(each, own) for each, own in zip(readings, words, strict=True) if not own & _NOT_IN_WATER]
     named = [each for each, own in maybe if own & _IN_WATER]

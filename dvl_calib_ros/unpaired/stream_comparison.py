@@ -29,6 +29,7 @@ def compare_streams(vehicle: Log, simulator: Log) -> list[Candidate]:
 
 
 def _outliers(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the shares of outliers: spikes of a fast stream, otherwise large residuals."""
     counts = []
     for log in (vehicle, simulator):
         far = n = 0

@@ -375,6 +375,7 @@ class _FileWalk:
         return index if holes_in(self._file, at, at + len(self._file.read(_CHUNK_BEGIN_SIZE))) else None
 
     def _chunk(self, at: int, length: int, index: ChunkIndex | None = None) -> tuple[list[Found], int]:
+        """Return a chunk's messages and the place after it. Raises DamagedError if its content is not trusted."""
         self._holds_chunks, self._before = True, None
         chunk = open_chunk(self._file, at, length, self._size, index)
         # of a chunk that is not trusted, use only the channels, which later chunks need
@@ -403,6 +404,7 @@ class _FileWalk:
         return found._replace(place=min(headless, default=found.place))
 
     def _searched(self, at: int) -> Resumed:
+        """Search where to continue after damage: at a chunk, or without chunks at a record."""
         if self._may_hold_chunks:
             start = at if self._before is None else self._before
             place = search(self._file, start + 1, self._size, (Opcode.CHUNK, Opcode.CHUNK), self._is_chunk_at)

@@ -235,6 +235,7 @@ def _begins(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
 
 
 def _is_definition(file: BinaryIO, at: int, opcode: int, length: int) -> bool:
+    """Return whether a record holds a definition that ends where the record does."""
     if length > LARGEST_RECORD:
         return False
     file.seek(at + RECORD_HEAD.size)

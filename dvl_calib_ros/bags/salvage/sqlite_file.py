@@ -142,6 +142,7 @@ class _Pages:
                 continue
 
     def _read(self, number: int) -> bytes:
+        """Return a page; empty, and noted as unread, if the disk cannot read it."""
         at = (number - 1) * self.size
         self._file.seek(at)
         page = self._file.read(self.size)
@@ -181,6 +182,7 @@ class _Pages:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """Return SQLite's variable-length integer at a place, and the place after it."""
     value = 0
     for i in range(8):
         byte = data[at + i]
