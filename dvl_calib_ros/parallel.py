@@ -130,8 +130,8 @@ def cores() -> int:
 def _as_done_on_cores(
     work: Callable[[Item], Outcome], items: Iterable[Item], jobs: int
 ) -> Iterator[tuple[int, Outcome | Lost]]:
-    left = enumerate(items)
-    while suspects := (yield from _until_one_dies(work, left, jobs)):
+    remaining = enumerate(items)
+    while suspects := (yield from _until_one_dies(work, remaining, jobs)):
         for suspect in suspects:
             if (yield from _until_one_dies(work, iter([suspect]), 1)):
                 yield suspect[0], Lost("the process that worked on it was killed, perhaps for want of memory")
@@ -199,6 +199,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 def _as_done_on_dask(
     work: Callable[[Item], Outcome], items: Sequence[Item], address: str
 ) -> Iterator[tuple[int, Outcome | Lost]]:
+    """Yield outcomes from a Dask cluster as they come. Raises InputError without scheduler or workers."""
     try:
         from distributed import Client
         from distributed.comm.core import CommClosedError

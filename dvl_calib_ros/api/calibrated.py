@@ -77,13 +77,13 @@ class Mounting:
             f"{name} {angle:.2f}° ± {std:.2f}°"
             for name, angle, std in zip(("roll", "pitch", "yaw"), self.rpy_deg, self.std_deg, strict=True)
         )
-        said = [*angles]
+        parts = [*angles]
         if not all(map(math.isnan, self.xyz_std_m)):
             arm = zip("xyz", self.xyz_m, self.xyz_std_m, strict=True)
-            said.append("lever arm " + ", ".join(f"{axis} {value:.2f} ± {std:.2f} m" for axis, value, std in arm))
+            parts.append("lever arm " + ", ".join(f"{axis} {value:.2f} ± {std:.2f} m" for axis, value, std in arm))
         if not math.isnan(self.time_offset_std_s):
-            said.append(f"stamps late {self.time_offset_s:.3f} ± {self.time_offset_std_s:.3f} s")
-        return printable(f"{self.dvl_frame} in {self.base_frame}: {', '.join(said)}")
+            parts.append(f"stamps late {self.time_offset_s:.3f} ± {self.time_offset_std_s:.3f} s")
+        return printable(f"{self.dvl_frame} in {self.base_frame}: {', '.join(parts)}")
 
     __repr__ = __str__
 

@@ -127,8 +127,8 @@ def checked_replay(
 def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
     """Add ambiguous frames to the verdict and, if the calibration is rejected anyway, their likely cause."""
     is_rejected = verification.verdict is Severity.REJECT
-    said = [each for each in contradictions if each.severity is Severity.MARGINAL or (is_rejected and is_cause(each))]
-    return verification.with_objections(said) if said else verification
+    kept = [each for each in contradictions if each.severity is Severity.MARGINAL or (is_rejected and is_cause(each))]
+    return verification.with_objections(kept) if kept else verification
 
 
 def _mounting_instead_of_guess(result: Result) -> tuple[float, float, float] | None:
@@ -189,8 +189,8 @@ def _calibrated_individually(
         comparison = compare(found) if len(found) > 1 else None
     except InputError:
         comparison = None
-    own = [bag for bag in bags if bag.has_dvl]
-    gaps_ns = (after.from_ns - before.to_ns for before, after in pairwise(own))
+    with_dvl = [bag for bag in bags if bag.has_dvl]
+    gaps_ns = (after.from_ns - before.to_ns for before, after in pairwise(with_dvl))
     pauses_ns = tuple(gap_ns for gap_ns in gaps_ns if gap_ns > DROPOUT_NS)
     number = sum(any(bag.has_dvl for bag in group) for group in groups)
     return Recordings(comparison, tuple(unchecked), overlapping, pauses_ns, number)
@@ -201,10 +201,10 @@ def _bags(recording: Recording, topics: Topics) -> list[_Bag]:
     short = [path.name or str(path) for path in recording.paths]
     names = short if len(set(short)) == len(short) else list(map(str, recording.paths))
     bags = []
-    for own, name in zip(recording.each, names, strict=True):
-        if own.types:
-            has_dvl = own.counts[topics.found_in(own.types).dvl] > 0
-            bags.append(_Bag(own, name, *own.span_ns, has_dvl))
+    for member, name in zip(recording.each, names, strict=True):
+        if member.types:
+            has_dvl = member.counts[topics.found_in(member.types).dvl] > 0
+            bags.append(_Bag(member, name, *member.span_ns, has_dvl))
     return sorted(bags, key=lambda bag: bag.from_ns)
 
 
@@ -224,9 +224,9 @@ def _recordings(bags: Sequence[_Bag]) -> list[list[_Bag]]:
 
 def _overlap(group: Sequence[_Bag]) -> tuple[str, str] | None:
     """Return the names of two bags whose DVL data overlap for longer than `OVERLAP_NS`."""
-    own = [bag for bag in group if bag.has_dvl]
-    for index, bag in enumerate(own):
-        for other in own[index + 1 :]:
+    with_dvl = [bag for bag in group if bag.has_dvl]
+    for index, bag in enumerate(with_dvl):
+        for other in with_dvl[index + 1 :]:
             if min(bag.to_ns, other.to_ns) - other.from_ns > OVERLAP_NS:
                 return bag.name, other.name
     return None
@@ -264,13 +264,13 @@ def _without_pauses(
 ) -> tuple[tuple[Reason, ...], Mapping[str, Mapping[str, int]]]:
     """Remove the pauses between recordings from the dropouts."""
     dropouts = counts["dvl"]["dropouts"]
-    left = max(dropouts - pauses, 0)
-    if left == dropouts:
+    remaining = max(dropouts - pauses, 0)
+    if remaining == dropouts:
         return findings, counts
     kept = [each for each in findings if each.code != DROPOUTS]
-    if left:
-        kept.append(finding(DROPOUTS, count=left))
-    return tuple(kept), {**counts, "dvl": {**counts["dvl"], "dropouts": left}}
+    if remaining:
+        kept.append(finding(DROPOUTS, count=remaining))
+    return tuple(kept), {**counts, "dvl": {**counts["dvl"], "dropouts": remaining}}
 
 
 def _replay_from_valid_start(
@@ -293,8 +293,8 @@ def _replay_from_valid_start(
     contradiction = None if found is None else contradicts(found, load_extrinsics(Path(saved), saved))
     if contradiction is None:
         return replayed
-    said = finding("INITIAL_CONTRADICTED", file=saved, difference=moved_in_words(contradiction))
-    return replace(alone, findings=(*alone.findings, said), notes=(*alone.notes, str(said)))
+    warning = finding("INITIAL_CONTRADICTED", file=saved, difference=moved_in_words(contradiction))
+    return replace(alone, findings=(*alone.findings, warning), notes=(*alone.notes, str(warning)))
 
 
 class Calibrated(NamedTuple):

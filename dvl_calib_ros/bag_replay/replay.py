@@ -72,7 +72,7 @@ class Replayed:
     @property
     def dvl_data(self) -> str:
         """Type and axes of the DVL's data, in words."""
-        return self.dvl_type + (", turned from forward-right-down to forward-left-up" if self.turned else "")
+        return self.dvl_type + (", converted from forward-right-down to forward-left-up" if self.turned else "")
 
     @property
     def cause_of_scale(self) -> CauseOfScale | None:
@@ -195,12 +195,12 @@ def _days_by_recording(days: Sequence[Day], recording: Recording) -> tuple[Day, 
     """Name days by their first recording if each has its own, else by date."""
     names = []
     for day in days:
-        own = [
+        names_of_day = [
             path.name
             for path, span_ns in zip(recording.paths, recording.path_spans_ns, strict=True)
             if span_ns is not None and span_ns[0] - SHORTEST_PAUSE_NS <= day.first_ns <= span_ns[1]
         ]
-        names.append(own[0] if own else "")
+        names.append(names_of_day[0] if names_of_day else "")
     if len(set(names)) < len(days) or not all(names):
         return tuple(days)
     return tuple(replace(day, name=name) for day, name in zip(days, names, strict=True))
@@ -270,7 +270,7 @@ def reference_prior(recording: Recording, parameters: Parameters, topics: Topics
     mean = np.concatenate([*velocities, np.zeros((0, 3))])
     if not len(mean):
         raise InputError(
-            f"prior_source reference: topic {topics.gnss} has no velocity that can be turned into the body frame in "
+            f"prior_source reference: topic {topics.gnss} has no velocity that can be rotated to the body frame in "
             f"its first {parameters.prior_window:g} s; set --gnss-topic, or use prior_source fixed"
         )
     _, sway, heave = mean.mean(axis=0).tolist()
@@ -289,8 +289,8 @@ def _in_body(reference: SampleBlock, attitude: SampleBlock) -> Array:
         return reference.values[is_body]
     enu = np.where(is_ned[:, None], reference.values @ ENU_FROM_NED.T, reference.values)
     rotation_enu_from_body = rotation_from_quaternion(unit_quaternions(attitude.orientation))[before]
-    turned = np.matmul(enu[:, None], rotation_enu_from_body)[:, 0]
-    velocity: Array = np.where(is_body[:, None], reference.values, turned)[is_body | (before >= 0)]
+    rotated = np.matmul(enu[:, None], rotation_enu_from_body)[:, 0]
+    velocity: Array = np.where(is_body[:, None], reference.values, rotated)[is_body | (before >= 0)]
     return velocity
 
 
@@ -321,7 +321,7 @@ def _counts_in_words(counts: Any) -> str:
 def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]:
     """Return plain data of a replay for the requested models. Segments are in s since the first DVL sample."""
     result = replayed.result
-    told = [name for name in models if name in result.estimates]
+    estimated = [name for name in models if name in result.estimates]
     segments = []
     with suppress(TypeError):  # no sample at all: first_ns is None and there are no segments
         ends = [segment.from_ns for segment in result.segments[1:]] + [result.last_ns]
@@ -334,8 +334,8 @@ def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]
             for segment, end in zip(result.segments, ends, strict=True)
         ]
     return {
-        "models": {name: estimate_document(result.estimates[name]) for name in told},
-        "verification": {name: verification_document(result.verifications[name]) for name in told},
+        "models": {name: estimate_document(result.estimates[name]) for name in estimated},
+        "verification": {name: verification_document(result.verifications[name]) for name in estimated},
         "selected": segments,
         **days_document(result),
         "counts": {name: dict(counts) for name, counts in result.counts.items()},

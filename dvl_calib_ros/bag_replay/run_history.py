@@ -143,6 +143,7 @@ class Recorder:
 def _model_history(
     estimate: Estimate, calibrator: Calibrator, trace: StateTrace, numbers: Stamps, stamps_ns: Stamps
 ) -> ModelHistory:
+    """Return a model's state, σ and NIS at the given times and at the end."""
     name = estimate.model
     nis_sum = estimate.used * estimate.mean_nis if estimate.used else 0.0
     states, covariances = [estimate.state[None]], [estimate.recording_covariance[None]]

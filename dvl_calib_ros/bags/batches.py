@@ -191,11 +191,11 @@ def _read_run(file: BinaryIO, at: int, end: int, channels: list[Channel]) -> Ite
         file.seek(at)
         part = rest + file.read(min(_PART, end - at))
         at += len(part) - len(rest)
-        here = 0
-        while here + _HEAD.size <= len(part):
-            log_ns, number, length = _HEAD.unpack_from(part, here)
-            if here + _HEAD.size + length > len(part):
+        offset = 0
+        while offset + _HEAD.size <= len(part):
+            log_ns, number, length = _HEAD.unpack_from(part, offset)
+            if offset + _HEAD.size + length > len(part):
                 break
-            yield log_ns, channels[number], part[here + _HEAD.size : here + _HEAD.size + length]
-            here += _HEAD.size + length
-        rest = part[here:]
+            yield log_ns, channels[number], part[offset + _HEAD.size : offset + _HEAD.size + length]
+            offset += _HEAD.size + length
+        rest = part[offset:]

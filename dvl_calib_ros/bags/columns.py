@@ -144,23 +144,23 @@ class _Layouts:
     def split(self, channel: Channel, data: Rows) -> Iterator[tuple[MessageColumns | None, Index]]:
         """Yield columns and indices of messages of one length, by layout; those without one last, with None."""
         known = self._known.setdefault((channel, data.itemsize), [])
-        left = np.arange(len(data))
+        remaining = np.arange(len(data))
         tried = 0
-        while len(left):
-            if tried == len(known) and not self._learn(channel, data[left[0]].tobytes(), known):
+        while len(remaining):
+            if tried == len(known) and not self._learn(channel, data[remaining[0]].tobytes(), known):
                 break
             layout = known[tried]
             tried += 1
-            rows = layout.view(data if len(left) == len(data) else data[left])
+            rows = layout.view(data if len(remaining) == len(data) else data[remaining])
             shared = layout.shared(rows)
             if shared.all():
-                yield MessageColumns(layout, rows), left
+                yield MessageColumns(layout, rows), remaining
                 return
             if shared.any():
-                yield MessageColumns(layout, rows[shared]), left[shared]
-            left = left[~shared]
-        if len(left):
-            yield None, left
+                yield MessageColumns(layout, rows[shared]), remaining[shared]
+            remaining = remaining[~shared]
+        if len(remaining):
+            yield None, remaining
 
     def _learn(self, channel: Channel, data: bytes, known: list[Layout]) -> bool:
         store = self._decoder.typestore(channel)

@@ -118,8 +118,8 @@ def with_journal(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
 
 
 def _journal(path: Path, suffix: str) -> Path | None:
-    for beside in (path, path.resolve()):
-        journal = beside.with_name(f"{beside.name}{suffix}")
+    for database in (path, path.resolve()):
+        journal = database.with_name(f"{database.name}{suffix}")
         if journal.is_file() and journal.stat().st_size:
             return journal
     return None

@@ -145,6 +145,7 @@ class BagReader:
             yield from batch.messages()
 
     def _of_source(self, source: Source, topics: frozenset[str]) -> Iterator[Batch]:
+        """Yield a file's batches up to the first damage, which is noted."""
         start_ns = newest_ns = source.span_ns[0]
         read = lost = 0
         try:

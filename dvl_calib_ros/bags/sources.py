@@ -302,11 +302,11 @@ class Database:
     def batches(self, topics: Collection[str]) -> Iterator[Batch]:
         """Yield messages of these topics in order of log time; those before an exception come first."""
         numbers = [number for number, channel in self._channels.items() if channel.topic in topics]
-        own = f"FROM messages WHERE topic_id IN ({','.join('?' * len(numbers))}) AND length(data) <= {LARGEST_RECORD}"
-        query = f"SELECT timestamp, topic_id, data {own} ORDER BY timestamp"
+        tail = f"FROM messages WHERE topic_id IN ({','.join('?' * len(numbers))}) AND length(data) <= {LARGEST_RECORD}"
+        query = f"SELECT timestamp, topic_id, data {tail} ORDER BY timestamp"
         with closing(self._connection()) as connection:
             # with grouping by topic, SQLite would sort the messages themselves
-            ((longest,),) = connection.execute(f"SELECT max(length(data)) {own}", numbers)
+            ((longest,),) = connection.execute(f"SELECT max(length(data)) {tail}", numbers)
             at_once = max(1, min(MOST_MESSAGES, MOST_BYTES // max(longest or 1, 1)))
             cursor = connection.execute(query, numbers)
             error: Exception | None = None
@@ -347,6 +347,7 @@ def _count_valid(log_ns: Sequence[Any], data: Sequence[Any]) -> int:
 
 
 def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
+    """Return topics by number, with types and definitions. Raises DamagedError without the tables."""
     tables = {name for (name,) in _rows(connection, "SELECT name FROM sqlite_master WHERE type = 'table'", (str,))}
     if not {"topics", "messages"} <= tables:
         raise DamagedError("its tables of topics and messages are missing")

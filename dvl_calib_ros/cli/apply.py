@@ -70,8 +70,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise InputError("--now, --settings and --send go with --instrument; name that, too")
     if arguments.instrument is not None and (targets.paths or arguments.rollback):
         raise InputError(
-            "--instrument takes the error out where it is made; with --urdf, --params, --launch or --fusion the DVL "
-            "would be turned twice: give one of them"
+            "--instrument corrects the error at its source; with --urdf, --params, --launch or --fusion the DVL "
+            "would be corrected twice: give one of them"
         )
     if arguments.rollback:
         for path, kept in roll_back(targets).items():
@@ -127,14 +127,14 @@ def _parse_now(words: Sequence[str]) -> dict[str, float]:
     """Parse --now NAME=VALUE. Raises InputError."""
     from ..errors import InputError
 
-    told = {}
+    settings = {}
     for word in words:
         name, _, value = word.partition("=")
         try:
-            told[name.strip()] = float(value)
+            settings[name.strip()] = float(value)
         except ValueError as error:
             raise InputError(f"--now {word}: is not NAME=VALUE with a number") from error
-    return told
+    return settings
 
 
 def _settings_lines(chosen: InstrumentSettings) -> list[str]:
@@ -147,6 +147,7 @@ def _settings_lines(chosen: InstrumentSettings) -> list[str]:
 
 
 def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
+    """Return the calibrated mounting as lines to print."""
     import numpy as np
 
     from ..files.mounting import POSITION_UNKNOWN, scale_advice
@@ -171,8 +172,8 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     if calibrated.dvl_time_offset:
         late = "late" if calibrated.dvl_time_offset > 0.0 else "early"
         lines.append(
-            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late}, today: URDF and TF hold no "
-            "delay; --params writes dvl_time_offset, or set the DVL's clock"
+            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late} in this recording: URDF and "
+            "TF have no delay; --params writes dvl_time_offset, or set the DVL's clock"
         )
     if calibrated.position is not None:
         lines.append(f"position: {_metres(calibrated.position)} in {calibrated.base_frame}")

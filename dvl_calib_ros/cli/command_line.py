@@ -97,6 +97,7 @@ def _terminated_as_interrupted() -> Iterator[None]:
 
 
 def _run(argv: Sequence[str]) -> int:
+    """Parse and run. Return the exit code, with errors printed in one line."""
     parser = build_parser(argv)
     arguments = parser.parse_args(argv)
     from ..calibration.models.parameter_spec import ParameterError
@@ -186,5 +187,5 @@ def _files(path: Path) -> list[Path]:
     """Return a folder's recordings, or a recording and its journals."""
     if path.is_dir():
         return [path / name for name in sorted(os.listdir(path)) if name.endswith(_SUFFIXES)]
-    beside = [path, *(path.with_name(path.name + journal) for journal in ("-wal", "-journal"))]
-    return [file for file in beside if file.name.endswith(_SUFFIXES) and file.exists()]
+    candidates = [path, *(path.with_name(path.name + journal) for journal in ("-wal", "-journal"))]
+    return [file for file in candidates if file.name.endswith(_SUFFIXES) and file.exists()]

@@ -122,6 +122,7 @@ def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
 
 
 def _compare(out: Any, saved: Path, offline: Result) -> bool:
+    """Print live and replayed estimates; return whether they agree to rounding."""
     import numpy as np
 
     from ..disk.yaml_files import load_yaml
@@ -138,9 +139,9 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     of_these = [row[: len(truth)] for row in found.rows]  # only the columns that have a truth
     out.print(rich_table(Table(found.head[: len(truth)], [truth, *of_these])))
     worst = max(
-        float(np.abs(here - there).max())
+        float(np.abs(live_value - replay_value).max())
         for name, estimate in offline.estimates.items()
-        for here, there in ((live[name].x, estimate.state), (live[name].p, estimate.covariance))
+        for live_value, replay_value in ((live[name].x, estimate.state), (live[name].p, estimate.covariance))
     )
     model = load_yaml(saved, "result file")["model"]
     start_ns = offline.first_ns or 0
@@ -197,6 +198,7 @@ def give_back(domain: int) -> None:
 
 
 def _take(domain: int) -> bool:
+    """Claim a ROS domain for this process; return whether it was free."""
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:
         claim.bind(f"\0dvl_calib_ros/domain/{domain}")

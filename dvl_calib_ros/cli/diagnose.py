@@ -154,7 +154,7 @@ def add_simulator_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--rounds", type=int, metavar="N",
-        help="put the simulator's DVL right by what was found, simulate it on the simulator's motion and compare "
+        help="correct the simulator's DVL by the differences, simulate it on the simulator's motion and compare "
         "again, up to N times",
     )  # fmt: skip
     parser.add_argument(
@@ -212,9 +212,9 @@ def _open_side(
     """Open one side's bags and discover their topics and frames."""
     from ..unpaired.both_sides import RecordedSide
 
-    own = argparse.Namespace(**{**vars(arguments), "params": params})
-    recording = common.opened(bags, common.load(own))
-    discovery = common.discovered(own, recording, common.load(own))
+    side_arguments = argparse.Namespace(**{**vars(arguments), "params": params})
+    recording = common.opened(bags, common.load(side_arguments))
+    discovery = common.discovered(side_arguments, recording, common.load(side_arguments))
     common.print_warnings(discovery.doubts)
-    parameters = common.load(own, defaults).replace(**discovery.values)
+    parameters = common.load(side_arguments, defaults).replace(**discovery.values)
     return RecordedSide(recording, parameters, discovery.topics), discovery

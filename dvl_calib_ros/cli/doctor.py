@@ -81,6 +81,7 @@ def _recordings(arguments: argparse.Namespace) -> Iterator[list[Path]]:
 
 
 def _record(path: Path, seconds: float) -> None:
+    """Record the live topics for some seconds. Raises InputError if nothing comes."""
     from ..bags.writer import BagWriter
     from ..errors import InputError
 

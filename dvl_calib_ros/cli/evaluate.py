@@ -102,6 +102,7 @@ def _are_bags(paths: list[Path]) -> bool:
 
 
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
+    """Check each bag's calibration on the other bags; print and save."""
     from ..errors import InputError
     from ..evaluation.cross_check import cross_check, cross_check_document
     from ..present import evaluation as present

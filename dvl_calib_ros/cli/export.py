@@ -33,14 +33,15 @@ def run(arguments: argparse.Namespace) -> None:
     from ..simulator_export.registry import missing_beside, write_settings
 
     missing = missing_beside(arguments.output)
-    beside = {} if missing is None else {"--output, for missing effects,": missing}
-    common.check_outputs(arguments, "output", also_written=beside)
+    also_written = {} if missing is None else {"--output, for missing effects,": missing}
+    common.check_outputs(arguments, "output", also_written=also_written)
     exported = write_settings(arguments.simulator, arguments.source, arguments.output)
     if missing is not None:
         _print(exported, arguments)
 
 
 def _print(exported: Export, arguments: argparse.Namespace) -> None:
+    """Print which settings were written, and which errors the simulator cannot represent."""
     from ..present.document import Table
     from ..present.terminal import rich_table
 
@@ -55,5 +56,5 @@ def _print(exported: Export, arguments: argparse.Namespace) -> None:
         out.print(f"{arguments.simulator} can represent everything that was found")
         return
     rows = [(e.name, "-" if e.error is None else f"{1e3 * e.error:.1f}", e.says) for e in exported.missing]
-    head = ("what", "error that stays, mm/s", "why")
+    head = ("what", "remaining error, mm/s", "why")
     out.print(rich_table(Table(head, rows, f"{arguments.simulator} cannot represent", words=3)))

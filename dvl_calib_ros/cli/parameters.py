@@ -29,8 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--models", action="store_true", help="what each model assumes and when it is wrong")
     what.add_argument("--drivers", action="store_true", help="the message types that DVLs are read from, and how")
     what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
-    for name, told in _TABLES.items():
-        what.add_argument(f"--{name}", action="store_true", help=told)
+    for name, help_text in _TABLES.items():
+        what.add_argument(f"--{name}", action="store_true", help=help_text)
     what.add_argument("--commands", action="store_true", help="every command with an example")
     what.add_argument("--urdf", type=Path, metavar="FILE", help="a parameter file that begins with a URDF's mounting")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint in the URDF; default: the one above dvl_link")

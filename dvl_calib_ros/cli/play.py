@@ -135,20 +135,17 @@ def _description(bag: BagReader, static: Sequence[str], played: Mapping[str, str
 
 
 def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Map topics of the bags to published names, and list the static transforms that cannot be published.
-
-    Raises InputError.
-    """
+    """Map topics to published names; list static transforms that cannot be published. Raises InputError."""
     from ..errors import InputError
     from ..node.message_types import message_class
     from ..recordings.recording import is_static
     from ..recordings.topics import spelled
 
     def found(name: str, option: str) -> str:
-        there = spelled(name, bag.topics)
-        if there is None:
+        spelled_topic = spelled(name, bag.topics)
+        if spelled_topic is None:
             raise InputError(f"{option}: {name} is not in the recording, which has {', '.join(sorted(bag.topics))}")
-        return there
+        return spelled_topic
 
     renamed = {}
     for each in remap:

@@ -50,12 +50,13 @@ def _path(name: str | None) -> Path | None:
     folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "dvl-calib"
     path = folder / f"{name}.yaml"
     if not path.exists():
-        there = ", ".join(sorted(each.stem for each in folder.glob("*.yaml"))) or "none"
-        raise InputError(f"--profile: {path} does not exist; profiles there: {there}")
+        existing = ", ".join(sorted(each.stem for each in folder.glob("*.yaml"))) or "none"
+        raise InputError(f"--profile: {path} does not exist; profiles there: {existing}")
     return path
 
 
 def _words(path: Path) -> list[str]:
+    """Return a profile's content as command-line words. Raises InputError."""
     from ..disk.yaml_files import load_yaml
     from ..errors import InputError
     from ..files.parameter_files import as_yaml

@@ -160,17 +160,18 @@ def _defaults() -> argparse.Namespace:
 
 
 def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace, scenario: Scenario) -> Scenario:
+    """Give the scenario the DVL found by a diagnosis. Raises InputError if options contradict it."""
     from ..errors import InputError
     from ..simulation.found_effects import with_dvl
     from ..simulator_export.dvl_description import load_description
 
     for name in OF_THE_DVL:
         if getattr(arguments, name) != getattr(defaults, name):
-            raise InputError(f"--{name.replace('_', '-')}: {arguments.diagnosis} says it; leave one of the two out")
+            raise InputError(f"--{name.replace('_', '-')}: {arguments.diagnosis} has it, too; leave one of the two out")
     description = load_description(arguments.diagnosis)
     scenario, left_out = with_dvl(scenario, description)
     notes = [
-        f"the data could not tell {', '.join(names)} apart; {names[0]} is taken" for names in description.ambiguous
+        f"the data could not distinguish {', '.join(names)}; {names[0]} is used" for names in description.ambiguous
     ]
     if left_out:
         notes.append(f"not simulated (of unknown size, or of another day): {', '.join(left_out)}")

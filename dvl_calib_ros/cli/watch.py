@@ -77,10 +77,10 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
             assert process.stdout is not None  # a pipe
             log = _Log(process.stdout)
             show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log.lines, True)
-            said = len(log.lines) if process.poll() is None else 0  # number of lines already on the screen
+            n_shown = len(log.lines) if process.poll() is None else 0  # number of lines already on the screen
         finally:
             code = _ended(process)
-        for text in log.finished()[said:]:
+        for text in log.finished()[n_shown:]:
             say(text)
     return code
 
@@ -204,8 +204,8 @@ class View:
 
         lines = folded(fixed)
         room = max(height - len(lines) - 1, 1)
-        told = folded(Row(f"{number}. {each}", most=height) for number, each in enumerate(warnings, start=1))
-        pages = [told[at : at + room] for at in range(0, len(told), room)]
+        warning_rows = folded(Row(f"{number}. {each}", most=height) for number, each in enumerate(warnings, start=1))
+        pages = [warning_rows[at : at + room] for at in range(0, len(warning_rows), room)]
         page = self.page % (len(pages) + 1)
         if page:
             lines += [*pages[page - 1], *folded([Row(f"page {page} of {len(pages)} (w goes on)", "dim", most=1)])]
@@ -214,6 +214,7 @@ class View:
         yield from lines[:height]
 
     def _fixed(self, status: Status, width: int) -> list[Row]:
+        """Return the rows that are always shown: model, goal, next step, keys, last event."""
         silent, code = self.now_s - status.received_s, status.get("next code")
         state = Row(f"model {status.get('model')}   {_duration(status.get('elapsed [s]'))}", "bold", most=1)
         if silent > SILENCE_S:
@@ -222,8 +223,8 @@ class View:
         if _is_usable(status) or not ("REJECTED" in code or "GOOD" in code):
             seconds = status.get("seconds")
             spread = status.values.get("seconds spread", "-")
-            left = " ± ".join(_duration(each, rough=True) for each in (seconds, spread))
-            about = "" if seconds == "-" else f", about {left} until good enough"
+            remaining = " ± ".join(_duration(each, rough=True) for each in (seconds, spread))
+            about = "" if seconds == "-" else f", about {remaining} until good enough"
             following = f"next: {status.get('next')}{about}"
         lines = 1 if width >= WIDE else 2
         return [
@@ -241,14 +242,14 @@ def _is_usable(status: Status) -> bool:
 
 def _warnings(status: Status) -> list[str]:
     found = [each for n in range(1, 100) if (each := status.values.get(f"finding {n}"))]
-    told = [status.values.get(name, "") for name in ("taken back", "longer")] if _is_usable(status) else []
-    return [*filter(None, told), *(found or [status.message] * bool(status.level))]
+    found_in_status = [status.values.get(name, "") for name in ("taken back", "longer")] if _is_usable(status) else []
+    return [*filter(None, found_in_status), *(found or [status.message] * bool(status.level))]
 
 
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
     """Yield the mounting, the first warning, streams, drift by axis and headings."""
     is_usable, colour = _is_usable(status), COLOURS.get(status.level, "red")
-    why = "see below" if status.get("next code") == "NEXT_REJECTED" else "the data do not show it yet"
+    why = "see below" if status.get("next code") == "NEXT_REJECTED" else "not observable yet"
     between = [Row("")] if width >= WIDE else []
     yield from between
     yield Row("mounting now") if is_usable else Row(f"mounting: not to be used, {why}", colour, most=2)
@@ -424,12 +425,12 @@ def show(
 
 
 def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:
-    said, said_s = ("", "", ""), 0.0
+    printed, printed_s = ("", "", ""), 0.0
     while is_running():
         status, now_s = statuses(REDRAW_S), time.monotonic()
         if status is None:
             continue
         what = (status.get("model"), status.get("convergence"), str(status.level))
-        if what != said or now_s - said_s > LINE_S:
-            said, said_s = what, now_s
+        if what != printed or now_s - printed_s > LINE_S:
+            printed, printed_s = what, now_s
             yield line(status)

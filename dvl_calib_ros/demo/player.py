@@ -35,8 +35,8 @@ def sensors_of(bag: BagReader) -> dict[str, str]:
 
 def wait_until(time_s: float, has_ended: Callable[[], bool]) -> None:
     """Wait until a time of `time.monotonic`, or until `has_ended`."""
-    while (left := time_s - time.monotonic()) > 0.0 and not has_ended():
-        time.sleep(min(left, BREATH_S))
+    while (remaining := time_s - time.monotonic()) > 0.0 and not has_ended():
+        time.sleep(min(remaining, BREATH_S))
 
 
 class BagPlayer:
@@ -90,7 +90,7 @@ class BagPlayer:
         deadline = time.monotonic() + timeout_s
         while unheard := self.unheard:
             if time.monotonic() > deadline:
-                raise InputError(f"nobody subscribes to {unheard[0]} within {timeout_s:.0f} s; is the node running?")
+                raise InputError(f"no subscriber of {unheard[0]} within {timeout_s:.0f} s; is the node running?")
             time.sleep(0.01)
 
     def play(

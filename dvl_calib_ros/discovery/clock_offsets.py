@@ -109,8 +109,9 @@ def find_clocks(
 def _find_in_recording(
     recording: Recording, topics: Topics, parameters: Parameters, knows_mounting: bool, given: frozenset[str]
 ) -> FoundClocks | None:
+    """Estimate the clock offsets under each frame hypothesis; None if none fits better than noise permits."""
     best: tuple[Registration, Parameters] | None = None
-    epoch_ns, left = 0, math.inf
+    epoch_ns, residual = 0, math.inf
     for hypothesis in _hypotheses(parameters, given):
         motion = _streams_to_register(recording, topics, hypothesis)
         if motion is None:
@@ -123,11 +124,11 @@ def _find_in_recording(
         mounting = rotation.T if knows_mounting or is_first else None
         found = register(motion, mounting, np.array(hypothesis.lever_arm))
         if found is not None and (best is None or found.left < CLEARLY * best[0].left):
-            best, epoch_ns, left = (found, hypothesis), motion.epoch_ns, _residual_without_noise(found, motion)
+            best, epoch_ns, residual = (found, hypothesis), motion.epoch_ns, _residual_without_noise(found, motion)
         if is_first and found is not None and _residual_without_noise(found, motion) < REGISTERED:
             recording.register_as(found, topics, parameters)
             break
-    if best is None or left >= REGISTERED:
+    if best is None or residual >= REGISTERED:
         return None
     registration, hypothesis = best
     offsets = {} if given.intersection(OFFSETS) else registration.taken_off
@@ -155,15 +156,15 @@ def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Param
 
 def _streams_to_register(recording: Recording, topics: Topics, parameters: Parameters) -> MotionStreams | None:
     """Return the streams to register, thinned so that memory does not grow with their rates."""
-    own = recording.of_types(topics, parameters)
+    parameters_used = recording.of_types(topics, parameters)
     named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
     parts = [
         Streams(*(_one_per_interval(block) for block in stretch.streams))
-        for stretch in recording.stretches(named, MessageDecoder(own))
+        for stretch in recording.stretches(named, MessageDecoder(parameters_used))
     ]
     if not parts:
         return None
-    return motion_of(Streams(*(one.joined(*others) for one, *others in zip(*parts, strict=True))), own)
+    return motion_of(Streams(*(one.joined(*others) for one, *others in zip(*parts, strict=True))), parameters_used)
 
 
 def _one_per_interval(block: SampleBlock) -> SampleBlock:
@@ -209,8 +210,8 @@ def compared_motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStrea
     if imu is not None and imu.has_orientation:
         columns = imu_columns_of(imu)
     measured = True, True, bool(reference.values[:, 2].any())
-    own, other = (in_order(each.stamps_s, each.values) for each in (dvl, reference))
-    return make_motion(own, other, False, measured, columns)
+    dvl_motion, reference_motion = (in_order(each.stamps_s, each.values) for each in (dvl, reference))
+    return make_motion(dvl_motion, reference_motion, False, measured, columns)
 
 
 def imu_columns_of(imu: Look) -> ImuColumns:

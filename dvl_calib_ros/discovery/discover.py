@@ -118,6 +118,7 @@ class _Search:
         self._readings: Readings  # of DVL and reference, set when they are compared
 
     def run(self) -> Discovery:
+        """Choose topics, then the frames of the DVL, if it has data."""
         topics = self._topics()
         looks = self._seen.looks
         dvl, reference, imu = looks.get(topics.dvl), looks.get(topics.gnss), looks.get(topics.imu)
@@ -138,14 +139,15 @@ class _Search:
         )
 
     def _topics(self) -> Topics:
+        """Choose the three topics: given ones, otherwise by type, name and motion."""
         given, default = self._given, Topics()
         dvl = self._named("dvl", given.dvl_topic) or topic_choice.choose_dvl(self._seen, default.dvl, self._where)
         self._notes += topic_choice.other_dvls(self._seen, dvl, difference_of)
         gnss, imu = default.gnss, default.imu
         if given.gnss_topic is None:
-            chosen, said = topic_choice.choose_reference(self._seen, default.gnss, dvl, difference_of)
+            chosen, notes = topic_choice.choose_reference(self._seen, default.gnss, dvl, difference_of)
             gnss = chosen or default.gnss
-            self._notes += said
+            self._notes += notes
         elif given.gnss_topic != topic_choice.NONE:
             gnss = self._named("gnss", given.gnss_topic) or gnss
         else:
@@ -173,6 +175,7 @@ class _Search:
         )
 
     def _topics_said(self, topics: Topics) -> str:
+        """Describe the chosen topics with type, frame and rate, for the first line of the output."""
         parts = []
         for role, name in (("DVL", topics.dvl), ("reference", topics.gnss), ("IMU", topics.imu)):
             kind = self._seen.topics.get(name)
@@ -194,6 +197,7 @@ class _Search:
         return name in self._given.parameters
 
     def _frames(self, dvl: Look, reference: Look | None, imu: Look | None) -> None:
+        """Choose mounting, axes and frames from transforms, motion and gravity; note what was found."""
         placed = self._place_dvl(dvl)
         known = self._parameters.rotation_dvl_from_body.T if self._is_given("mounting_rpy") else None
         if known is None and placed is not None:
@@ -207,31 +211,31 @@ class _Search:
         if dvl.claimed_std >= SAYS_NOTHING and not self._is_given("use_message_covariance"):
             self._values["use_message_covariance"] = False
             self._found.append(
-                f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which says nothing and is not used "
+                f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which is no information and not used "
                 "(-p use_message_covariance:=false)"
             )
         if reference is not None:
             chosen = self._fit(frames, dvl, reference, imu, known, placed)
         taken = frames.imu if chosen is None else chosen.imu
         self._use_base_axes(taken is not None and taken.z_down)
-        turned = frames.dvl_is_turned(self._is_z_down)
+        is_turned = frames.dvl_is_turned(self._is_z_down)
         if chosen is not None and reference is not None:
             agreement = self._chosen = chosen.agreement
-            turned = agreement.reading.turned
+            is_turned = agreement.reading.turned
             self._contradictions += chosen.says
             self._use_reading(agreement, known, reference, imu)
             self._measure_noise(agreement, known, dvl, reference)
         elif reference is None:
-            self._mounting_from_motion(dvl, turned, known)
+            self._mounting_from_motion(dvl, is_turned, known)
         if taken is not None:
             self._use_imu(taken.frame)
         parameters = self._parameters.replace(base_axes=FRD if self._is_z_down else FLU)
-        if parameters.dvl_axes == FROM_MESSAGE and turned != turns_dvl(
+        if parameters.dvl_axes == FROM_MESSAGE and is_turned != turns_dvl(
             VELOCITY_TYPES[dvl.msgtype], dvl.frame_id, parameters
         ):
-            axes = self._values["dvl_axes"] = FRD if turned != self._is_z_down else FLU
+            axes = self._values["dvl_axes"] = FRD if is_turned != self._is_z_down else FLU
             which = "forward-right-down" if axes == FRD else "forward-left-up"
-            self._found.append(f"the DVL's data are taken {which} (dvl_axes {axes})")
+            self._found.append(f"the DVL's data are used as {which} (dvl_axes {axes})")
         if known is not None and not self._is_given("mounting_rpy"):
             self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
         if placed is not None and placed.source:
@@ -285,7 +289,7 @@ class _Search:
         """Set the knowledge about the DVL's position in the body, which needs more than the lever arm."""
         if self._is_given("dvl_position"):
             return
-        told = _is_located(placed) and not self._is_given("lever_arm")
+        is_known = _is_located(placed) and not self._is_given("lever_arm")
         at = None if reference is None else self._known_reference_position(reference)
         if self._is_given("reference_position"):
             at = np.array(self._parameters.reference_position)
@@ -293,7 +297,7 @@ class _Search:
             self._values["dvl_position"] = FROM_REFERENCE
             if at.any() and not self._is_given("reference_position"):
                 self._values["reference_position"] = tuple((at + 0.0).tolist())
-        elif told:
+        elif is_known:
             self._values["dvl_position"] = TOLD
 
     def _known_reference_position(self, reference: Look) -> Array | None:
@@ -308,6 +312,7 @@ class _Search:
         return np.zeros(3) if in_body and says_body else None
 
     def _place_dvl(self, dvl: Look) -> Placed | None:
+        """Return the DVL's mounting by transforms; with an unknown frame, by a frame whose name indicates a DVL."""
         base_frame = self._parameters.base_frame
         frame = self._parameters.dvl_frame or dvl.frame_id
         if self._is_body_or_earth(dvl.frame_id) and not self._parameters.dvl_frame:
@@ -340,8 +345,8 @@ class _Search:
         if reference is None:
             return None
         taken = self._values.get("gnss_frame")
-        said = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
-        return None if said is None else said.frame
+        declared = self._declared_reference(reference) if taken is None else DECLARED_FRAMES[taken]
+        return None if declared is None else declared.frame
 
     def _knows_imu(self, imu: Look | None) -> bool:
         """Return whether the IMU's orientation in the body is known: by a transform, or DVL and reference agree."""
@@ -362,6 +367,7 @@ class _Search:
         known: Array | None,
         placed: Placed | None,
     ) -> FrameChoice | None:
+        """Choose the frames under which DVL and reference agree best; None without common motion."""
         position = np.zeros(3) if placed is None else placed.position - self._reference_position(reference)
         motion = compared_motion(dvl, reference, imu)
         if motion is None:
@@ -390,8 +396,8 @@ class _Search:
             name = self._values["gnss_frame"] = taken.name
             if declared is None:
                 self._found.append(
-                    f"the reference is taken as {name}, which fits best; its frame {reference.frame_id!r} does not "
-                    f"say (-p gnss_frame:={name})"
+                    f"the reference is used as {name}, which fits best; its frame {reference.frame_id!r} does not "
+                    f"define it (-p gnss_frame:={name})"
                 )
             else:
                 frame = {"frame": reference.frame_id, "declared": declared.name, "taken": name}
@@ -399,9 +405,9 @@ class _Search:
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
         if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
-            left = self._readings.registered(reading, np.eye(3)).left
+            residual = self._readings.registered(reading, np.eye(3)).left
             turned_left, rotation, *_ = self._readings.registered(reading, None)
-            if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(left):
+            if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(residual):
                 agree = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)
@@ -418,15 +424,15 @@ class _Search:
         if self._readings.beside_noise(chosen.best_left) > FITS:
             return
         is_position = VELOCITY_TYPES[reference.msgtype].position is not None
-        own = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
-        too_little = not is_position and own > CLAIMS_TOO_LITTLE * reference.claimed_std
+        measured_std = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
+        too_little = not is_position and measured_std > CLAIMS_TOO_LITTLE * reference.claimed_std
         # part of it is due to lever arm and delay, which are estimated later
         least = 0.5 * chosen.best_left
         per_axis = dvl.speed / (math.sqrt(3.0) * TRIMMED)
         claims = [reference.claimed_std] if is_position else [reference.claimed_std, dvl.claimed_std]
         claimed = math.hypot(*np.nan_to_num(claims))  # both are part of the predicted residual
         most = claimed / (CLAIMS_TOO_MUCH if is_position else CLAIMS_FAR_TOO_MUCH)
-        may_claim_less = is_position or says_nothing or own > NOISIER * math.sqrt(white_noise(dvl.values))
+        may_claim_less = is_position or says_nothing or measured_std > NOISIER * math.sqrt(white_noise(dvl.values))
         claims_none = math.isnan(reference.claimed_std)
         if not (
             too_little or claims_none or says_nothing or (may_claim_less and most > max(least * per_axis, QUIETEST))
@@ -448,13 +454,14 @@ class _Search:
         )
 
     def _use_imu(self, frame: ImuFrame) -> None:
+        """Set the IMU's orientation and world frame as chosen, unless given or default."""
         if self._is_given("imu_rpy") or self._is_given("imu_frame"):
             return
         rpy = tuple((rpy_from_rotation(frame.rotation_body_from_imu) + 0.0).tolist())
         if np.allclose(rpy, 0.0, atol=1e-9) and frame.world == "enu":
             return
         self._values |= {"imu_rpy": rpy, "imu_frame": frame.world}
-        self._found.append(f"the IMU's data are taken {frame.says}: imu_rpy {in_degrees(rpy)}, imu_frame {frame.world}")
+        self._found.append(f"the IMU's data are used {frame.says}: imu_rpy {in_degrees(rpy)}, imu_frame {frame.world}")
 
     def _mounting_found(self, rpy: tuple[float, float, float], why: str) -> None:
         if not any(rpy):
@@ -481,10 +488,10 @@ class _Search:
             ahead_in_body = known @ mean
             if abs(ahead_in_body[1]) > abs(ahead_in_body[0]) and not self._is_given("mounting_rpy"):
                 given, fits = in_degrees(rpy_from_rotation(known)), nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
-                said = {"given": given, "found": in_degrees(fits), "option": as_option(fits)}
-                self._contradictions.append(finding("TRAVELS_SIDEWAYS", **said))
+                fields = {"given": given, "found": in_degrees(fits), "option": as_option(fits)}
+                self._contradictions.append(finding("TRAVELS_SIDEWAYS", **fields))
         elif abs(yaw) > OTHER_MOUNTING:
-            self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "where the vehicle goes ahead")
+            self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 
     def _reference_position(self, reference: Look) -> Array:
         """Return the position in the body of the point whose velocity the reference measures."""
@@ -492,17 +499,18 @@ class _Search:
         return np.zeros(3) if placed is None else placed.position
 
     def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
+        """Set the lever arm by the transforms, from the reference's position; note the source."""
         given_mounting = self._is_given("mounting_rpy")
-        said = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]
+        parts = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]
         if placed.is_located and not self._is_given("lever_arm"):
             position = placed.position
             if reference is not None:
                 position = position - self._reference_position(reference)
             if np.abs(position).max() <= 100.0:  # the parameter's range; a larger value is a transform in another unit
                 self._values["lever_arm"] = tuple((position + 0.0).tolist())
-                said.append(f"lever arm {in_metres(position)} m")
-        if said:
-            self._found.append(f"{', '.join(said)}: {placed.frame} in {placed.base}, from {placed.source}")
+                parts.append(f"lever arm {in_metres(position)} m")
+        if parts:
+            self._found.append(f"{', '.join(parts)}: {placed.frame} in {placed.base}, from {placed.source}")
 
 
 def _is_located(placed: Placed | None) -> bool:

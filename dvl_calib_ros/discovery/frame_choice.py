@@ -160,6 +160,7 @@ class FrameChooser:
         return self._parameters.is_z_down or self._base_frame.lower().endswith(("_frd", "_ned"))
 
     def _imu_hypotheses(self) -> list[ImuHypothesis]:
+        """Return the possible frames of the IMU, each with a penalty for being unusual or contradicting gravity."""
         imu, placed = self._imu, self._imu_placed
         if imu is None:
             return []
@@ -168,21 +169,21 @@ class FrameChooser:
             frame = ImuFrame(rotation, self._parameters.imu_frame, "as given")
             return [ImuHypothesis(frame, self._parameters.is_z_down, 0.0)]
         at = np.eye(3) if placed is None else placed.rotation
-        says = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
+        text = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
         frames = [
-            (ImuFrame(at, IMU_ENU, says), 0.0),
+            (ImuFrame(at, IMU_ENU, text), 0.0),
             (
-                ImuFrame(at @ FLU_FROM_FRD, IMU_NED, f"forward-right-down in NED, {says}"),
+                ImuFrame(at @ FLU_FROM_FRD, IMU_NED, f"forward-right-down in NED, {text}"),
                 UNPLACED_IN_NED if placed is None else IMU_IN_NED,
             ),
-            (ImuFrame(at, IMU_NED, f"in NED, {says}"), IMU_IN_OTHER_WORLD),
-            (ImuFrame(at, NWU, f"with a heading that counts from north, {says}"), IMU_OTHERWISE),
+            (ImuFrame(at, IMU_NED, f"in NED, {text}"), IMU_IN_OTHER_WORLD),
+            (ImuFrame(at, NWU, f"with a heading that counts from north, {text}"), IMU_OTHERWISE),
         ]
         if not np.allclose(at, np.eye(3)):
-            said = "as the body, whatever its transform says"
-            frames.append((ImuFrame(np.eye(3), IMU_ENU, said), IMU_IN_OTHER_WORLD))
+            note = "as the body, despite its transform"
+            frames.append((ImuFrame(np.eye(3), IMU_ENU, note), IMU_IN_OTHER_WORLD))
         if self._gravity is not None:
-            frames.append((ImuFrame(at @ FLU_FROM_FRD, IMU_ENU, f"turned over, {says}"), IMU_OTHERWISE))
+            frames.append((ImuFrame(at @ FLU_FROM_FRD, IMU_ENU, f"turned over, {text}"), IMU_OTHERWISE))
         found = []
         for frame, prior in frames:
             z_down = self._body_is_z_down(frame)
@@ -276,12 +277,12 @@ class FrameChooser:
             z_down = self._says_z_down if imu is None else imu.z_down
             declared = self.dvl_is_turned(z_down)
             for name, prior in self._reference_priors(reference, imu).items():
-                for turned in {declared} if self._dvl_axes_are_said else {declared, not declared}:
-                    reading = Reading(name, None if imu is None else imu.frame, turned)
+                for is_turned in {declared} if self._dvl_axes_are_said else {declared, not declared}:
+                    reading = Reading(name, None if imu is None else imu.frame, is_turned)
                     imus[reading] = imu
                     priors[reading] = prior + (0.0 if imu is None else imu.prior)
                     as_declared[reading] = declared
-                    if turned != declared:
+                    if is_turned != declared:
                         priors[reading] += DVL_AXES_OTHER
         found = readings.agreements(list(priors), mounting)
         declared_frame = declared_reference(reference, self._parameters, self._base_frame)
@@ -301,18 +302,18 @@ class FrameChooser:
             for each in tried
         }
         ranked = sorted(tried, key=lambda each: -first[each])
-        says: tuple[Reason, ...] = ()
+        reasons: tuple[Reason, ...] = ()
         if in_earth:
             first_best = ranked[0].agreement
             if first_best.reading.in_body and not readings.is_in_body(first_best):
-                says = (finding("BODY_OR_EARTH"),)
+                reasons = (finding("BODY_OR_EARTH"),)
                 ranked = [each for each in ranked if not each.reading.in_body] or ranked
         likely = [each for each in ranked if first[each] > first[ranked[0]] - FAR_WORSE][:MOST_REGISTERED]
         expected = max(ranked, key=lambda each: each.prior)
         if expected not in likely:
             likely.append(expected)
         if likely == [expected] and expected.mounting is mounting:
-            return FrameChoice(expected.agreement, imus[expected.reading], says)
+            return FrameChoice(expected.agreement, imus[expected.reading], reasons)
         fits = {each: readings.registered(each.reading, each.mounting) for each in likely}
         odds = {
             each: each.odds(fit.rotation_dvl_from_body)
@@ -335,13 +336,13 @@ class FrameChooser:
                     " and ".join(f"{name} {this[name]}" for name in this if one[name] != other[name]) or "the mounting"
                     for this in (one, other)
                 )
-                says += (finding("FRAMES_AMBIGUOUS", taken=taken, other=instead),)
+                reasons += (finding("FRAMES_AMBIGUOUS", taken=taken, other=instead),)
                 break
         if mounting is not None and best.mounting is None:
             given, fitting = in_degrees(rpy_from_rotation(mounting.T)), nominal_rpy(fits[best].rotation_dvl_from_body.T)
-            said = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting)}
-            says += (finding("MOUNTING_CONTRADICTED", **said),)
-        return FrameChoice(best.agreement, imus[best.reading], says)
+            fields = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting)}
+            reasons += (finding("MOUNTING_CONTRADICTED", **fields),)
+        return FrameChoice(best.agreement, imus[best.reading], reasons)
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
         """Return a reading as values of parameters."""

@@ -66,21 +66,21 @@ def is_derived(look: Look) -> bool:
 def checked_topic(option: str, name: str, kinds: Sequence[str], survey: Survey, where: str) -> str:
     """Return a named topic as spelled in the recording. Raises InputError if it is missing or of another type."""
     present = survey.topics
-    there = spelled(name, present)
+    spelled_topic = spelled(name, present)
     wanted = set(kinds)
-    if there is not None and present[there] not in wanted:
+    if spelled_topic is not None and present[spelled_topic] not in wanted:
         expected = " or ".join(kinds)
         fields = f"; set {option}"
-        if option == "--dvl-topic" and there in survey.field_maps:
-            fields = f"; read it with --dvl-fields {survey.field_maps[there]}"
-        raise InputError(f"{where}: topic {there} holds {present[there]}, expected {expected}{fields}")
-    if there is None:
+        if option == "--dvl-topic" and spelled_topic in survey.field_maps:
+            fields = f"; read it with --dvl-fields {survey.field_maps[spelled_topic]}"
+        raise InputError(f"{where}: topic {spelled_topic} holds {present[spelled_topic]}, expected {expected}{fields}")
+    if spelled_topic is None:
         fitting = sorted(topic for topic, kind in present.items() if kind in wanted)
         near = difflib.get_close_matches(name, fitting, n=1, cutoff=0.5)
         hint = f"; did you mean {near[0]}?" if near else f"; set {option}."
         listing = ", ".join(fitting) or "none"
         raise InputError(f"{where}: no topic {name!r}{hint} Of types that fit, the bag has: {listing}")
-    return there
+    return spelled_topic
 
 
 def choose_dvl(survey: Survey, default: str, where: str) -> str:
@@ -135,34 +135,34 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
         return standard, []
     dvl_look = survey.looks.get(dvl)
     ranked: list[tuple[tuple[float, ...], Look]] = []
-    said: list[Reason] = []
+    reasons: list[Reason] = []
     for look in survey.looks.values():
         if look.topic == dvl or look.msgtype not in REFERENCE_TYPES or _has(look, COMMAND_WORDS):
             continue
         if look.msgtype in POSE_TYPES and not _has(look, (*ACOUSTIC_WORDS, *TRUTH_WORDS)):
             continue
         if look.speed < MOVES_FROM:
-            said.append(finding("TOPIC_DOES_NOT_MOVE", topic=look.topic))
+            reasons.append(finding("TOPIC_DOES_NOT_MOVE", topic=look.topic))
             continue
         share = None if dvl_look is None else difference(dvl_look, look)
         if _has(look, DVL_WORDS) or (share is not None and share < SAME_SHARE):
             if dvl_look is None or not is_another_dvl(look, dvl_look) or (share is not None and share < SAME_SHARE):
-                said.append(finding("TOPIC_FROM_DVL", topic=look.topic))
+                reasons.append(finding("TOPIC_FROM_DVL", topic=look.topic))
             continue
         if is_derived(look):
-            said.append(finding("TOPIC_DERIVED", topic=look.topic))
+            reasons.append(finding("TOPIC_DERIVED", topic=look.topic))
             continue
         kind = next((i for i, words in enumerate((GNSS_WORDS, TRUTH_WORDS, INS_WORDS)) if _has(look, words)), 3)
         fits = 0.0 if share is None or share < 0.5 else 1.0
         ranked.append(((fits, kind, _rank(look), -look.rate_hz), look))
     if not ranked:
-        return None, said
+        return None, reasons
     ranked.sort(key=lambda each: (each[0], each[1].topic))
     chosen = ranked[0][1]
     others = [look.topic for _, look in ranked[1:]]
     if others:
-        said.append(finding("SEVERAL_REFERENCES", topic=chosen.topic, others=", ".join(others)))
-    return chosen.topic, said
+        reasons.append(finding("SEVERAL_REFERENCES", topic=chosen.topic, others=", ".join(others)))
+    return chosen.topic, reasons
 
 
 def _rank(look: Look) -> float:

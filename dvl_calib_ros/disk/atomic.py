@@ -136,21 +136,18 @@ def backups_of(path: Path) -> list[Path]:
 
 
 def own_stream(path: Path) -> int | None:
-    """Return the file descriptor of this process that a path names (/dev/stdout, /dev/fd/3), else None.
-
-    /dev/null gives -1.
-    """
-    here = os.path.abspath(path)
+    """Return the descriptor of this process that a path names (/dev/fd/3), -1 for /dev/null, else None."""
+    target = os.path.abspath(path)
     for _ in range(40):  # the kernel follows at most 40 links
-        folder, name = os.path.split(here)
+        folder, name = os.path.split(target)
         folder = os.path.realpath(folder)
         if re.fullmatch(rf"/proc/{os.getpid()}(/task/\d+)?/fd", folder) and name.isdigit():
             return int(name)
-        here = os.path.join(folder, name)
-        if not os.path.islink(here):
+        target = os.path.join(folder, name)
+        if not os.path.islink(target):
             break
-        here = os.path.join(folder, os.readlink(here))
-    return -1 if here == os.devnull else None
+        target = os.path.join(folder, os.readlink(target))
+    return -1 if target == os.devnull else None
 
 
 def _error_text(error: OSError | ValueError) -> str:
@@ -247,9 +244,9 @@ def _temporary_file(target: Path, content: bytes) -> Iterator[str]:
 
 
 def _write(handle: int, content: bytes) -> None:
-    left = memoryview(content)
-    while left:
-        left = left[os.write(handle, left) :]
+    remaining = memoryview(content)
+    while remaining:
+        remaining = remaining[os.write(handle, remaining) :]
 
 
 @contextmanager

@@ -245,8 +245,8 @@ class EffectWithMemory(Effect):
 
         velocity: (N, 3) m/s, body frame, or several (N, 3, p).
         """
-        left: Array = velocity - self.filtered(motion, velocity, values)
-        return left - self.of_before(motion, left, values)
+        residual: Array = velocity - self.filtered(motion, velocity, values)
+        return residual - self.of_before(motion, residual, values)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return the filter's addition to the motion's own velocity."""
@@ -295,8 +295,5 @@ class NoiseEffect(AnyEffect, ABC):
         """Return the samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, with the effect."""
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
-        """Return a function for successive batches of samples, each a continuation of the previous ones.
-
-        Raises InputError if that is impossible.
-        """
+        """Return a function for batches of samples that continue each other. Raises InputError if impossible."""
         raise InputError(f"effect {self.name}: cannot be made sample by sample; simulate a recorded motion instead")

@@ -184,8 +184,8 @@ class ReferenceLag(EffectWithMemory):
 
 def _decaying_part(time: Array, values: Array, time_constant: float) -> Array:
     """Return the part of values (N, ...) at times (N,) s that decays from the first with a time constant, s."""
-    left = np.exp((time[0] - time) / time_constant)
-    return np.multiply.outer(left, np.tensordot(left, values, axes=1) / (left @ left))
+    decay = np.exp((time[0] - time) / time_constant)
+    return np.multiply.outer(decay, np.tensordot(decay, values, axes=1) / (decay @ decay))
 
 
 def delayed(time: Array, values: Array, delay: float | Array) -> Array:

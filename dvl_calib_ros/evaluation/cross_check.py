@@ -148,8 +148,8 @@ def cross_check(
 
 def _with_own_delay(terms: Terms, verified: _Replayed) -> Terms:
     """Replace the delay by the verifying bag's, because clocks are synchronised anew in each recording."""
-    own = next(iter(verified.delayed.values()), None)
-    return terms if own is None else terms._replace(time_offset=own.time_offset)
+    delayed = next(iter(verified.delayed.values()), None)
+    return terms if delayed is None else terms._replace(time_offset=delayed.time_offset)
 
 
 def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> float:
@@ -190,6 +190,7 @@ def _replay_or_nothing(parameters: Parameters, models: Sequence[str], given: Giv
 
 
 def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
+    """Replay one bag and collect its corrections and the moments of its paired velocities."""
     opened = open_recording([bag], None, named)
     discovery = discover(opened, named, given)
     topics, parameters = discovery.topics, discovery.parameters

@@ -141,8 +141,8 @@ def _estimate_by_variant(
     x = np.full((len(ends), n_variants, n_state), np.nan)
     p = np.full((len(ends), n_variants, n_state, n_state), np.nan)
     for index in range(n_variants):
-        own = slice(index, index + 1)
-        one = replace(data, velocity_dvl=data.velocity_dvl[own], reference=data.reference[own])
+        one_variant = slice(index, index + 1)
+        one = replace(data, velocity_dvl=data.velocity_dvl[one_variant], reference=data.reference[one_variant])
         try:
             state = _estimate([name], one, parameters, ends)[name]
         except Exception as error:
@@ -170,6 +170,7 @@ def _estimate(
 def _estimate_one(
     model: Model, seen: Observations, variants: AlignedVariants, parameters: Parameters, ends: Sequence[int]
 ) -> GaussianState:
+    """Return a model's estimates for all variants at the ends of their data."""
     assembler = Assembler([model], parameters)
     if model.uses_height:
         seen = replace(seen, height=_heights(seen, variants, variants.has[model.needs]))
@@ -188,8 +189,8 @@ def _heights(seen: Observations, variants: AlignedVariants, given: Mask) -> Arra
     """Return `Observations.height` of all rows (B N,), from those that models receive (B, N)."""
     heights = np.zeros(given.shape)
     columns = (each.reshape(given.shape) for each in (variants.rows.stamps_ns, seen.rising))
-    for own, at, stamps_ns, rising in zip(heights, given, *columns, strict=True):
-        own[at] = RelativeHeight().add(stamps_ns[at], rising[at])
+    for height, at, stamps_ns, rising in zip(heights, given, *columns, strict=True):
+        height[at] = RelativeHeight().add(stamps_ns[at], rising[at])
     return heights.ravel()
 
 
@@ -208,10 +209,10 @@ def heave_joined(
     filter used and received.
     """
     sums = []
-    for at, stamps, own, use in zip(given, stamps_ns, rows, used, strict=True):
+    for at, stamps, row, use in zip(given, stamps_ns, rows, used, strict=True):
         number = np.concatenate([[0], np.cumsum(at)])  # number of received samples before each
         taken = HeaveRows(1, rows.shape[-1] - 1, parameters)
-        found = taken.add(stamps[at], own[at], use[at], [int(number[end]) for end in ends])
+        found = taken.add(stamps[at], row[at], use[at], [int(number[end]) for end in ends])
         sums.append(HeaveSums.stacked(found))
     of_all = HeaveSums(*(np.stack(each, axis=1)[:, :, 0] for each in zip(*sums, strict=True)))
     return with_heave(after, of_all, parameters.motion_std)[0]

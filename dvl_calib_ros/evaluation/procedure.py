@@ -34,10 +34,7 @@ NOISE_STUDY_SMALLEST_STD = 0.01
 
 @dataclass(frozen=True)
 class Procedure:
-    """Configuration of a run.
-
-    models: names. runs: trajectories by name. studies: False for the published procedure only.
-    """
+    """Configuration of a run. runs: trajectories by name. studies: False for the published procedure only."""
 
     runs: Mapping[str, Trajectory]
     models: tuple[str, ...]
@@ -272,8 +269,8 @@ def _legs(run: Trajectory) -> list[tuple[str, int, int]]:
     start = 0
     while start + LEG_SAMPLES <= len(heading):
         stretch = heading[start:]
-        turned = np.maximum.accumulate(stretch) - np.minimum.accumulate(stretch) > LEG_HEADING_RANGE
-        length = int(np.argmax(turned)) if turned.any() else len(stretch)
+        has_turned = np.maximum.accumulate(stretch) - np.minimum.accumulate(stretch) > LEG_HEADING_RANGE
+        length = int(np.argmax(has_turned)) if has_turned.any() else len(stretch)
         if length >= LEG_SAMPLES:
             legs.append((run.name, start, start + length))
             start += length

@@ -217,9 +217,9 @@ def _with_attitude(run: Trajectory, path: Path) -> Trajectory:
     if wide.any():
         raise InputError(f"{path}: row {int(np.argmax(wide)) + 1} holds no roll, pitch, yaw in rad; convert the file")
     common = min(len(time), len(run.time))
-    apart = np.abs(time[:common] - run.time[:common]) > 1e-6
-    if apart.any() or len(time) != len(run.time):
-        row = int(np.argmax(apart)) if apart.any() else common
+    differs = np.abs(time[:common] - run.time[:common]) > 1e-6
+    if differs.any() or len(time) != len(run.time):
+        row = int(np.argmax(differs)) if differs.any() else common
         raise InputError(f"{path}: row {row + 1}: its time differs from {run.name}_dvl.csv; resample it")
     rotation = attitude_enu_flu_from_ned_frd(rpy)
     return Trajectory(run.name, run.time, run.velocity, rotation, angular_velocities(time, rotation))

@@ -76,8 +76,8 @@ class Failure:
     @staticmethod
     def of(error: Exception, what: str, run: str = "", combination: int | None = None) -> Failure:
         """Build from an exception."""
-        said = " ".join(str(error).split())
-        return Failure(what, run, combination, f"{type(error).__name__}: {said}" if said else type(error).__name__)
+        text = " ".join(str(error).split())
+        return Failure(what, run, combination, f"{type(error).__name__}: {text}" if text else type(error).__name__)
 
     def __str__(self) -> str:
         parts = [self.what, self.run]

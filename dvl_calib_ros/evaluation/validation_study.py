@@ -187,6 +187,7 @@ def _each_study(
 
 
 def _errors_in_variables(procedure: Procedure, outcomes: Sequence[SeedOutcome]) -> ErrorsInVariables | None:
+    """Return predicted and measured pull of the scale by reference noise; None without models for it."""
     models = models_in_noise_study(procedure.models)
     if not models:
         return None
@@ -303,6 +304,7 @@ def _calibrate(data: SensorData, end: int, procedure: Procedure, failures: list[
 
 
 def _summary(set_name: str, model: str, found: Sequence[Verification]) -> HeldOut:
+    """Summarize a model's verifications over the runs of a set: most frequent verdict, rms errors."""
     verdicts = Counter(each.verdict.value for each in found)
     errors = [each.held_out for each in found if each.held_out is not None]
 

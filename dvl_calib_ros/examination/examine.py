@@ -147,10 +147,10 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     discovery = discover(recording, parameters, given)
     topics = discovery.topics
     wanted = {"dvl": topics.dvl, "reference": topics.gnss, "imu": topics.imu}
-    there = {role: name for role, name in wanted.items() if name in recording.types}
-    looks = {role: recording.survey.looks.get(name) for role, name in there.items()}
+    present = {role: name for role, name in wanted.items() if name in recording.types}
+    looks = {role: recording.survey.looks.get(name) for role, name in present.items()}
     start_ns, end_ns = recording.span_ns
-    streams = {role: recording.recorded(name, discovery.parameters) for role, name in there.items()}
+    streams = {role: recording.recorded(name, discovery.parameters) for role, name in present.items()}
     recorded_s = 1e-9 * (end_ns - start_ns)
     seconds = {role: recorded_s * (1.0 if look is None else look.clock_rate) for role, look in looks.items()}
     velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
@@ -222,12 +222,13 @@ def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> 
     """Return the DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
     values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
     values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]
-    turned = turns_dvl(VELOCITY_TYPES[dvl.msgtype], "" if look is None else look.frame_id, parameters)
-    own = values @ FLU_FROM_FRD if turned else values
-    return own @ rotation_from_rpy(parameters.mounting_rpy).T
+    is_turned = turns_dvl(VELOCITY_TYPES[dvl.msgtype], "" if look is None else look.frame_id, parameters)
+    dvl_velocity = values @ FLU_FROM_FRD if is_turned else values
+    return dvl_velocity @ rotation_from_rpy(parameters.mounting_rpy).T
 
 
 def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Array) -> list[Reason]:
+    """Return all problems of the streams, errors first; consequences of a reported problem are left out."""
     dvl, reference, imu = streams["dvl"], streams.get("reference"), streams.get("imu")
     over_legs = reference is not None and _is_compared_over_legs(reference)
     found: list[Reason] = []
@@ -253,7 +254,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         found += topic_checks.orientation_findings(imu)
     if imu is None:
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
-        what = "no lever arm is taken out or found" if reference is not None else "nothing tells the heading"
+        what = "no lever arm is corrected or estimated" if reference is not None else "nothing tells the heading"
         found.append(finding("DOCTOR_NO_IMU", what=what) if in_body else finding("DOCTOR_NO_IMU_EARTH"))
     told_by_log = any(each.code == "DOCTOR_CLOCKS" for each in found)  # the clock and its offset are already reported
     without = None if discovery.clocks is None else discovery.clocks.doubt  # this doubt prevents every calibration

@@ -134,8 +134,8 @@ def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> li
             "side": "after" if each.ahead > 0.0 else "before",
         }
         topic, other = topics[each.stream.value].topic, topics[each.other.value].topic
-        here = f"-p {name}:={late:.2f}" if can_be_taken_off else f"--restamp {topic}"
-        found.append(finding("DOCTOR_CLOCKS", topic=topic, other=other, here=here, **fields))
+        remedy = f"-p {name}:={late:.2f}" if can_be_taken_off else f"--restamp {topic}"
+        found.append(finding("DOCTOR_CLOCKS", topic=topic, other=other, here=remedy, **fields))
     return found
 
 

@@ -68,15 +68,15 @@ def write_calibration(
     if targets.paths:
         calibrated.check_applicable(force)
     contents, notes = _contents(calibrated, targets, force)
-    there = [path for path in contents if own_stream(path) is None and path.exists()]
-    new = {path: content for path, content in contents.items() if path not in there or path.read_bytes() != content}
+    existing = [path for path in contents if own_stream(path) is None and path.exists()]
+    new = {path: content for path, content in contents.items() if path not in existing or path.read_bytes() != content}
     unchanged = tuple(path for path in contents if path not in new)
     if dry_run:
-        before = {path: path.read_bytes() if path in there else b"" for path in new}
+        before = {path: path.read_bytes() if path in existing else b"" for path in new}
         changes = "".join(_difference(path, before[path], content) for path, content in new.items())
         return Applied(tuple(new), unchanged, {}, tuple(notes), changes)
     save_all(new)  # a new URDF with old parameters would apply the rotation twice or not at all
-    kept = {path: backup_of(path) for path in new if path in there}
+    kept = {path: backup_of(path) for path in new if path in existing}
     return Applied(tuple(new), unchanged, kept, tuple(notes))
 
 
@@ -87,6 +87,7 @@ def _difference(path: Path, before: bytes, after: bytes) -> str:
 
 
 def _contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> tuple[dict[Path, bytes], list[str]]:
+    """Return new contents by file, and notes."""
     contents: dict[Path, bytes] = {}
     notes = []
     if targets.urdf is not None:

@@ -135,8 +135,8 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         parameters = Parameters.from_mapping(content["parameters"])
         saved = rotation_from_rpy(np.array(content["mounting"]["corrected_rpy"], dtype=float).reshape(3))
         frames = (str(content["mounting"]["frame_id"]), str(content["mounting"]["child_frame_id"]))
-        turned = content["mounting"].get("dvl_data_axes") == FRD
-        told = {
+        is_turned = content["mounting"].get("dvl_data_axes") == FRD
+        in_result = {
             name: np.array(content["mounting"][name], dtype=float).reshape(3)
             for name in ("lever_arm", "position")
             if content["mounting"].get(name) is not None
@@ -154,7 +154,9 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     rotation = corrected_mounting(errors[:3], parameters.rotation_dvl_from_body)
     arm, position = lever_arm(model, state, parameters.lever_arm), position_in_body(model, state, parameters)
     at_hand = {"lever_arm": arm, "position": position}
-    agree = all(np.allclose(told[name], at_hand[name] or told[name], rtol=0.0, atol=1e-6) for name in told)
+    agree = all(
+        np.allclose(in_result[name], at_hand[name] or in_result[name], rtol=0.0, atol=1e-6) for name in in_result
+    )
     if not (angle_between(rotation, saved) < 1e-6 and agree):
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
     if parameters.dvl_frame not in ("", frames[1]):
@@ -168,8 +170,8 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         of_recording = load_result(path, of_recording=True)[1][model.name]
         of_scale = cause_of_scale(model, of_recording, parameters, water)
     return CalibratedMounting(
-        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, turned, arm, delay, position, water,
-        of_scale,
+        path, model, parameters, *frames, rotation, errors[3:], objections, doubts, is_turned, arm, delay, position,
+        water, of_scale,
     )  # fmt: skip
 
 
@@ -184,7 +186,7 @@ def _objections_and_doubts(
     """Return objections and doubts from the verdict and the convergence in a result file."""
     objections, doubts = [], []
     if convergence is Convergence.COLLECTING:
-        objections.append("its data show no angle and no scale yet (collecting)")
+        objections.append("no angle and no scale is observable in its data yet (collecting)")
     elif convergence is Convergence.COARSE:
         doubts.append(
             "its convergence is coarse: standard deviations are above fine_std_misalignment or fine_std_scale"
@@ -207,7 +209,7 @@ def _saved_warnings(content: Mapping[str, Any], *severities: Severity) -> tuple[
 def _unobservable(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
     entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
     return tuple(
-        f"{each.name} ({each.axis}) was not shown by the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
+        f"{each.name} ({each.axis}) was not observable in the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
         for each in entries
     )
 
@@ -263,20 +265,20 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
     """
     values = calibrated.compensating
     if not path.exists():
-        own = calibrated.parameters.replace(result_file="", initial_calibration="")
-        return new_file(own, values, _origin(calibrated))
-    there, default = load_parameters(path), Parameters()
-    if there.initial_calibration:
+        parameters = calibrated.parameters.replace(result_file="", initial_calibration="")
+        return new_file(parameters, values, _origin(calibrated))
+    in_file, default = load_parameters(path), Parameters()
+    if in_file.initial_calibration:
         raise InputError(
-            f"{path}: sets initial_calibration, whose angles are relative to the mounting before; take it out first"
+            f"{path}: sets initial_calibration, whose angles are relative to the previous mounting; remove it first"
         )
     for name, value in values.items():
-        now, begun_with = getattr(there, name), getattr(calibrated.parameters, name)
+        now, begun_with = getattr(in_file, name), getattr(calibrated.parameters, name)
         known = [np.array(each) for each in (getattr(default, name), begun_with, value)]
         within = SAME_POSITION if name == "lever_arm" else SAME_MOUNTING
         if not any(np.allclose(now, each, rtol=0.0, atol=within) for each in known) and not force:
             raise InputError(
-                f"{path}: sets {name} to {as_yaml(there.as_dict()[name])}, but {calibrated.path} began with "
+                f"{path}: sets {name} to {as_yaml(in_file.as_dict()[name])}, but {calibrated.path} began with "
                 f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's, or write the calibrated "
                 "one all the same with --force"
             )
@@ -307,12 +309,12 @@ def launch_file(calibrated: CalibratedMounting) -> str:
     for frame in (calibrated.base_frame, calibrated.dvl_frame):
         if "$" in frame:
             raise InputError(
-                f"{calibrated.path}: the frame {frame!r} cannot be named in a launch file, which would run what "
-                "stands behind a $; name it otherwise in the driver, or run static_transform_publisher yourself"
+                f"{calibrated.path}: the frame {frame!r} cannot be used in a launch file, which would evaluate "
+                "text after a $; rename it in the driver, or run static_transform_publisher yourself"
             )
     arguments = quoteattr(calibrated.static_transform)
     return f"""<launch>
-  <!-- {_origin(calibrated)}. A transform holds no scale. Not beside a robot_state_publisher with the same joint. -->
+  <!-- {_origin(calibrated)}. A transform has no scale. Do not add a robot_state_publisher with this joint. -->
   <node pkg="tf2_ros" exec="static_transform_publisher" name="dvl_mounting" args={arguments}/>
 </launch>
 """
@@ -326,10 +328,10 @@ def _origin(calibrated: CalibratedMounting) -> str:
 def scale_advice(calibrated: CalibratedMounting) -> str:
     """Return a sentence on the scale error, which a transform cannot correct, and its remedy."""
     if not calibrated.model.scale_axes:
-        return f"{calibrated.model.name} estimates no scale: a scale error of the DVL stays in"
+        return f"{calibrated.model.name} estimates no scale: a scale error of the DVL remains"
     error = calibrated.scale_ahead
     return (
-        f"a transform holds no scale: {100.0 * error:+.2f} % ahead stays in ({abs(1000.0 * error):.1f} m per km). Use "
+        f"a transform has no scale: {100.0 * error:+.2f} % ahead stays in ({abs(1000.0 * error):.1f} m per km). Use "
         "~/calibrated_twist, which is corrected in both, or multiply the driver's speed of sound by "
         f"{calibrated.speed_of_sound_factor:.5f} (not with a phased array, which measures ahead without it)"
     )
@@ -339,7 +341,7 @@ def fusion_file(calibrated: CalibratedMounting) -> str:
     """Return one ROS 2 parameter file for robot_localization and for our node."""
     base, dvl, name = printable(calibrated.base_frame), printable(calibrated.dvl_frame), calibrated.model.name
     used = [index in (6, 7, 8) for index in range(15)]  # x y z, roll pitch yaw, vx vy vz, their rates, accelerations
-    own = {
+    settings = {
         **{key: value for key, value in changed_parameters(calibrated.parameters).items() if key != "result_file"},
         "model": name,
         "initial_calibration": str(calibrated.path.resolve()),
@@ -361,7 +363,7 @@ def fusion_file(calibrated: CalibratedMounting) -> str:
             "    twist0_queue_size: 10",
             f"{NODE_NAME}:",
             "  ros__parameters:",
-            *(f"    {key}: {as_yaml(value)}" for key, value in own.items()),
+            *(f"    {key}: {as_yaml(value)}" for key, value in settings.items()),
             *_comment(
                 f"B. The driver's own topic (a TwistWithCovarianceStamped), in frame {dvl}, rotated by TF (URDF or "
                 "static transform, calibrated), which has the lever arm, too. Our node does not run. Corrected in "
@@ -397,7 +399,7 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     if not used:
-        raise InputError(f"{path}: {model.name} used no sample, so it says nothing of the mounting; leave it out")
+        raise InputError(f"{path}: {model.name} used no sample, so it has no mounting; leave it out")
     remarks = list(calibrated.objections)
     if initial := calibrated.parameters.initial_calibration:
         remarks.append(

@@ -132,20 +132,21 @@ def names_of_others(path: Path, node: str) -> set[str]:
 def _own_sections(
     path: Path, node: str, is_own: Callable[[str], bool], text: str | None = None
 ) -> list[tuple[str, dict[str, Any]]]:
+    """Return the parameters that apply to the node, by section. Raises InputError if there are none."""
     content = load_yaml(path, "ROS 2 parameter file", text)
     if not isinstance(content, dict):
         raise InputError(f"{path}: no ROS 2 parameter file; it begins with '/**:', then 'ros__parameters:'")
     sections = [found for key, section in content.items() for found in _sections(str(key), section)]
-    own = [(name, body) for name, body in sections if is_own(name)]
-    for name, body in own:
+    own_sections = [(name, body) for name, body in sections if is_own(name)]
+    for name, body in own_sections:
         if not isinstance(body, dict):
             raise InputError(f"{path}: ros__parameters of {name} is not a list of name: value")
     if not sections:
         raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
-    if not own:  # ROS would silently use the defaults
+    if not own_sections:  # ROS would silently use the defaults
         others = ", ".join(name for name, _ in sections)
         raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; use '/**:' or the name")
-    return [(name, _flat(body)) for name, body in own]
+    return [(name, _flat(body)) for name, body in own_sections]
 
 
 def _names_for_all_nodes(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> set[str]:
@@ -273,9 +274,9 @@ def with_parameters(path: Path, values: Mapping[str, Any]) -> bytes:
     content = path.read_bytes()
     text = content.decode("utf-8")
     sections = list(_own_mappings(compose_yaml(text), ""))
-    there = [(key.value, node) for section in sections for key, node in section.value]
-    changes = [(*_span(node), as_yaml(values[name])) for name, node in there if name in values]
-    new = {name: as_yaml(value) for name, value in values.items() if name not in dict(there)}
+    existing = [(key.value, node) for section in sections for key, node in section.value]
+    changes = [(*_span(node), as_yaml(values[name])) for name, node in existing if name in values]
+    new = {name: as_yaml(value) for name, value in values.items() if name not in dict(existing)}
     if new:
         changes.append(_insertion(text, sections[-1], new))
     for start, end, value in sorted(changes, reverse=True):

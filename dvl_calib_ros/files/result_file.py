@@ -91,7 +91,7 @@ def result_document(
     model, state = MODELS[estimate.model], GaussianState(estimate.state, estimate.covariance)
     checked = Parameters.from_mapping(parameters)
     position = position_in_body(model, state, checked)
-    beside = scale_and_delay(model, state, checked)
+    scale_delay = scale_and_delay(model, state, checked)
     arguments = None if position is None else static_transform_arguments(position, of_frame, parent, child)
     return {
         "format": FORMAT,
@@ -115,10 +115,10 @@ def result_document(
             "scale_error_xyz": estimate.scale.tolist(),
             "lever_arm": estimate.lever_arm(parameters["lever_arm"]).tolist(),
             "position": None if position is None else list(position),
-            "scale_error_ahead": beside.scale,
-            "scale_error_ahead_std": beside.scale_std,
-            "dvl_time_offset": beside.time_offset,
-            "dvl_time_offset_std": beside.time_offset_std,
+            "scale_error_ahead": scale_delay.scale,
+            "scale_error_ahead_std": scale_delay.scale_std,
+            "dvl_time_offset": scale_delay.time_offset,
+            "dvl_time_offset_std": scale_delay.time_offset_std,
             "pose_covariance": mounting_pose(model, state, checked, turned).covariance.tolist(),
         },
         **({} if verification is None else {"verification": verification_document(verification)}),
@@ -160,7 +160,7 @@ def days_document(result: Result) -> dict[str, Any]:
 
 def _in_words(found: Quantity) -> str:
     unit = found.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
-    return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not shown by this data)")
+    return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not observable in this data)")
 
 
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
@@ -232,10 +232,10 @@ def save_unless_worse(path: Path, document: Mapping[str, Any], n_backups: int = 
     better = _better(path, document) if document["used"] and own_stream(path) is None else None
     if better is None:
         return save_result(path, document, n_backups)
-    beside = path.with_name(f"{path.stem}.newer{path.suffix}")
-    save_result(beside, document, n_backups)
+    newer = path.with_name(f"{path.stem}.newer{path.suffix}")
+    save_result(newer, document, n_backups)
     before, now = _quality_in_words(better), _quality_in_words(document)
-    raise KeptError(str(finding("RESULT_WORSE", path=path, beside=beside, before=before, now=now)))
+    raise KeptError(str(finding("RESULT_WORSE", path=path, beside=newer, before=before, now=now)))
 
 
 def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -324,13 +324,13 @@ def _backups_to_keep(new: _ResultValue, n_backups: int, before: Sequence[Path]) 
     worth = {path: _ResultValue.of_file(path) for path in before}
     kept: list[Path] = []
     for path in before:
-        own = worth[path]
-        if own is not None and (not own.used or (path != before[0] and own.continued_by(new))):
+        current = worth[path]
+        if current is not None and (not current.used or (path != before[0] and current.continued_by(new))):
             continue
         kept.append(path)
-        new = own or new
+        new = current or new
     first, rest = kept[:1], kept[1:]
-    rest.sort(key=lambda path: -1 if (own := worth[path]) is None else own.convergence, reverse=True)  # stable
+    rest.sort(key=lambda path: -1 if (current := worth[path]) is None else current.convergence, reverse=True)  # stable
     best = rest[: n_backups - len(first)]
     return [*first, *(path for path in before if path in best)]
 
@@ -424,11 +424,12 @@ def _gaussian(where: str, name: str, saved: Any, of_recording: bool) -> Gaussian
     published = _with_covariance(where, name, saved, "covariance")
     if "covariance_of_recording" not in saved:  # older files have only one covariance
         return published
-    own = _with_covariance(where, name, saved, "covariance_of_recording")
-    return own if of_recording else published
+    recorded = _with_covariance(where, name, saved, "covariance_of_recording")
+    return recorded if of_recording else published
 
 
 def _with_covariance(where: str, name: str, saved: Any, key: str) -> GaussianState:
+    """Return a saved state with one of its covariances, both checked. Raises InputError."""
     model = MODELS[name]
     try:
         x = np.array(saved["state"], dtype=float)

@@ -138,6 +138,7 @@ def _is_link(link: str, frame: str) -> bool:
 
 
 def _with_attribute(tag: bytes, name: str, text: bytes) -> bytes:
+    """Return a start tag with an attribute set, or added at the end."""
     found = re.compile(rb"(?<=\s)" + name.encode() + rb"""\s*=\s*("[^"]*"|'[^']*')""").search(tag)
     if found is not None:
         first, last = found.span(1)

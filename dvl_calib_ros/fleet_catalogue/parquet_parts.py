@@ -94,8 +94,8 @@ class Catalogue:
     def rename(self, part: CataloguePart, vehicle: str) -> None:
         """Change the vehicle in the rows of a recording."""
         rows = self.rows_of(part.recording)
-        own = CataloguePart(part.recording, vehicle, part.fingerprint, part.extrinsics)
-        self._save(own, [{**row, "vehicle": vehicle} for row in rows])
+        renamed = CataloguePart(part.recording, vehicle, part.fingerprint, part.extrinsics)
+        self._save(renamed, [{**row, "vehicle": vehicle} for row in rows])
 
     def parts(self) -> Iterator[CataloguePart]:
         """Yield each recording's part, and set faulty files aside; parts of another schema are skipped.
@@ -125,8 +125,8 @@ class Catalogue:
 
         content = self._whole(path)
         try:
-            told = json.loads(parquet.read_schema(self._arrow.BufferReader(content)).metadata[_KEY])
-            part = CataloguePart(**told)
+            metadata = json.loads(parquet.read_schema(self._arrow.BufferReader(content)).metadata[_KEY])
+            part = CataloguePart(**metadata)
         except (OSError, KeyError, TypeError, ValueError, self._arrow.ArrowException) as error:
             raise InputError(f"{path}: was not written by this version of dvl-calib fleet") from error
         if path != self._path(part.recording):
@@ -162,8 +162,8 @@ class Catalogue:
         from pyarrow import parquet
 
         rows = [{name: as_cell(value) for name, value in row.items()} for row in rows]
-        told = {_KEY: json.dumps(vars(part)), _CHECKSUM_KEY: _CHECKSUM + _ZEROS}
-        table = self._arrow.Table.from_pylist(rows, schema=self._schema.with_metadata(told))
+        metadata = {_KEY: json.dumps(vars(part)), _CHECKSUM_KEY: _CHECKSUM + _ZEROS}
+        table = self._arrow.Table.from_pylist(rows, schema=self._schema.with_metadata(metadata))
         sink = self._arrow.BufferOutputStream()
         parquet.write_table(table, sink, write_page_checksum=True)  # for other readers
         content = _with_checksum(sink.getvalue().to_pybytes())
@@ -180,8 +180,8 @@ def _with_checksum(content: bytes) -> bytes:
 
 def _stamped(row: Row) -> Row:
     """Convert stamps to times."""
-    own = {name: value for name, value in row.items() if not name.endswith("_ns")}
-    return own | {name: row.get(f"{name}_ns") for name in ("first", "last")}
+    values = {name: value for name, value in row.items() if not name.endswith("_ns")}
+    return values | {name: row.get(f"{name}_ns") for name in ("first", "last")}
 
 
 def _arrow() -> Any:

@@ -112,12 +112,12 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
         common |= {"first_ns": result.first_ns, "last_ns": result.last_ns}
         common["day"] = _day(result.first_ns)
     extrinsics, without_day = (extrinsics_of_replay(each, where) for each in (replayed, _without_day(replayed)))
-    told = None
+    extrinsics_row = None
     if extrinsics is not None and without_day is not None:
-        told = {**_plain(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
-        told |= _cause(replayed)
+        extrinsics_row = {**_plain(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
+        extrinsics_row |= _cause(replayed)
     rows = (*_quantities(result), *_heading(estimate), *_water(replayed.water))
-    return Entry([common | each for each in rows], told)
+    return Entry([common | each for each in rows], extrinsics_row)
 
 
 def _day(stamp_ns: int) -> date | None:
@@ -158,10 +158,10 @@ def _heading(estimate: Estimate) -> list[Row]:
         return []
     value, std = estimate.heading_deviation.x, np.sqrt(np.diag(estimate.heading_deviation.p))
     rows = []
-    for name, each, own in zip(HEADING_ERRORS, np.degrees(value), np.degrees(std), strict=True):
+    for name, each, each_std in zip(HEADING_ERRORS, np.degrees(value), np.degrees(std), strict=True):
         factor, unit = (3600.0, "deg/h") if name == "heading_drift" else (1.0, "deg")
         rows.append(
-            {"parameter": name, "unit": unit, "value": factor * float(each), "std_recording": factor * float(own)}
+            {"parameter": name, "unit": unit, "value": factor * float(each), "std_recording": factor * float(each_std)}
         )
     return rows
 

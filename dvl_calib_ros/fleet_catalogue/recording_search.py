@@ -130,6 +130,7 @@ _Files = tuple[str, dict[str, list[StoredFile]]]
 
 
 def _local_files(place: str, unread: list[str]) -> _Files:
+    """Return root and files by folder of a local place; unreadable ones are added to `unread`."""
     root = os.path.abspath(place.removeprefix("file://"))
     if os.path.isfile(root):
         folder, name = os.path.split(root)
@@ -149,8 +150,8 @@ def _local_files(place: str, unread: list[str]) -> _Files:
             continue
         seen.add(real)
         folders[:] = sorted(name for name in folders if not name.startswith("."))
-        own = [name for name in sorted(names) if _is_of_a_recording(name) and not name.startswith(".")]
-        for name in own:
+        recording_files = [name for name in sorted(names) if _is_of_a_recording(name) and not name.startswith(".")]
+        for name in recording_files:
             try:
                 files.setdefault(folder, []).append(_local_file(os.path.join(folder, name)))
             except OSError as error:  # a dangling link
@@ -159,13 +160,14 @@ def _local_files(place: str, unread: list[str]) -> _Files:
 
 
 def _local_file(path: str) -> StoredFile:
-    told = os.stat(path)
-    if not stat.S_ISREG(told.st_mode):
+    status = os.stat(path)
+    if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "is no file")  # a pipe would block
-    return StoredFile(path, told.st_size, str(told.st_mtime_ns))
+    return StoredFile(path, status.st_size, str(status.st_mtime_ns))
 
 
 def _stored(place: str) -> _Files:
+    """Return root and files by folder of an object store. Raises InputError."""
     store, root = _store(place)
     try:
         found: Mapping[str, Mapping[str, Any]] = store.find(root, detail=True)
@@ -174,12 +176,12 @@ def _stored(place: str) -> _Files:
             f"{place}: cannot be listed ({type(error).__name__}: {error}); see to address and access"
         ) from error
     files: dict[str, list[StoredFile]] = {}
-    for path, told in sorted(found.items()):
+    for path, info in sorted(found.items()):
         where = store.unstrip_protocol(path)
         folder, _, name = where.rpartition("/")
         if _is_of_a_recording(name) and not name.startswith("."):
-            stamp = next((str(told[key]) for key in _VERSIONS if told.get(key) is not None), "")
-            files.setdefault(folder, []).append(StoredFile(where, int(told.get("size") or 0), stamp))
+            stamp = next((str(info[key]) for key in _VERSIONS if info.get(key) is not None), "")
+            files.setdefault(folder, []).append(StoredFile(where, int(info.get("size") or 0), stamp))
     is_file = list(found) == [root]
     place = store.unstrip_protocol(root)
     return place.rpartition("/")[0] if is_file else place.rstrip("/"), files
@@ -199,6 +201,7 @@ def _store(place: str) -> tuple[Any, str]:
 
 
 def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterator[StoredRecording]:
+    """Yield bags and single files: a folder is one bag if its files are numbered as rosbag2 does."""
     bags: list[str] = []
     for folder, files in sorted(folders.items()):
         if any(folder.startswith(f"{bag}/") for bag in bags[-1:]):
@@ -213,12 +216,12 @@ def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterato
             continue
         for each in storage:
             name = each.where.rpartition("/")[2]
-            own = [file for file in files if file.where in (each.where, *(each.where + end for end in _JOURNALS))]
-            yield StoredRecording(each.where, f"{inside}/{name}".strip("/"), place, tuple(own))
+            parts = [file for file in files if file.where in (each.where, *(each.where + end for end in _JOURNALS))]
+            yield StoredRecording(each.where, f"{inside}/{name}".strip("/"), place, tuple(parts))
 
 
 def _is_bag(folder: str, files: Sequence[StoredFile], storage: Sequence[StoredFile]) -> bool:
     if any(each.where.endswith(f"/{METADATA}") for each in files):
         return True
-    own = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # rosbag2's numbering of files
-    return all(own.match(each.where.rpartition("/")[2]) for each in storage)
+    numbered = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # rosbag2's numbering of files
+    return all(numbered.match(each.where.rpartition("/")[2]) for each in storage)

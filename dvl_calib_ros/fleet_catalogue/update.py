@@ -92,23 +92,23 @@ def run_fleet(
     catalogue = Catalogue(out)
     options = _options(parameters, given)
     known = {part.recording: part for part in catalogue.parts()}
-    left = []
+    to_do = []
     for each in recordings:
         vehicle, part = each.vehicle(pattern), known.get(each.name)
         if part is None or part.fingerprint != _fingerprint(each, options):
-            left.append(each)
+            to_do.append(each)
         elif part.vehicle != vehicle:
             catalogue.rename(part, vehicle)
-    _check_reach(left, workers)
-    tasks = [Task(each, parameters, given) for each in left]
+    _check_reach(to_do, workers)
+    tasks = [Task(each, parameters, given) for each in to_do]
     for number, (index, entry) in enumerate(outcomes_as_done(entry_of, tasks, workers), start=1):
-        each = left[index]
+        each = to_do[index]
         if isinstance(entry, Lost):
             entry = failed(each.name, entry.why, is_final=False)
         fingerprint = _fingerprint(each, options) if entry.is_final else ""
         catalogue.write(CataloguePart(each.name, each.vehicle(pattern), fingerprint, entry.extrinsics), entry)
         on_progress(number / len(tasks))
-    return _read(catalogue, len(left), len(recordings) - len(left), notes)
+    return _read(catalogue, len(to_do), len(recordings) - len(to_do), notes)
 
 
 def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence[str]) -> Fleet:
@@ -116,14 +116,14 @@ def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence
         Catalogued.of(part.recording, part.vehicle, catalogue.rows_of(part.recording), part.extrinsics)
         for part in sorted(catalogue.parts(), key=lambda part: part.recording)
     ]
-    left, doubled = distinct(entries)
+    unique, doubled = distinct(entries)
     return Fleet(
         out=catalogue.folder,
         recordings=len(entries),
         calibrated=calibrated,
         unchanged=unchanged,
-        vehicles=tuple(histories(left)),
-        persons=(*doubled, *need_person(left)),
+        vehicles=tuple(histories(unique)),
+        persons=(*doubled, *need_person(unique)),
         notes=(*notes, *catalogue.notes),
     )
 

@@ -43,12 +43,12 @@ class Catalogued:
         """Build from the plain data of a part."""
         if told is None:
             return Catalogued(recording, vehicle, tuple(rows))
-        own = {field.name: told[field.name] for field in fields(Extrinsics) if field.name in told}
-        for name in own.keys() & {"value", "covariance", "by_bias"}:
-            own[name] = np.array(own[name])
-        own["shown"] = np.array(own["shown"], dtype=bool)
+        values = {field.name: told[field.name] for field in fields(Extrinsics) if field.name in told}
+        for name in values.keys() & {"value", "covariance", "by_bias"}:
+            values[name] = np.array(values[name])
+        values["shown"] = np.array(values["shown"], dtype=bool)
         covariance, cause = np.array(told["covariance_of_recording"]), str(told.get("cause_of_scale", ""))
-        return Catalogued(recording, vehicle, tuple(rows), Extrinsics(**own), covariance, cause)
+        return Catalogued(recording, vehicle, tuple(rows), Extrinsics(**values), covariance, cause)
 
     @property
     def error(self) -> str:
@@ -116,19 +116,19 @@ def histories(entries: Sequence[Catalogued]) -> list[VehicleHistory]:
     by_vehicle: dict[str, list[Catalogued]] = defaultdict(list)
     for each in entries:
         by_vehicle[each.vehicle].append(each)
-    return [_history(name, own) for name, own in sorted(by_vehicle.items())]
+    return [_history(name, entries_of) for name, entries_of in sorted(by_vehicle.items())]
 
 
 def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[NeedsPerson]]:
     """Remove recordings with the same data as another, which would confirm itself; also return those."""
     first: dict[Any, Catalogued] = {}
-    left, doubled = [], []
+    unique, doubled = [], []
     for each in entries:
-        own = each.extrinsics
+        fit = each.extrinsics
         key = (
             each.recording
-            if own is None
-            else (own.model, own.first_ns, own.last_ns, own.used, own.covariance.tobytes())
+            if fit is None
+            else (fit.model, fit.first_ns, fit.last_ns, fit.used, fit.covariance.tobytes())
         )
         if key in first:
             doubled.append(
@@ -138,8 +138,8 @@ def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[Need
             )
         else:
             first[key] = each
-            left.append(each)
-    return left, doubled
+            unique.append(each)
+    return unique, doubled
 
 
 def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
@@ -152,8 +152,8 @@ def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
         elif row["verdict"] == "reject":
             groups[row["codes"][0] if row["codes"] else "", ""].append(each)
     found = [
-        NeedsPerson(code, error or own[0].rows[0]["reason"], tuple(each.recording for each in own))
-        for (code, error), own in groups.items()
+        NeedsPerson(code, error or members[0].rows[0]["reason"], tuple(each.recording for each in members))
+        for (code, error), members in groups.items()
     ]
     return sorted(found, key=lambda each: -len(each.recordings))
 
@@ -185,9 +185,9 @@ def _days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
         if each.extrinsics is not None and each.covariance_of_recording is not None:
             by_day[each.extrinsics.first_ns // DAY_NS].append((each.extrinsics, each.covariance_of_recording))
     found = []
-    for _, own in sorted(by_day.items()):
-        own.sort(key=lambda each: each[0].first_ns)
-        found += [_of_day(part) for part in _split_at_moves(own)]
+    for _, of_one_day in sorted(by_day.items()):
+        of_one_day.sort(key=lambda each: each[0].first_ns)
+        found += [_of_day(part) for part in _split_at_moves(of_one_day)]
     return found
 
 
@@ -227,10 +227,10 @@ def _heading(entries: Sequence[Catalogued]) -> CompassDeviation | None:
     names = HEADING_ERRORS[:4]
     values, stds = [], []
     for each in entries:
-        own = {row["parameter"]: row for row in each.rows}
-        if all(name in own for name in names):
-            values.append([own[name]["value"] for name in names])
-            stds.append([own[name]["std_recording"] for name in names])
+        by_parameter = {row["parameter"]: row for row in each.rows}
+        if all(name in by_parameter for name in names):
+            values.append([by_parameter[name]["value"] for name in names])
+            stds.append([by_parameter[name]["std_recording"] for name in names])
     if not values:
         return None
     weight = 1.0 / np.square(stds)

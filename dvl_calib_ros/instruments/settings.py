@@ -95,8 +95,8 @@ def instrument_settings(
     if name not in INSTRUMENTS:
         raise InputError(f"instrument {name!r} is not known; one of {', '.join(INSTRUMENTS)}")
     calibrated.check_applicable(force)
-    instrument, told = INSTRUMENTS[name], dict(now or {})
-    for key, value in told.items():
+    instrument, given = INSTRUMENTS[name], dict(now or {})
+    for key, value in given.items():
         if key not in instrument.ranges:
             raise InputError(f"{name} has no setting {key!r}; one of {', '.join(instrument.ranges)}")
         holds = instrument.ranges[key]
@@ -106,8 +106,8 @@ def instrument_settings(
                 "setting when the data were recorded"
             )
     delivered = {key: holds.delivered for key, holds in instrument.ranges.items() if holds.delivered is not None}
-    recorded = _recorded_sound(calibrated, instrument, told)
-    settings, text, notes = instrument.settings(calibrated, {**delivered, **recorded, **told})
+    recorded = _recorded_sound(calibrated, instrument, given)
+    settings, text, notes = instrument.settings(calibrated, {**delivered, **recorded, **given})
     if calibrated.cause_of_scale is not None:
         notes.append(printable(calibrated.cause_of_scale.sentence))
     for setting in settings:
@@ -118,7 +118,7 @@ def instrument_settings(
                 "current setting right?"
             )
     origins = {**dict.fromkeys(delivered, AS_DELIVERED), **dict.fromkeys(recorded, AS_RECORDED)}
-    marked = [replace(each, now_by="" if each.name in told else origins.get(each.name, "")) for each in settings]
+    marked = [replace(each, now_by="" if each.name in given else origins.get(each.name, "")) for each in settings]
     return InstrumentSettings(name, instrument.document, tuple(marked), text, tuple(notes))
 
 
@@ -140,9 +140,9 @@ def _recorded_sound(
 
 def _water_linked(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
     offset, swing = _heading(calibrated, now["mounting_rotation_offset"])
-    turned = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
+    angle = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
     sound, of_sound = _speed_of_sound(calibrated, now.get(SPEED_OF_SOUND))
-    settings, notes = [turned, *sound], [*_residual_notes(calibrated, swing), *_delay(calibrated), *of_sound]
+    settings, notes = [angle, *sound], [*_residual_notes(calibrated, swing), *_delay(calibrated), *of_sound]
     command = {"command": "set_config", "parameters": {each.name: each.new for each in settings}}
     return settings, json.dumps(command) + "\n", notes
 
@@ -152,25 +152,25 @@ def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[
     factor, scale = calibrated.speed_of_sound_factor, f"{100.0 * calibrated.scale_ahead:+.2f} %"
     if calibrated.model.scale_axes and now is not None:
         new = round(factor * now, 2)
-        said = f"scale {scale}: as a speed of sound that is {now - new:+.1f} m/s off. Other water, another speed"
-        return [Setting(SPEED_OF_SOUND, now, new, "m/s")], [said]
+        note = f"scale {scale}: equals a speed of sound error of {now - new:+.1f} m/s. It changes with the water"
+        return [Setting(SPEED_OF_SOUND, now, new, "m/s")], [note]
     water = calibrated.water
     if water is not None and water.speed is not None and not math.isnan(water.salinity):
         middle, half = 0.5 * (water.speed.most + water.speed.least), 0.5 * (water.speed.most - water.speed.least)
         why = (
-            "for the calibration holds no scale"
+            "because the calibration has no scale"
             if now is not None
             else f"because the DVL's setting is unknown; if you know it, give --now {SPEED_OF_SOUND}=1500"
         )
-        said = f"{SPEED_OF_SOUND}: the water's, ±{half:.1f} m/s, {why}"
-        return [Setting(SPEED_OF_SOUND, now, round(middle, 1), "m/s")], [said]
+        note = f"{SPEED_OF_SOUND}: the water's, ±{half:.1f} m/s, {why}"
+        return [Setting(SPEED_OF_SOUND, now, round(middle, 1), "m/s")], [note]
     if not calibrated.model.scale_axes:
         return [], []
-    said = (
+    note = (
         f"{SPEED_OF_SOUND}: times {factor:.5f}; give its setting (--now {SPEED_OF_SOUND}=1500), for m/s. A wrong "
         "speed of sound causes this: correct the settings of temperature and salinity first"
     )
-    return [], [said]
+    return [], [note]
 
 
 def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
@@ -183,11 +183,12 @@ def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple
         settings.append(Setting("velocity_adjustment", now["velocity_adjustment"], new))
         lines.append(f"SET-VELOCITY-ADJUSTMENT {new:g}")
         if calibrated.cause_of_scale is not None:
-            notes.append("velocity_adjustment takes the scale out: set it or the speed of sound, not both")
+            notes.append("velocity_adjustment corrects the scale: set it or the speed of sound, not both")
     return settings, "\n".join(lines) + "\n", notes
 
 
 def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
+    """Return settings, parameter file and notes for ArduPilot. Raises InputError if not near a quarter turn."""
     settings, notes = [], []
     if calibrated.position is None:
         notes.append(f"VISO_POS_X, _Y, _Z are not set: {POSITION_UNKNOWN}")
@@ -208,16 +209,16 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tupl
     settings.append(Setting("VISO_ORIENT", now.get("VISO_ORIENT"), float(quarters % 4 * 2)))
     if abs(off) > SAID_FROM:
         notes.append(
-            f"{math.degrees(off):+.2f}° of yaw (clockwise) stay: VISO_ORIENT holds quarter turns. Set them in the DVL "
-            "itself (--instrument waterlinked or cerulean)"
+            f"{math.degrees(off):+.2f}° of yaw (clockwise) remain: VISO_ORIENT has only quarter turns. Set them in "
+            "the DVL itself (--instrument waterlinked or cerulean)"
         )
     delay = round(1000.0 * calibrated.dvl_time_offset)
     if DELAY_MS[0] <= delay <= DELAY_MS[1]:
         settings.append(Setting("VISO_DELAY_MS", now.get("VISO_DELAY_MS"), float(delay), "ms"))
     else:
         notes.append(
-            f"VISO_DELAY_MS holds {DELAY_MS[0]} to {DELAY_MS[1]} ms, and the DVL's stamps are {delay} ms late: set its "
-            "clock right"
+            f"VISO_DELAY_MS allows {DELAY_MS[0]} to {DELAY_MS[1]} ms, and the DVL's stamps are {delay} ms late: "
+            "correct its clock"
         )
     if calibrated.model.scale_axes:
         notes.append(f"the DVL's scale, {100.0 * calibrated.scale_ahead:+.2f} %, is its own to set")
@@ -230,8 +231,8 @@ def _heading(calibrated: CalibratedMounting, now_deg: float) -> tuple[float, Arr
     The angle is from the vehicle's forward axis to the DVL's, and corrects the error found relative to the configured
     mounting.
     """
-    told = calibrated.parameters.rotation_dvl_from_body
-    found = told @ calibrated.rotation_body_from_dvl
+    configured = calibrated.parameters.rotation_dvl_from_body
+    found = configured @ calibrated.rotation_body_from_dvl
     if not _is_down(calibrated):
         found = FLU_FROM_FRD @ found @ FLU_FROM_FRD
     whole = found @ rotation_from_rpy(np.array([0.0, 0.0, math.radians(now_deg)]))
@@ -247,15 +248,15 @@ def _is_down(calibrated: CalibratedMounting) -> bool:
 
 def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
     roll_pitch = np.abs(rpy_from_rotation(swing)[:2])
-    said = ["URDF and parameters stay unchanged: do not write this result into them as well"]
+    notes = ["URDF and parameters stay unchanged: do not write this result into them as well"]
     if roll_pitch.max() <= SAID_FROM:
-        return said
+        return notes
     axes = swing if _is_down(calibrated) else FLU_FROM_FRD @ swing @ FLU_FROM_FRD
     mounting = calibrated.parameters.rotation_dvl_from_body.T @ axes
     of_frame = mounting @ FLU_FROM_FRD if calibrated.turned else mounting
     degrees = ", ".join(f"{math.degrees(each):.2f}°" for each in roll_pitch)
     return [
-        *said,
+        *notes,
         f"roll and pitch ({degrees}) are no setting of the instrument: with it set, give the URDF rpy="
         f'"{numbers(rpy_from_rotation(of_frame))}" (mounting_rpy {numbers(rpy_from_rotation(mounting))})',
     ]
@@ -263,7 +264,7 @@ def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
 
 def _delay(calibrated: CalibratedMounting) -> list[str]:
     late = calibrated.dvl_time_offset
-    return [f"the DVL's stamps are {late:+.3f} s late, which is no setting of the instrument"] if late else []
+    return [f"the DVL's stamps are {late:+.3f} s late, for which the instrument has no setting"] if late else []
 
 
 INSTRUMENTS: Mapping[str, Instrument] = {

@@ -101,17 +101,17 @@ class _Dvl:
             if not isinstance(answer, dict) or answer.get("response_to") != command["command"]:
                 continue
             if answer.get("success") is not True:
-                told = answer.get("error_message")
-                why = told[:LONGEST_REASON] if told and isinstance(told, str) else "no reason given"
+                message = answer.get("error_message")
+                why = message[:LONGEST_REASON] if message and isinstance(message, str) else "no reason given"
                 raise InputError(f"{self._address}: refuses {command['command']} ({why})")
             return answer.get("result")
 
     def _line(self, until: float) -> bytes:
         while b"\n" not in self._pending:
-            left = until - time.monotonic()
-            if left <= 0.0 or len(self._pending) > LONGEST_LINE:
+            remaining = until - time.monotonic()
+            if remaining <= 0.0 or len(self._pending) > LONGEST_LINE:
                 raise TimeoutError("no answer")
-            self._connection.settimeout(left)
+            self._connection.settimeout(remaining)
             got = self._connection.recv(1 << 16)
             if not got:
                 raise ConnectionResetError(0, "it closed the connection")

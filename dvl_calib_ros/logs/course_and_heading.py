@@ -85,7 +85,7 @@ def _named(path: Path, names: Sequence[str], notes: list[str]) -> tuple[Array, A
     if not good.any():
         raise InputError(f"{path}: no row with a number in every column")
     if not good.all():
-        notes.append(f"{path}: {int((~good).sum())} of {len(table)} rows hold no finite number somewhere, left out")
+        notes.append(f"{path}: {int((~good).sum())} of {len(table)} rows have a value that is not finite, left out")
     table = table[good]
     if (np.diff(table[:, 0]) <= 0.0).any():
         raise InputError(f"{path}: time does not increase at row {int(np.argmax(np.diff(table[:, 0]) <= 0.0)) + 2}")

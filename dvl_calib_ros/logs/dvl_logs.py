@@ -101,6 +101,7 @@ def _holds_json(content: bytes) -> bool:
 
 
 def _read_json(path: Path, content: bytes) -> DvlLog:
+    """Read Water Linked's JSON reports, one a line."""
     samples: list[DvlSample] = []
     left_out: Counter[str] = Counter()
     for line in content.decode("utf-8", "replace").splitlines():
@@ -120,6 +121,7 @@ def _read_json(path: Path, content: bytes) -> DvlLog:
 
 
 def _json_sample(path: Path, report: dict[str, Any], left_out: Counter[str]) -> DvlSample | None:
+    """Return a report's velocity, forward-left-up; None, counted, if unusable."""
     if report.get("velocity_valid") is not True:
         left_out["without bottom lock"] += 1
         return None
@@ -169,6 +171,7 @@ def _ensembles(content: bytes) -> Iterator[list[tuple[int, bytes]]]:
 
 
 def _read_pd0(path: Path, content: bytes) -> DvlLog:
+    """Read velocities, attitudes, NMEA and water properties from PD0 ensembles."""
     samples: list[DvlSample] = []
     attitudes: dict[int, tuple[float, float, float]] = {}
     left_out: Counter[str] = Counter()
@@ -288,6 +291,7 @@ def _pd0_stamp(data: dict[int, bytes]) -> int:
 
 
 def _pd0_sample(path: Path, stamp_ns: int, data: dict[int, bytes], left_out: Counter[str]) -> DvlSample | None:
+    """Return an ensemble's bottom-track velocity in the DVL's axes; None, counted, if unusable."""
     if _BOTTOM_TRACK not in data:
         left_out["without bottom track"] += 1
         return None

@@ -88,9 +88,10 @@ def _sum(data: bytes) -> int:
 
 
 def _sample(data: bytes) -> DvlSample | None:
+    """Return a record's velocity, with the mean of its valid vertical velocities; None without bottom lock."""
     _, _, _, year, month, day, hour, minute, second, fraction, _, _, status, *_ = _LEADER.unpack_from(data)
-    told = np.array(_BY_AXIS.unpack_from(data, _LEADER.size + _BY_BEAM.size), dtype=float).reshape(3, 4)
-    velocity, noise, late = told
+    values = np.array(_BY_AXIS.unpack_from(data, _LEADER.size + _BY_BEAM.size), dtype=float).reshape(3, 4)
+    velocity, noise, late = values
     valid = np.array([bool(status & bit) for bit in _VALID]) & np.isfinite(velocity) & (velocity > _BAD_VELOCITY)
     if not (valid[0] and valid[1] and valid[2:].any()):
         return None

@@ -94,13 +94,13 @@ def _values(kind: str, specific: int, body: bytes) -> list[float]:
     if sentence is not None:
         return _of_text(kind, sentence)
     header = 10 if 100 <= specific < 104 else 7
-    told = _BINARY[kind].unpack_from(body, header)
+    fields = _BINARY[kind].unpack_from(body, header)
     if kind == _VTG:
-        course, _, _, _, knots = told
+        course, _, _, _, knots = fields
         return _over_ground(course, knots)
     if kind == _HDT:
-        return [math.radians(told[0])]
-    _, latitude, south, longitude, west, quality = told
+        return [math.radians(fields[0])]
+    _, latitude, south, longitude, west, quality = fields
     return _position(latitude, south, longitude, west, quality)
 
 

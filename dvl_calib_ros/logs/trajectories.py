@@ -53,10 +53,10 @@ def read_columns(path: Path, unit: str) -> TimedRows:
     good = np.isfinite(table).all(axis=1)
     rows = np.flatnonzero(good) + 1
     if not len(rows):
-        raise InputError(f"{path}: row 1 holds a value that is not a finite number, and so does every other")
+        raise InputError(f"{path}: every row has a value that is not a finite number")
     if n_bad := len(table) - len(rows):
         first = f"the first is row {int(np.argmin(good)) + 1}"
-        left_out.insert(0, f"{path}: {n_bad} of {len(table)} rows hold no finite number somewhere, left out; {first}")
+        left_out.insert(0, f"{path}: {n_bad} of {len(table)} rows have a value that is not finite, left out; {first}")
     table = table[good]
     backwards = np.diff(table[:, 0]) <= 0.0
     if backwards.any():
@@ -80,6 +80,7 @@ def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
 
 
 def _check_header(path: Path, header: list[str], unit: str) -> None:
+    """Check number, units and order of columns, as far as their names indicate them. Raises InputError."""
     if len(header) != N_COLUMNS:
         names = ", ".join(cell.strip() for cell in header)[:SHOWN]
         raise InputError(

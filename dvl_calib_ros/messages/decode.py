@@ -336,7 +336,7 @@ class MessageDecoder:
     @property
     def frame_of_reference(self) -> VelocityFrame | None:
         """Frame of the first accepted reference message; None before."""
-        return next((said.frame for said in self._reference_frames.values() if said is not None), None)
+        return next((declared.frame for declared in self._reference_frames.values() if declared is not None), None)
 
     @property
     def frame_ids(self) -> tuple[str, str, str]:
@@ -353,6 +353,7 @@ class MessageDecoder:
         return self._reference_frames[frame_id]
 
     def _frame_named(self, frame_id: str) -> DeclaredFrame | None:
+        """Return the reference's frame, by parameter, type or frame_id; None, with a note, if unknown."""
         p = self.parameters
         if p.gnss_frame != FROM_FRAME_ID:
             return DECLARED_FRAMES[p.gnss_frame].in_base(p)

@@ -29,10 +29,7 @@ _SURFACE_PA, _PA_PER_M = 101_325.0, 1025.0 * 9.81
 
 
 class OfWater(NamedTuple):
-    """Readings of one topic.
-
-    kind: temperature, salinity, pressure or used. values: (N,) °C, PSU, Pa or m/s. std: of each.
-    """
+    """Readings of a topic. kind: temperature, salinity, pressure, used. values: (N,) °C, PSU, Pa, m/s. std: of each."""
 
     topic: str
     kind: str
@@ -123,6 +120,7 @@ def _middle(readings: Sequence[OfWater]) -> float:
 
 
 def _in_water(readings: Sequence[OfWater]) -> OfWater | None:
+    """Return the readings of the thermometer in the water; None if it is unclear which that is."""
     words = [set(re.split("[^a-z]+", each.topic.lower())) for each in readings]
     maybe = [(each, own) for each, own in zip(readings, words, strict=True) if not own & _NOT_IN_WATER]
     named = [each for each, own in maybe if own & _IN_WATER]

@@ -195,22 +195,22 @@ class CalibrationNode(AnsweringNode):
             self._warn(doubt)
         topics = discovery.topics
         names = {"dvl/twist": topics.dvl, "gnss/twist": topics.gnss, "imu/data": topics.imu}
-        there = {name for name, _ in self.get_topic_names_and_types()}
-        self._found_names = {own: name for own, name in names.items() if name in there}
+        present = {name for name, _ in self.get_topic_names_and_types()}
+        self._found_names = {name_used: name for name_used, name in names.items() if name in present}
         classes = {
             "dvl/twist": velocity_class("dvl_type", parameters.dvl_type, parameters.dvl_fields),
             "gnss/twist": velocity_class("gnss_type", parameters.gnss_type),
             "imu/data": Imu,
         }
-        for own in self._found_names:
-            old = self._inputs[own]
-            self._subscribe(classes[own], own)
+        for name_used in self._found_names:
+            old = self._inputs[name_used]
+            self._subscribe(classes[name_used], name_used)
             self.destroy_subscription(old)
         self._begin(parameters, self._initial)
         self._adapted = self._feed.decoder.adapted
         self._awaits_heading_std = self._awaits_heading_std and "heading_deviation_std" not in discovery.values
         now_s = self._pauses.running_s(steady_s())
-        heard = {own: subscription.topic_name for own, subscription in self._inputs.items()}
+        heard = {name_used: subscription.topic_name for name_used, subscription in self._inputs.items()}
         self._silence, self._recent, self._card = Silence(now_s, heard), RecentCounts(), Card(now_s)
         self._correction, self._mounting_published = None, ("", 0)
 
@@ -250,7 +250,7 @@ class CalibrationNode(AnsweringNode):
             self._calibrator.set_parameters(parameters.replace(**place))
             return
         self.get_logger().info(
-            f"{printable(found.said)}; the calibration begins with it (use_transforms: false does without)"
+            f"{printable(found.said)}; the calibration starts with it (set use_transforms to false to ignore it)"
         )
         self._restart(parameters.replace(**found.values))
 
@@ -395,6 +395,7 @@ class CalibrationNode(AnsweringNode):
         return self._correction
 
     def _publish_corrected(self, sample: DvlSample) -> None:
+        """Publish the velocity corrected by the selected model, at the reference point if the lever arm is known."""
         calibrator = self._calibrator
         name = calibrator.selected
         correction = self._correction
@@ -441,6 +442,7 @@ class CalibrationNode(AnsweringNode):
             self._feed.kept.forget()
 
     def _publish_diagnostics(self) -> None:
+        """Publish estimate, problems and progress; also rediscovers topics and publishes the mounting."""
         self._discover()
         self._publish_mounting()
         self._publish_iac()
@@ -462,9 +464,9 @@ class CalibrationNode(AnsweringNode):
         self._diagnostics_publisher.publish(message)
 
     def _hear_water(self) -> None:
-        own = [subscription.topic_name for subscription in self._inputs.values()]
+        subscribed = [subscription.topic_name for subscription in self._inputs.values()]
         dvl = (self._inputs["dvl/twist"].topic_name, self._feed.decoder.dvl_type.name, self._newest_dvl)
-        self._water, self._newest_dvl = self._water_heard.hear(own, dvl), None
+        self._water, self._newest_dvl = self._water_heard.hear(subscribed, dvl), None
 
     def _topic_problems(self) -> list[Reason]:
         type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
@@ -491,6 +493,7 @@ class CalibrationNode(AnsweringNode):
     def _on_save(
         self, request: Trigger.Request, response: Trigger.Response, save: Callable[..., None] = save_unless_worse
     ) -> Trigger.Response:
+        """Save the result when the service is called, unless the saved one is better."""
         path = self._calibrator.parameters.result_file
         if not path:
             response.message = "parameter result_file is not set: dvl-calib param set result_file FILE"

@@ -168,10 +168,10 @@ def diagnose(
     found += message_warnings(grown) + recording_warnings(grown) + dvl_type.advice(grown["dvl"])
     found += gate_warnings(estimate) + consistency_warnings(estimate)
     found += reference_warnings(estimate)
-    if says := calibrator.suggestion_so_far:
-        found.append(finding("CONFIGURATION_WRONG", says=says))
+    if suggestion := calibrator.suggestion_so_far:
+        found.append(finding("CONFIGURATION_WRONG", says=suggestion))
     doubts = calibrator.doubts_so_far
-    rejected = bool(says) or any(each.severity is Severity.REJECT for each in doubts)
+    rejected = bool(suggestion) or any(each.severity is Severity.REJECT for each in doubts)
     verdict = Severity.REJECT if rejected else calibrator.verdict_so_far
     # a reason to reject in a replay is an error here
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]
@@ -213,6 +213,7 @@ def _restart_advice(counts: Counts) -> list[Reason]:
 
 
 def _estimate_values(estimate: Estimate) -> dict[str, str]:
+    """Return value, σ and progress of each parameter, and the consistency (NIS), as text."""
     values = {}
     model, std = MODELS[estimate.model], estimate.std
     by_filter = dict(zip(estimate.state_names, estimate.filter_std.tolist(), strict=True))
@@ -246,9 +247,9 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
 def _scale_and_delay_values(estimate: Estimate, parameters: Parameters) -> dict[str, str]:
     """Return scale and delay, which ~/mounting cannot hold. Keys of states begin with std, so these do not."""
     state = GaussianState(estimate.state, estimate.covariance)
-    beside = scale_and_delay(MODELS[estimate.model], state, parameters)
-    values = {"scale error ahead [%]": 100.0 * beside.scale, "dvl_time_offset [s]": beside.time_offset}
-    stds = (None if beside.scale_std is None else 100.0 * beside.scale_std, beside.time_offset_std)
+    scale_delay = scale_and_delay(MODELS[estimate.model], state, parameters)
+    values = {"scale error ahead [%]": 100.0 * scale_delay.scale, "dvl_time_offset [s]": scale_delay.time_offset}
+    stds = (None if scale_delay.scale_std is None else 100.0 * scale_delay.scale_std, scale_delay.time_offset_std)
     words = {name: f"{value:.4f}" for name, value in values.items()}
     for name, std in zip(values, stds, strict=True):
         words[f"sigma {name}"] = "not estimated" if std is None else f"{std:.4f}"

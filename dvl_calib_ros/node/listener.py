@@ -55,8 +55,8 @@ class Listener:
     def latest(self, wait_s: float) -> Status | None:
         """Listen for `wait_s` seconds and return the latest status, also an earlier one."""
         deadline = time.monotonic() + wait_s
-        while (left := deadline - time.monotonic()) > 0.0:
-            self._executor.spin_once(timeout_sec=left)
+        while (remaining := deadline - time.monotonic()) > 0.0:
+            self._executor.spin_once(timeout_sec=remaining)
         return self._latest
 
     def call(self, service: str) -> None:
@@ -70,9 +70,9 @@ class Listener:
 
     def _on_answer(self, future: Any) -> None:
         error = future.exception()
-        said = future.result().message if error is None else printable(str(error))
+        text = future.result().message if error is None else printable(str(error))
         self.is_waiting = False
-        self.answer = f"{time.strftime('%H:%M:%S')} {said}"  # the time distinguishes equal answers
+        self.answer = f"{time.strftime('%H:%M:%S')} {text}"  # the time distinguishes equal answers
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -93,11 +93,11 @@ class Discovering:
         return None
 
     def _may_be_dvl(self) -> list[str]:
-        own = f"{self._node.get_fully_qualified_name()}/"
+        own_prefix = f"{self._node.get_fully_qualified_name()}/"
         return [
             topic
             for topic, kinds in self._node.get_topic_names_and_types()
-            if not topic.startswith(own) and any(may_be_dvl(topic, kind) for kind in kinds)
+            if not topic.startswith(own_prefix) and any(may_be_dvl(topic, kind) for kind in kinds)
             and self._node.count_publishers(topic)
         ]  # fmt: skip
 

@@ -52,16 +52,16 @@ def in_order_of_arrival(
     ready: the only topics with messages a moment ago, if known. While these have no second message, the others are not
     polled: an empty poll costs a third of a message.
     """
-    heads, left = dict(taken), at_most
+    heads, remaining = dict(taken), at_most
 
     def take_more(names: Iterable[str]) -> bool:
-        nonlocal left
-        before = left
+        nonlocal remaining
+        before = remaining
         for name in names:
-            if left and name not in heads and (arrived := take_from(inputs[name])) is not None:
+            if remaining and name not in heads and (arrived := take_from(inputs[name])) is not None:
                 heads[name] = arrived
-                left -= 1
-        return left < before
+                remaining -= 1
+        return remaining < before
 
     take_more(inputs if ready is None else ready)
     while heads:

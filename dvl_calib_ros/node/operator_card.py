@@ -75,18 +75,18 @@ class RecentWorth:
         self._looks.append((now_s, drift))
         while self._looks[0][0] < now_s - STANDS_S:
             self._looks.popleft()
-        told = PredictedDrift(
+        predicted = PredictedDrift(
             *(sorted(each)[len(each) // 2] for each in zip(*(d for _, d in self._looks), strict=True))
         )
-        if self.is_good and told.both > TAKEN_BACK * target:
-            self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=told.both)
+        if self.is_good and predicted.both > TAKEN_BACK * target:
+            self.is_good, self.taken_back = False, finding("WORTH_HAS_FALLEN", worth=predicted.both)
         if rejected or drift.both > target:
             self._within_since_s = None
         elif self._within_since_s is None:
             self._within_since_s = now_s
         elif self.seconds_left(now_s) == 0.0:
             self.is_good, self.taken_back = True, None
-        return told
+        return predicted
 
     def seconds_left(self, now_s: float) -> float:
         """Return the time (s) for which the drift must still stay within the goal."""
@@ -113,14 +113,14 @@ class RemainingTime:
         while self._ends_s[0][0] < now_s - STANDS_S:
             self._ends_s.popleft()
         end_s = sorted(end for _, end in self._ends_s)[len(self._ends_s) // 2]
-        left = max(end_s - now_s, 0.0)
-        latest_s = end_s + SPREAD * left
+        remaining = max(end_s - now_s, 0.0)
+        latest_s = end_s + SPREAD * remaining
         if end_s > self._latest_s:
             code = "LONGER_AS_DRIFT_GREW" if drift > self._promised_at else "LONGER_AS_LITTLE_SHOWN"
             self.longer, self._longer_since_s = finding(code, before=self._promised_at, now=drift), now_s
         if latest_s < self._latest_s or end_s > self._latest_s:
             self._latest_s, self._promised_at = latest_s, drift
-        return left if math.isfinite(left) else None
+        return remaining if math.isfinite(remaining) else None
 
 
 class Card:
@@ -177,6 +177,7 @@ class Card:
         return min(max(1e-9 * (newest_ns - before_ns), 0.0), STANDS_S / LEAST_LOOKS)
 
     def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float, rejected: bool) -> dict[str, str]:
+        """Update drift, goals and remaining time; return them as values of the diagnostics."""
         parameters, model = calibrator.parameters, MODELS[estimate.model]
         motion, step = calibrator.latest_motion(), self._dvl_time_step(calibrator.last_ns)
         self._shown_s += step
@@ -196,11 +197,11 @@ class Card:
             found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(self._shown_s))
         else:
             found = self._suggestion(calibrator, estimate, motion, now_s)
-        left = None
+        remaining = None
         if rejected or worth.is_good:
             self._remaining = RemainingTime()
         elif found.next.code != "NEXT_WAIT":  # a standing vehicle keeps its last prediction
-            left = self._remaining.look(found.seconds, drift.both, self._shown_s)
+            remaining = self._remaining.look(found.seconds, drift.both, self._shown_s)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
             "side": _progress_percent(drift.side, unknown[0], target / math.sqrt(2.0)),
@@ -216,8 +217,8 @@ class Card:
             "taken back": "" if worth.taken_back is None else worth.taken_back.sentence,
             "next": found.next.sentence,
             "next code": found.next.code,
-            "seconds": "-" if left is None else f"{left:.0f}",
-            "seconds spread": "-" if left is None else f"{SPREAD * left:.0f}",
+            "seconds": "-" if remaining is None else f"{remaining:.0f}",
+            "seconds spread": "-" if remaining is None else f"{SPREAD * remaining:.0f}",
             "longer": "" if self._remaining.longer is None else self._remaining.longer.sentence,
         }
 
@@ -257,9 +258,9 @@ def _mounting(calibrator: Calibrator, estimate: Estimate) -> dict[str, str]:
     arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
     for index, axis in enumerate("xyz"):
         found[f"arm {axis}"] = (arm[index], math.nan if arm_std is None else arm_std[index], "m")
-    beside = scale_and_delay(model, GaussianState(estimate.state, estimate.covariance), parameters)
-    found["scale"] = (100.0 * beside.scale, 100.0 * (beside.scale_std or math.nan), "%")
-    found["delay"] = (beside.time_offset, beside.time_offset_std or math.nan, "s")
+    scale_delay = scale_and_delay(model, GaussianState(estimate.state, estimate.covariance), parameters)
+    found["scale"] = (100.0 * scale_delay.scale, 100.0 * (scale_delay.scale_std or math.nan), "%")
+    found["delay"] = (scale_delay.time_offset, scale_delay.time_offset_std or math.nan, "s")
     values = {}
     for name, (value, std, unit) in found.items():
         values[f"mounting {name} [{unit}]"] = f"{value:.3f}"

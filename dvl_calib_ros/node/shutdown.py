@@ -74,6 +74,7 @@ class Ending:
         self._requested = True
 
     def _watch(self) -> None:
+        """Wait for a signal or hang-up, then call the registered functions, repeatedly until the context is left."""
         watched = [self._reading.fileno(), *([] if self._closed is None else [self._closed])]
         while True:
             ready, _, _ = select.select(watched, [], [], AGAIN_S if self.requested else None)

@@ -116,6 +116,7 @@ class SimulatorNode(AnsweringNode):
         subscription = self.create_subscription(Odometry, topic, self._on_odometry, profile, event_callbacks=events)
 
     def _on_odometry(self, message: Any) -> None:
+        """Publish the samples that a new odometry message makes computable; restart if its time goes back."""
         now_ns = stamp_ns(message.header.stamp)
         orientation = message.pose.pose.orientation
         q = unit_quaternion((orientation.x, orientation.y, orientation.z, orientation.w))
@@ -180,8 +181,8 @@ def _play(
     began = time.monotonic()
     for sample in shifted(samples, start_ns - START_NS):
         due = began + 1e-9 * (sample.stamp_ns - start_ns) / speed
-        while (left := due - time.monotonic()) > 0.0 and not ending.requested:
-            executor.spin_once(timeout_sec=min(left, BREATH_S))
+        while (remaining := due - time.monotonic()) > 0.0 and not ending.requested:
+            executor.spin_once(timeout_sec=min(remaining, BREATH_S))
         if ending.requested:
             return
         node.publish([sample])

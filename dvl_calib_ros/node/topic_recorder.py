@@ -43,10 +43,10 @@ class TopicRecorder:
     def look(self) -> bool:
         """Subscribe to new topics. Return whether there are any."""
         before = len(self._subscriptions)
-        own = f"{self._node.get_fully_qualified_name()}/"
+        own_prefix = f"{self._node.get_fully_qualified_name()}/"
         for topic, kinds in self._node.get_topic_names_and_types():
             for kind in kinds:
-                is_new = (topic, kind) not in self._seen and not topic.startswith(own)
+                is_new = (topic, kind) not in self._seen and not topic.startswith(own_prefix)
                 if is_new and (is_kept(kind) or is_static(topic, kind)):
                     self._seen.add((topic, kind))
                     try:
@@ -56,6 +56,7 @@ class TopicRecorder:
         return len(self._subscriptions) > before
 
     def _subscribe(self, topic: str, kind: str) -> None:
+        """Subscribe with the publishers' QoS, to record serialized messages."""
         publishers = self._node.get_publishers_info_by_topic(topic)
         if is_static(topic, kind) or not publishers:
             self._static.add(topic)

@@ -64,6 +64,7 @@ class WaterHeard:
         return self._collectors.setdefault((topic, kind), WaterCollector(topic, kind, READINGS))
 
     def _look(self, own: Collection[str]) -> None:
+        """Subscribe to new topics with water properties."""
         for topic, kinds in self._node.get_topic_names_and_types():
             for kind in kinds:
                 if topic in own or (topic, kind) in self._subscriptions or not readers(topic, kind):

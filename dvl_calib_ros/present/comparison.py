@@ -22,10 +22,7 @@ _DEGREE = math.degrees(1.0)
 
 
 class ComparedQuantity(NamedTuple):
-    """Quantity of a comparison.
-
-    component: its index in `COMPONENTS`. factor: from SI. changes: attribute of `Comparison`.
-    """
+    """Compared quantity. component: index in `COMPONENTS`. factor: from SI. changes: attribute of `Comparison`."""
 
     component: int
     name: str
@@ -65,7 +62,7 @@ def comparison(result: Comparison) -> Document:
             ),
         ),
     }
-    own = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
+    own_values = replace(table_by(columns, ordered, (OWN_NOTE,), words=3), dense=True)
     return Document(
         title="DVL calibrations compared",
         subtitle=", ".join(each.name for each in ordered),
@@ -80,7 +77,7 @@ def comparison(result: Comparison) -> Document:
                 ],
                 Where.PAGE,
             ),
-            Section("Calibrations", [own]),
+            Section("Calibrations", [own_values]),
             Section(
                 "Differences, the later less the earlier",
                 [_differences(pairs, by_name)],
@@ -97,7 +94,7 @@ def comparison(result: Comparison) -> Document:
 
 def shown_quantities(result: Comparison) -> list[ComparedQuantity]:
     """Return the quantities that were observable in at least two calibrations."""
-    return [each for each in QUANTITIES if sum(own.shown[each.component] for own in result.calibrations) > 1]
+    return [each for each in QUANTITIES if sum(one.shown[each.component] for one in result.calibrations) > 1]
 
 
 DIFFERENCES_NOTE = (
@@ -107,6 +104,7 @@ DIFFERENCES_NOTE = (
 
 
 def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Table:
+    """Return the table of differences between calibrations, with σ and p of the mounting."""
     shown = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
     columns: Columns[tuple[str, Difference, float]] = {
         "": lambda each: each[0],

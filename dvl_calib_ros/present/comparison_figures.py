@@ -32,12 +32,12 @@ def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONEN
     for quantity in (each for each in shown_quantities(comparison) if each.component in components):
         at = quantity.component
         known = [each for each in comparison.calibrations if each.shown[at]]
-        told = ", ".join(
+        values_text = ", ".join(
             f"{each.name} {quantity.factor * each.value[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
             for each in (known if len(known) <= TOLD else (known[0], known[-1]))
         )
-        told += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
-        alt = f"{quantity.name} over time, in {quantity.unit}: {told}"
+        values_text += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
+        alt = f"{quantity.name} over time, in {quantity.unit}: {values_text}"
         made.append(picture(f"{quantity.name.capitalize()}, {quantity.unit}", alt, _panel, comparison, quantity))
     return made
 

@@ -56,8 +56,8 @@ EFFECTS_NOTE = (
     "“or”, the parameters are those of the first."
 )
 TRACES_NOTE = (
-    "Measured: the residual without the other effects. What misalignment and scale could explain has been removed from "
-    "both curves, so they show only what is evidence for the effect."
+    "Measured: the residual without the other effects. The part that misalignment and scale could explain is removed "
+    "from both curves, so they show only the evidence for the effect."
 )
 TWINS_NOTE = (
     "The twin is a simulated DVL on the recorded motion, without and with the effects found. Shown is the recorded "
@@ -164,7 +164,7 @@ def diagnosis(d: Diagnosis) -> Document:
             *(_sections_over_time(d, series) if series is not None else []),
             section("Residual", *_residual_items(d), where=Where.PAGE),
             section(
-                "What this data cannot tell",
+                "Limits of this data",
                 *_equivalence_sentences(d),
                 Sentence(f"Next: {d.next_manoeuvre}."),
                 table_by(NEEDS, d.untestable.items()),
@@ -181,7 +181,7 @@ def _sections_over_time(d: Diagnosis, series: DiagnosisSeries) -> Iterator[Secti
     for each in d.effects:
         if series.traces[each.name].any():
             drawn = figures("diagnosis_pictures.trace_pictures", each.name, series, axes)
-            title = f"{each.name}: measured and as the effect says"
+            title = f"{each.name}: measured and explained"
             yield section(title, drawn, Sentence(TRACES_NOTE, soft=True), where=Where.PAGE)
     errors = [each for twin in series.twins for each in twin_errors(twin, has_effects)]
     heads = {TWIN_HEADS.get(name, "recorded less twin, m/s"): name for name in (errors[0].errors if errors else ())}
@@ -201,7 +201,7 @@ def _equivalence_sentences(d: Diagnosis) -> Iterator[Sentence]:
     for each in d.effects:
         if each.equivalent_to:
             others = " or ".join(each.equivalent_to)
-            yield Sentence(f"This data cannot tell {each.name} from {others}; each explains it as well.")
+            yield Sentence(f"This data cannot distinguish {each.name} from {others}; each explains it equally well.")
     for known in (each.combination for each in d.effects):
         if known is not None:
             value, low, high = known.value
@@ -218,12 +218,12 @@ def _numbers(d: Diagnosis) -> list[Number]:
     if d.effects:
         low, high = gap.interval
         found.append(Number("with the effects", f"{mm(gap.after)} mm/s", note="held-out rms, noise included"))
-        told = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
-        found.append(Number("closed", share(gap.closure), note=told))
+        note = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
+        found.append(Number("closed", share(gap.closure), note=note))
     claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
     slow = ", and slow noise due to the lag" if any(each.name == LAG for each in d.effects) else ""
     found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"estimated from high frequencies{slow}{claimed}"))
-    return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="left beyond the noise")]
+    return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="beyond the noise")]
 
 
 def _residual_items(d: Diagnosis) -> Iterator[Item]:
@@ -241,11 +241,11 @@ def _residual_items(d: Diagnosis) -> Iterator[Item]:
         return
     rest = series.rest
     if rest.found:
-        said = rest.follows.full_sentence.removesuffix(".")
+        text = rest.follows.full_sentence.removesuffix(".")
     else:
-        said = "Nothing in it follows motion or time more than chance would"
+        text = "Nothing in it follows motion or time more than chance would"
     p = p_value(math.exp(rest.log_p))
-    yield Sentence(f"{amount} {said} (p {p if p.startswith('<') else f'= {p}'}).")
+    yield Sentence(f"{amount} {text} (p {p if p.startswith('<') else f'= {p}'}).")
     if series.followed:
         where, followed = series.axes[series.followed.axis], series.followed
         yield figure(
@@ -277,8 +277,7 @@ class Detectable(NamedTuple):
 
 
 DETECTABLE_NOTE = (
-    "An effect of this size would be found in four of five recordings like this one. Green: that is no more than the "
-    "size worth knowing of."
+    "An effect of this size would be found in four of five recordings like this one. Green: at most the relevant size."
 )
 DETECTABLE: Columns[Detectable] = {
     "effect": lambda each: each.effect,
@@ -286,7 +285,7 @@ DETECTABLE: Columns[Detectable] = {
         f"{each.spec.spoken if each.spec else each.parameter} {three(each.said[0][0])} {each.said[1]}".strip(),
         "text" if each.spec is None else "text good" if each.size <= each.spec.typical else "text far",
     ),
-    "worth knowing of": lambda each: f"{two(each.said[0][1])} {each.said[1]}" if each.spec else "–",
+    "relevant size": lambda each: f"{two(each.said[0][1])} {each.said[1]}" if each.spec else "–",
 }
 
 

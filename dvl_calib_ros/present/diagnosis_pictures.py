@@ -26,8 +26,8 @@ RESAMPLES = 500
 
 def _stamps(series: DiagnosisSeries) -> Array:
     """Return stamps (M,) ns that put the recordings one after the other, with gaps that the time axis cuts out."""
-    apart = CUT_FROM_S + float(series.time.max()) * len(series.recordings)
-    return np.asarray(1e9 * (series.time + series.recording_of * (series.time.max() + apart)), dtype=np.int64)
+    spacing = CUT_FROM_S + float(series.time.max()) * len(series.recordings)
+    return np.asarray(1e9 * (series.time + series.recording_of * (series.time.max() + spacing)), dtype=np.int64)
 
 
 def _window(series: DiagnosisSeries) -> int:
@@ -121,7 +121,7 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
     noise = float(np.sqrt(2.0 * interval * (twin.noise**2).sum()))
     densities = {name: density for name, (_, density) in spectra.items()} | {"noise": np.full(len(frequency), noise)}
     yield picture(
-        f"{twin.name}: by frequency", f"Amplitude spectral density of recorded less twin, {names}, beside the noise",
+        f"{twin.name}: by frequency", f"Amplitude spectral density of recorded less twin, {names}, and the noise",
         figures.spectra, frequency, densities, "recorded − twin, mm/s/√Hz",
     )  # fmt: skip
     pooled = {name: values[:, measured].ravel() for name, values in found.items()}

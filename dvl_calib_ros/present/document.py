@@ -61,10 +61,7 @@ def _printable(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Cell(_Printable):
-    """Text of a table. kind: a class of the style sheet, such as good, off, far, bad.
-
-    below: small text on a second line.
-    """
+    """Text of a table. kind: class of the style sheet (good, off, far, bad). below: small second line."""
 
     text: str
     kind: str = ""

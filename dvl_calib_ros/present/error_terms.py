@@ -76,7 +76,7 @@ def estimate_table(result: Result, shown: Sequence[str]) -> Table:
         marked=list(shown).index(result.selected),
         dense=True,
         notes=(
-            "± is 1σ as the model believes it; ? marks what this data does not show; – is not estimated. φ and δk are "
+            "± is the model's 1σ; ? is not observable in this data; – is not estimated. φ and δk are "
             "in the DVL's frame. NIS/m: mean normalised innovation squared per measured component, about 1 when the "
             "noise is as assumed, above when σ is too small.",
         ),

@@ -48,9 +48,9 @@ CONVERGENCE_NOTE = (
     "Only turns make roll observable: without them the whole angle keeps the error of the prior."
 )
 BASELINES_NOTE = (
-    "The rotation alone by least squares on SO(3): of displacements (Kinsey and Whitcomb, 2007; here of the integrated "
-    "reference velocity, whose noise grows with time, where they had positions), and of velocities (Troni and "
-    "Whitcomb, 2010). They have neither scale nor prior."
+    "Only the rotation, by least squares on SO(3): from displacements (Kinsey and Whitcomb, 2007; here of the "
+    "integrated reference velocity, whose noise grows with time, where they had positions), and from velocities "
+    "(Troni and Whitcomb, 2010). They have neither scale nor prior."
 )
 # prefixes of state names -> displayed symbols
 SYMBOLS = {"phi_": "φ", "delta_k": "δk", "delta_k_": "δk "}
@@ -131,11 +131,11 @@ def evaluation(e: Evaluation) -> Document:
 
 def _scores(e: Evaluation) -> Iterable[Item]:
     """Yield Avg.VRMSE by model and set, with the published figure and the ratio, and the error reduction by model."""
-    here, published = (np.vstack([each, each.mean(axis=0)]).T for each in (e.seed_mean, e.published_of_these))
-    ratio = here / published
+    ours, published = (np.vstack([each, each.mean(axis=0)]).T for each in (e.seed_mean, e.published_of_these))
+    ratio = ours / published
     kinds = np.searchsorted(WITHIN, np.abs(ratio - 1.0))  # nan sorts after all others
     rows: list[tuple[str | Cell, ...]] = []
-    for name, *of_sets in zip(e.columns, *map(np.ndarray.tolist, (here, published, ratio, kinds)), strict=True):
+    for name, *of_sets in zip(e.columns, *map(np.ndarray.tolist, (ours, published, ratio, kinds)), strict=True):
         cells = (
             Cell(number(value, 4), KINDS[kind], f"{known:.4f} ×{times:.2f}" if math.isfinite(times) else "")
             for value, known, times, kind in zip(*of_sets, strict=True)
@@ -155,15 +155,15 @@ def _scores(e: Evaluation) -> Iterable[Item]:
         )
     yield Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
     base = e.columns.index(UNCALIBRATED)
-    gone, gone_published = (1.0 - e.of_models(of) / of[:, [base]] for of in (e.seed_mean, e.published_of_these))
-    told = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gone.mean(axis=0), strict=True))
+    gains, gains_published = (1.0 - e.of_models(of) / of[:, [base]] for of in (e.seed_mean, e.published_of_these))
+    text = ", ".join(f"{name} {100 * value:.0f} %" for name, value in zip(e.models, gains.mean(axis=0), strict=True))
     yield figure(
         "evaluation_figures.improvement_bars",
         "Improvement over uncalibrated",
-        f"Mean over the sets: {told}",
+        f"Mean over the sets: {text}",
         e.models,
-        gone,
-        gone_published,
+        gains,
+        gains_published,
     )
 
 
@@ -207,12 +207,12 @@ def _converging(e: Evaluation) -> Section:
         ("Pitch and yaw", [each.level_deg for each in shown]),
         ("The whole angle", [each.angle_deg for each in shown]),
     ):
-        told = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(shown, values, strict=True))
+        text = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(shown, values, strict=True))
         drawn.append(
             figure(
                 "evaluation_figures.misalignment_over_time",
                 f"{what}, error against time",
-                f"{what} against time; after {TIMES_S[-1]:g} s {told}",
+                f"{what} against time; after {TIMES_S[-1]:g} s {text}",
                 TIMES_S,
                 [each.name for each in shown],
                 [each.gnss_std for each in shown],
@@ -257,6 +257,7 @@ def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
 
 
 def _pull(study: ErrorsInVariables) -> Section:
+    """Lay out the scale error caused by noise in the reference, predicted and measured."""
     rows = [
         (
             f"{std:g}",
@@ -289,6 +290,7 @@ def _pull(study: ErrorsInVariables) -> Section:
 
 
 def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
+    """Lay out the scores of calibrations on each single run."""
     rows = []
     for run, label, values, observed in zip(
         study.runs, study.run_names, study.seed_mean.tolist(), study.yaw_observed.tolist(), strict=True
@@ -307,7 +309,7 @@ def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
     ]
     notes = (
         "Avg.VRMSE on all other trajectories, m/s. Headings: their circular standard deviation. ? marks where the "
-        "model mostly says that it has not seen yaw; – where it cannot run.",
+        "yaw is mostly not observable for the model; – where it cannot run.",
     )
     table = Table(("run", "headings, °", *e.columns), rows, marked=len(study.runs), dense=True, notes=notes)
     median = ", ".join(f"{name} {v:.4f}" for name, v in zip(e.columns, medians["median"].tolist(), strict=True))
@@ -325,6 +327,7 @@ def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
 
 
 def _held_out(held_out: Sequence[HeldOut]) -> Section:
+    """Lay out error and verdict on held-out data, by set and model."""
     sets = list(dict.fromkeys(each.set_name for each in held_out))
     models = list(dict.fromkeys(each.model for each in held_out))
     cells = {
@@ -343,14 +346,14 @@ def _held_out(held_out: Sequence[HeldOut]) -> Section:
     )
     drawn = []
     for name in sets:
-        own = [each for each in held_out if each.set_name == name]
+        of_set = [each for each in held_out if each.set_name == name]
         drawn.append(
             figure(
                 "replay_figures.held_out_errors",
                 f"{name}: error on held-out data",
-                "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in own),
-                [each.model for each in own],
-                *(np.array([getattr(each, kind) for each in own]) for kind in HELD_OUT_KINDS),
+                "Verdicts: " + ", ".join(f"{each.model} {each.verdict}" for each in of_set),
+                [each.model for each in of_set],
+                *(np.array([getattr(each, kind) for each in of_set]) for kind in HELD_OUT_KINDS),
             )
         )
     return section("Held-out verification", Table(("model", *sets), rows, notes=notes), *drawn)

@@ -38,7 +38,7 @@ def improvement_bars(models: Sequence[str], improvement: Array, published: Array
     axes.axvline(0.0, color=INK, linewidth=0.8)
     axes.set_yticks(rows, models)
     axes.invert_yaxis()
-    axes.set_xlabel("Avg.VRMSE taken away from the uncalibrated, %")
+    axes.set_xlabel("reduction of the uncalibrated Avg.VRMSE, %")
     axes.grid(False, axis="y")
     legend_above(axes)
     return figure

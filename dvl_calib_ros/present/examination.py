@@ -30,7 +30,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     lead, found = (found[0], found[1:]) if found and found[0].code.startswith(NO_IMU) else (None, found)
     found = (*found, *examined.against)
     notes = (note.sentence for note in discovery.notes)
-    said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
+    lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"
     also = "else " if lead or examined.notes else ""
     nothing = "Without a reference only pitch is observable, and yaw on opposite headings."
@@ -40,7 +40,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
         answer=Answer(examined.verdict, severity, [f"{answer} {examined.why}".rstrip()]),
         warnings=examined.notes,
         sections=[
-            Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *said]),
+            Section(f"{names}: {examined.seconds:.0f} s", [table_by(CONTENTS, examined.contents, words=5), *lines]),
             Section(
                 f"Findings: {len(found)}" if found else f"Nothing {also}wrong was found",
                 list(map(FindingLine, found)) or [Sentence("")],
@@ -77,8 +77,8 @@ def next_commands(examined: Examination, is_live: bool, named: Sequence[str]) ->
         names = ((role, getattr(discovery.topics, role)) for role in ("dvl", "gnss", "imu"))
         topics = [(role, name) for role, name in names if name.lstrip("/") not in ("", getattr(default, role))]
         values = {name: list(value) if isinstance(value, tuple) else value for name, value in discovery.values.items()}
-        told = options(topics, [f"{name}:={as_yaml(value)}" for name, value in values.items()])
-        return [("next", typed("run --watch", (), *told, "-p", "result_file:=calibration.yaml"))]
+        arguments = options(topics, [f"{name}:={as_yaml(value)}" for name, value in values.items()])
+        return [("next", typed("run --watch", (), *arguments, "-p", "result_file:=calibration.yaml"))]
     given = [
         word
         for found in examined.findings

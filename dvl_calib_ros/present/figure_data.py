@@ -35,10 +35,7 @@ def mark_time(axes: Axes, run: str) -> None:
 
 
 class MapTrack(Line2D):
-    """Invisible copy of a line on a map, with a time for each point.
-
-    The times are on the axis of the run's figures.
-    """
+    """Invisible copy of a line on a map, with a time for each point. The times are on the axis of the run's figures."""
 
     def __init__(self, line: Line2D, run: str, times: Array) -> None:
         """Set up. line: drawn line of P points. times: (P,)."""

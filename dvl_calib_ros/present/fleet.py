@@ -49,18 +49,18 @@ def fleet(result: Fleet) -> Document:
     recordings = result.recordings
     persons = sum(len(each.recordings) for each in result.persons)
     severity = ANSWERS[result.word].severity if result.word in ANSWERS else Severity.MARGINAL
-    said = [
+    sentences = [
         f"{each.name}: {reason.full_sentence}"
         for each in vehicles
         if each.compared is not None
         for reason in reasons(each.compared)
         if each.compared.verdict != "same" and reason.code in MOVEMENTS
     ]
-    if not said and result.word == "same":
-        said = ["No movement found; the table says how small a movement could not be seen."]
-    if not said:
-        said = ["No vehicle has two days that show the same angle, so nothing can be compared."]
-    said.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
+    if not sentences and result.word == "same":
+        sentences = ["No movement found; the table has the smallest detectable movement."]
+    if not sentences:
+        sentences = ["No vehicle has an angle that is observable on two days, so nothing can be compared."]
+    sentences.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
     sitting = [VehicleNow(each, now(each)) for each in sorted(vehicles, key=_urgency)]
     speeds = [
@@ -74,14 +74,14 @@ def fleet(result: Fleet) -> Document:
     ]
     several = any(len(each.recordings) > 1 for each in result.persons)
     compasses = [(each.name, each.heading) for each in vehicles if each.heading is not None]
-    told = "; ".join(f"{name} up to {largest(heading):.2f}°" for name, heading in compasses)
+    deviations = "; ".join(f"{name} up to {largest(heading):.2f}°" for name, heading in compasses)
     drawn = figure(
-        "comparison_figures.compass", "Deviation, °", f"Deviation of the heading by heading: {told}", compasses
+        "comparison_figures.compass", "Deviation, °", f"Deviation of the heading by heading: {deviations}", compasses
     )
     return Document(
         title="DVL calibrations of a fleet",
         subtitle=f"{counted(len(vehicles), 'vehicle')}, {counted(recordings, 'recording')}; {done}",
-        answer=Answer(result.word, severity, said),
+        answer=Answer(result.word, severity, sentences),
         warnings=result.notes,
         sections=[
             Section("Vehicles", [replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True)]),
@@ -139,7 +139,7 @@ class VehicleNow(NamedTuple):
         if self.history.compared is not None:
             return ""
         days = len(self.history.days)
-        return {0: "No recording is usable.", 1: "One day alone."}.get(days, "No two days show the same angle.")
+        return {0: "No recording is usable.", 1: "One day alone."}.get(days, "No angle is observable on two days.")
 
     @property
     def seen_from(self) -> str:

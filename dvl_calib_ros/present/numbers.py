@@ -86,7 +86,7 @@ def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffec
     specs = {} if of is None else {each.name: each for each in of.parameters}
     texts = []
     for name, values in parameters.items():
-        said, unit = (specs[name].spoken, specs[name].unit) if name in specs else (name, "")
+        label, unit = (specs[name].spoken, specs[name].unit) if name in specs else (name, "")
         (value, low, high), unit = quantity(values, unit)
         half = 0.5 * (high - low)
         if math.isfinite(half) and half > 0.0:
@@ -96,7 +96,7 @@ def intervals(parameters: Mapping[str, tuple[float, float, float]], of: AnyEffec
         else:
             shown = [three(each) for each in (value, low, high)]
         space = "" if unit.startswith("°") else " "
-        texts.append(" ".join(f"{said} {shown[0]}{space}{unit} ({shown[1]} to {shown[2]})".split()))
+        texts.append(" ".join(f"{label} {shown[0]}{space}{unit} ({shown[1]} to {shown[2]})".split()))
     return "; ".join(texts) or "–"
 
 

@@ -65,14 +65,14 @@ _AXES = {
 NO_MOUNTING = "No mounting is given. The models' estimates are in the details (--verbose)."
 AGAINST_TRAVEL = (
     "Without a reference the angles are relative to the direction of travel: a constant sideslip looks like yaw, and "
-    "driving astern looks like a DVL turned by 180°."
+    "driving astern looks like a DVL rotated by 180°."
 )
 AGAINST_IMU = (
     "Angles are relative to the IMU: a constant error of its heading is in the yaw, one of its level in roll and "
     "pitch. Both are harmless as long as the same IMU is used."
 )
 STRAIGHT = "A straight kilometre of dead reckoning ends {0.before} m off as mounted, {0.after} m corrected (1σ)."
-NO_RESIDUALS = ". No reference is beside enough of them for residuals."
+NO_RESIDUALS = ". Too few of them have a reference for residuals."
 RESIDUALS = (
     "; residuals are at the reference point, corrected by estimates without this data, with everything "
     "found, including lever arm and delay. They include the reference's noise. Lines are running means."
@@ -165,7 +165,7 @@ def replayed(
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
     first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
     notes = [note for note in run.notes if first is None or note != str(first)]
-    own = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
+    shown_warnings = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
     where = Where.BOTH if details else Where.PAGE
     streams = [(name, result.counts[key]) for key, name in _STREAMS]
     # an angle that is not observable must not be put on a vehicle
@@ -175,7 +175,7 @@ def replayed(
         title="DVL calibration",
         subtitle=", ".join(map(str, bags)),
         answer=_answer(verification),
-        warnings=own,
+        warnings=shown_warnings,
         sections=[
             section(
                 "",
@@ -238,8 +238,8 @@ def _answer(verification: Verification | None) -> Answer:
     reasons = [*verification.reasons]
     if verification.mounting is not None and verification.verdict is not Severity.REJECT:
         reasons.append(verification.mounting)
-    said = [each.full_sentence for each in reasons]
-    return Answer(verification.verdict.value, verification.verdict, said, ADVICE[verification.verdict])
+    sentences = [each.full_sentence for each in reasons]
+    return Answer(verification.verdict.value, verification.verdict, sentences, ADVICE[verification.verdict])
 
 
 def _headline(run: Replayed, rejected: bool) -> str:
@@ -266,7 +266,7 @@ def _mounting(run: Replayed) -> Iterator[Item]:
             each.in_unit(each.std),
             each.in_unit(each.nominal),
             each.in_unit(each.value - each.nominal, signed=True),
-            "" if each.shown else "not shown by this data",
+            "" if each.shown else "not observable in this data",
             each.shown,
         )
         for each in quantities(run.result)
@@ -277,7 +277,7 @@ def _mounting(run: Replayed) -> Iterator[Item]:
     elif run.reference_frame in EARTH:
         yield Sentence(AGAINST_IMU)
     for lacks, axes in not_shown(run.result).items():
-        yield Sentence(f"{axes} (?): not shown by this recording; it needs {lacks}")
+        yield Sentence(f"{axes} (?): not observable in this recording; it needs {lacks}")
     if (cause := run.cause_of_scale) is not None:
         yield Sentence(cause.sentence)
     if run.result.iac_model in run.result.estimates and run.result.iac_model != run.result.selected:
@@ -287,11 +287,11 @@ def _mounting(run: Replayed) -> Iterator[Item]:
 def _iac_sentence(result: Result) -> str:
     """Return the result of the paper's own selection for roll, pitch, yaw and scale."""
     found = quantities(replace(result, selected=result.iac_model))
-    said = ", ".join(
+    values = ", ".join(
         f"{each.name} {each.in_unit(each.value)} ± {each.in_unit(each.std)}" if each.shown else f"{each.name} not shown"
         for each in found[:4]
     )
-    return f"The paper's own selection (iac, {result.iac_model}): {said}."
+    return f"The paper's own selection (iac, {result.iac_model}): {values}."
 
 
 def _mounting_to_copy(run: Replayed) -> Commands:
@@ -300,13 +300,13 @@ def _mounting_to_copy(run: Replayed) -> Commands:
     parameters = Parameters.from_mapping(result.parameters)
     rotation = result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
     mounting = result_document(result, run.dvl_frame, run.turned)["mounting"]
-    static, own = mounting["static_transform_publisher"], mounting["urdf_origin"]
-    lines = [("URDF", own)]
+    static, origin = mounting["static_transform_publisher"], mounting["urdf_origin"]
+    lines = [("URDF", origin)]
     if run.turned:
         tag = origin_tag(result.position_in_body, rpy_from_rotation(rotation))
         lines = [
             ("URDF", f"{tag}  (forward-left-up axes)"),
-            ("", f"{own}  ({run.dvl_frame} of the driver: forward-right-down)"),
+            ("", f"{origin}  ({run.dvl_frame} of the driver: forward-right-down)"),
         ]
     return Commands(lines, on_page=[("tf", static)] if static else [])
 

@@ -123,8 +123,8 @@ def selection_over_time(
     names = list(dict.fromkeys(name for name, _, _ in segments))
     figure, axes = new_figure(height=1.0 + 0.36 * (len(names) + 1))
     for name, start, end in segments:
-        left, right = time([start, end])
-        axes.barh(names.index(name) + 1, right - left, left=left, height=0.62, color=MODEL_STYLES[name].color)
+        begin, end_shown = time([start, end])
+        axes.barh(names.index(name) + 1, end_shown - begin, left=begin, height=0.62, color=MODEL_STYLES[name].color)
     edges = time(stamps_ns)
     if len(edges) > 1:
         share = _filled_from_next(paired_share[1:])[None]
@@ -170,10 +170,10 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
     """Draw bars of the DVL samples that each model used, gated, or was not given, by reason."""
     colours = (GOOD, BAD, WARNING, FAINT, "#8d99a6", "#d8dde1")
     figure, axes = new_figure(height=1.1 + 0.28 * len(models))
-    left = np.zeros(len(models))
+    bar_start = np.zeros(len(models))
     for (reason, values), colour in zip(counts.items(), colours, strict=False):
-        axes.barh(models, values, left=left, color=colour, height=0.7, label=reason)
-        left += np.asarray(values, dtype=float)
+        axes.barh(models, values, left=bar_start, color=colour, height=0.7, label=reason)
+        bar_start += np.asarray(values, dtype=float)
     axes.invert_yaxis()
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -219,7 +219,7 @@ def mounting_pictures(result: Result) -> list[Picture]:
     place = result.position_in_body
     how = f"The turn of {math.degrees(angle):.2f}° is drawn {times} times as large." if times > 1 else "True to scale."
     if place is None:
-        how += " Where the DVL sits is not known: drawn in the middle."
+        how += " The position of the DVL is unknown: drawn in the middle."
     return [
         picture(
             f"DVL on the vehicle, {where}", f"Axes of the DVL as configured and as found, {where}. {how}",
@@ -231,6 +231,7 @@ def mounting_pictures(result: Result) -> list[Picture]:
 
 
 def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float], down: bool) -> Figure:
+    """Draw the DVL's axes on the hull in one view, as configured and as found."""
     across, up, name = axes_of
     figure, axes = new_figure(height=2.6)
     length = max(_LENGTH, 2.4 * float(np.abs(place).max()))
@@ -279,8 +280,8 @@ def navigation_pictures(
     one: its reference and uncorrected track are drawn. corrected: tracks by their correction ('' for a single one); the
     first four are drawn. stamps_ns: of figures whose cursor the map follows.
     """
-    told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
-    alt = f"over {one.distance_m:.0f} m; off at the end: as mounted {one.before.end:.1f} m; {told}"
+    ends = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
+    alt = f"over {one.distance_m:.0f} m; error at the end: as mounted {one.before.end:.1f} m; {ends}"
     time = None if stamps_ns is None else TimeAxis(stamps_ns)
     figures = []
     if one.on_a_map:
@@ -331,7 +332,7 @@ def _coloured(figure: Figure, axes: Axes, one: Navigation) -> None:
     axes.add_collection(track)
     bar = figure.colorbar(track, ax=axes, shrink=0.6, aspect=24, pad=0.02)
     bar.outline.set_visible(False)
-    bar.set_label("corrected: off by, m")
+    bar.set_label("corrected: error, m")
 
 
 def error_along(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:
@@ -381,15 +382,15 @@ def calibration_figure(replayed: Replayed) -> Figure:
     angles, errors = figure.subplots(2, 1, sharex=True)
     time = 1e-9 * (history.stamps_ns - first_ns)
     phi = model.state[:, :3]
-    turned = np.degrees([corrected_rpy(each, parameters) for each in phi]) - np.degrees(parameters.mounting_rpy)
+    change = np.degrees([corrected_rpy(each, parameters) for each in phi]) - np.degrees(parameters.mounting_rpy)
     std = np.degrees([rpy_std(*each, parameters) for each in zip(phi, model.misalignment_covariance, strict=True)])
     settled = slice(int(_SETTLING * len(time)), None)
     for axis, found in enumerate(quantities(result)[:3]):  # σ includes the change to the next recording
-        value, sleeve = turned[:, axis], std[:, axis]
+        value, sleeve = change[:, axis], std[:, axis]
         label = f"{found.name} {value[-1]:+.2f}° ± {found.in_unit(found.std)}"
         angles.fill_between(time, value - sleeve, value + sleeve, color=_COLOURS[axis], alpha=0.15, linewidth=0)
         angles.plot(time, value, color=_COLOURS[axis], label=label)
-    span = turned[settled]
+    span = change[settled]
     margin = 0.2 * float(np.ptp(span)) + 0.1
     angles.set_ylim(float(span.min()) - margin, float(span.max()) + margin)
     angles.set_ylabel("correction of the mounting, °")

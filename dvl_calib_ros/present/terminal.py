@@ -67,13 +67,13 @@ def _groups(columns: Sequence[Column], needed: Sequence[int], width: int) -> lis
         if max((needed[at] for at in rest), default=0) > room:
             continue
         groups: list[list[int]] = []
-        left = 0
+        space_left = 0
         for at in rest:
-            if needed[at] > left:
+            if needed[at] > space_left:
                 groups.append([*names])
-                left = room
+                space_left = room
             groups[-1].append(at)
-            left -= needed[at]
+            space_left -= needed[at]
         return groups
     return None
 

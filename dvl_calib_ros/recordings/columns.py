@@ -147,12 +147,12 @@ class Singles:
             return self.log_ns
         stamps_ns = np.zeros(len(self), dtype=np.int64)
         for number, channel in enumerate(self.channels):
-            own = np.flatnonzero(self.channel == number)
+            of_channel = np.flatnonzero(self.channel == number)
             kind = VELOCITY_TYPES.get(channel.msgtype)
             if kind is not None and kind.adapted is not None:  # a message without header
-                stamps_ns[own] = [_stamp_or_none(message) for _, _, message, _ in self.messages(own)]
+                stamps_ns[of_channel] = [_stamp_or_none(message) for _, _, message, _ in self.messages(of_channel)]
             else:
-                stamps_ns[own] = self._header_stamps_ns(own)
+                stamps_ns[of_channel] = self._header_stamps_ns(of_channel)
         return stamps_ns
 
     def _header_stamps_ns(self, at: Index) -> Stamps:
@@ -162,12 +162,12 @@ class Singles:
         head = self.content[np.where(whole, starts, 0)[:, None] + np.arange(STAMP_END if whole.any() else 0)]
         stamps_ns = np.zeros(len(at), dtype=np.int64)
         for order, number in (("<", 1), (">", 0)):
-            own = whole & ((head[:, :1] == 0) & (head[:, 1:2] == number)).any(axis=1)
+            readable = whole & ((head[:, :1] == 0) & (head[:, 1:2] == number)).any(axis=1)
             seconds, nanoseconds = (
-                np.ascontiguousarray(head[own, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
+                np.ascontiguousarray(head[readable, first : first + 4]).view(f"{order}{kind}4").astype(np.int64).ravel()
                 for first, kind in ((STAMP_END - 8, "i"), (STAMP_END - 4, "u"))
             )
-            stamps_ns[own] = seconds * 1_000_000_000 + nanoseconds
+            stamps_ns[readable] = seconds * 1_000_000_000 + nanoseconds
         return stamps_ns
 
 
@@ -228,10 +228,7 @@ def is_kept(msgtype: str) -> bool:
 
 
 class Collector:
-    """Collector of a topic's messages while they are read.
-
-    expected: number of messages. parameters: used by the type's validity rules.
-    """
+    """Collector of a topic's messages. expected: number of messages. parameters: for the type's validity rules."""
 
     def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
         self._topic, self._msgtype, self._parameters, self._decoder = topic, msgtype, parameters, decoder
@@ -259,6 +256,7 @@ class Collector:
             self._take_singly(part)
 
     def _take_columns(self, part: Part) -> None:
+        """Store a part's columns. Raises ValueError, storing nothing, if its messages have no common layout."""
         columns = part.columns
         if columns is None:
             raise ValueError("not laid out alike")
@@ -269,13 +267,13 @@ class Collector:
         n = len(part)
         covariances, broken = Covariances.none(n), np.zeros(n, dtype=np.uint8)
         if kind is None:
-            values, beside = _imu(columns)
+            values, extra = _imu(columns)
             if math.isnan(self._heading_variance):
                 self._heading_variance = heading_variance(columns.orientation_covariance[0])
         else:
             velocity = kind.velocity(columns)
-            values, beside = _columns_of(velocity), beside_velocity(columns, self._msgtype)
-            beside = np.broadcast_to(beside, (n, beside.shape[1]))
+            values, extra = _columns_of(velocity), beside_velocity(columns, self._msgtype)
+            extra = np.broadcast_to(extra, (n, extra.shape[1]))
             covariances = _covariances(kind, columns)
             broken = _broken(kind, columns, self._parameters)
         self._world = self._world or frame_name(columns.header.frame_id[0].tobytes().decode("ascii"))
@@ -284,7 +282,7 @@ class Collector:
         if len(covariances.distinct):
             self._distinct.append(covariances.distinct)
             self._n_distinct += len(covariances.distinct)
-        rows = (part.arrival, part.log_ns, stamps_ns, values, self._frame(frame_ids), index, broken, beside)
+        rows = (part.arrival, part.log_ns, stamps_ns, values, self._frame(frame_ids), index, broken, extra)
         for column, each in zip(self._laid.values(), rows, strict=True):
             column.add(each)
 

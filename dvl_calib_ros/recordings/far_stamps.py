@@ -46,14 +46,14 @@ def far(each: Sequence[Stamps]) -> list[Mask]:
     """
     none = [np.zeros(len(stamps_ns), dtype=bool) for stamps_ns in each]
     given = [stamps_ns for stamps_ns in each if len(stamps_ns)]
-    if not given or max(int(own.max()) for own in given) - min(int(own.min()) for own in given) <= SEGMENT_GAP_NS:
+    if not given or max(int(part.max()) for part in given) - min(int(part.min()) for part in given) <= SEGMENT_GAP_NS:
         return none
     in_order = np.sort(np.concatenate(given))
     breaks = np.flatnonzero(np.diff(in_order) > SEGMENT_GAP_NS) + 1
     if not len(breaks):
         return none
     starts, ends = in_order[np.append(0, breaks)], in_order[np.append(breaks, len(in_order)) - 1]
-    segment_of = [np.searchsorted(starts, own, side="right") - 1 for own in each]
+    segment_of = [np.searchsorted(starts, part, side="right") - 1 for part in each]
     shares = np.array([np.bincount(of, minlength=len(starts)) / max(len(of), 1) for of in segment_of])
     weights = shares.sum(axis=0)
     found = []
@@ -144,10 +144,10 @@ def without_far(
 def _named(topic: str, how: str, times_ns: Stamps, aside: Mask) -> Iterator[Reason]:
     """Yield the finding on the removed messages of a topic, from the mask (N,)."""
     if aside.any():
-        own = times_ns[aside]
-        first, last = _date(int(own.min())), _date(int(own.max()))
+        far_ns = times_ns[aside]
+        first, last = _date(int(far_ns.min())), _date(int(far_ns.max()))
         yield finding(
-            "STAMPS_FAR", topic=topic, count=len(own), how=how, when=f"at {first}" if first == last else
+            "STAMPS_FAR", topic=topic, count=len(far_ns), how=how, when=f"at {first}" if first == last else
             f"from {first} to {last}", total=len(aside),
         )  # fmt: skip
 
@@ -165,9 +165,9 @@ def _within(spans_ns: Sequence[Span], kept_ns: Stamps, aside_ns: Collection[int]
     length_ns = int(kept_ns.max() - kept_ns.min()) if len(kept_ns) else 0
     most_ns = min(max(length_ns, LEAST_PAUSE_NS), SEGMENT_GAP_NS)
     for start_ns, end_ns in spans_ns:
-        own = kept_ns[(kept_ns >= start_ns) & (kept_ns <= end_ns)]
-        if len(own):
-            first_ns, last_ns = int(own.min()), int(own.max())
+        inside_ns = kept_ns[(kept_ns >= start_ns) & (kept_ns <= end_ns)]
+        if len(inside_ns):
+            first_ns, last_ns = int(inside_ns.min()), int(inside_ns.max())
             yield (
                 first_ns if start_ns in aside_ns or first_ns - start_ns > most_ns else start_ns,
                 last_ns if end_ns in aside_ns or end_ns - last_ns > most_ns else end_ns,

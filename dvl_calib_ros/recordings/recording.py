@@ -240,7 +240,7 @@ def together(each: Sequence[Recording]) -> Recording:
         tuple(path for one in each for path in one.paths),
         {name: kind for one in each for name, kind in one.types.items()},
         {
-            name: Held(frozenset().union(*(own.types for own in owns)), any(own.lacks_definition for own in owns))
+            name: Held(frozenset().union(*(held.types for held in owns)), any(held.lacks_definition for held in owns))
             for name, owns in held.items()
             if owns
         },
@@ -262,8 +262,8 @@ def _joined_waters(each: Sequence[Recording]) -> tuple[OfWater, ...]:
     for reading in (reading for one in each for reading in one.waters):
         found.setdefault((reading.topic, reading.kind), []).append(reading)
     return tuple(
-        own[0]._replace(values=np.concatenate([part.values for part in own]), std=max(part.std for part in own))
-        for own in found.values()
+        parts[0]._replace(values=np.concatenate([part.values for part in parts]), std=max(part.std for part in parts))
+        for parts in found.values()
     )
 
 
@@ -298,6 +298,7 @@ _NOTHING = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))
 def _read(
     path: Path, bag: BagReader, topics: Topics | None, parameters: Parameters, on_progress: Callable[[float], None]
 ) -> Recording:
+    """Read a bag window by window: columns of moving topics, static transforms, descriptions, water readings."""
     types = bag.topics
     moving = {topic for topic, kind in types.items() if is_kept(kind)}
     static = {topic for topic, kind in types.items() if is_static(topic, kind)}
@@ -312,7 +313,7 @@ def _read(
     collectors = {
         topic: Collector(topic, types[topic], counts[topic], parameters, bag.decoder) for topic in sorted(moving)
     }
-    left = dict.fromkeys(static, MOST_STATIC)
+    still_to_read = dict.fromkeys(static, MOST_STATIC)
     transforms: list[Any] = []
     descriptions: list[str] = []
     start_ns, end_ns = bag.span_ns
@@ -328,8 +329,8 @@ def _read(
             if topic in collectors:
                 collectors[topic].take(part)
                 continue
-            for message, _ in islice(part.messages(), left[topic]):
-                left[topic] -= 1
+            for message, _ in islice(part.messages(), still_to_read[topic]):
+                still_to_read[topic] -= 1
                 if message is not None and types[topic] == TF_TYPE:
                     transforms += list(message.transforms)
                 elif message is not None:
@@ -339,13 +340,13 @@ def _read(
     for topic in _restamped(columns, parameters.restamp, path):
         columns[topic] = columns[topic].restamped()
     kept, file_spans_ns, aside = without_far(columns, bag.file_spans_ns)
-    counts.subtract({topic: len(columns[topic]) - len(own) for topic, own in kept.items()})
+    counts.subtract({topic: len(columns[topic]) - len(column) for topic, column in kept.items()})
     held = {topic: Held(frozenset(bag.types_of(topic)), bag.lacks_definition(topic)) for topic in types}
-    imus = [own for own in kept.values() if own.msgtype == IMU_TYPE]
-    if not any(len(own.singles) or hold_orientations(own.laid.values) for own in imus):
-        for own in filter(None, map(orientations_of, list(kept.values()))):
-            kept[own.topic], counts[own.topic] = own, len(own)
-            types, held[own.topic] = {**types, own.topic: IMU_TYPE}, Held(frozenset({IMU_TYPE}), False)
+    imus = [column for column in kept.values() if column.msgtype == IMU_TYPE]
+    if not any(len(column.singles) or hold_orientations(column.laid.values) for column in imus):
+        for column in filter(None, map(orientations_of, list(kept.values()))):
+            kept[column.topic], counts[column.topic] = column, len(column)
+            types, held[column.topic] = {**types, column.topic: IMU_TYPE}, Held(frozenset({IMU_TYPE}), False)
     return Recording(
         (path,),
         types,
@@ -353,7 +354,7 @@ def _read(
         counts,
         file_spans_ns,
         (*bag.notes, *map(str, aside)),
-        {topic: (own,) for topic, own in kept.items()},
+        {topic: (column,) for topic, column in kept.items()},
         tuple(transforms),
         tuple(dict.fromkeys(descriptions)),
         waters=tuple(reading for each in waters.values() for reading in each.readings()),
@@ -368,8 +369,8 @@ def _restamped(columns: Mapping[str, TopicColumns], restamp: str, path: Path) ->
     found = {name.strip(): spelled(name.strip(), columns) for name in restamp.split(",")}
     for name, topic in found.items():
         if topic is None:
-            there = ", ".join((RESTAMP_ALL, *columns))
-            raise InputError(f"{path}: restamp: no topic {name!r} with stamps; there are {there}")
+            choices = ", ".join((RESTAMP_ALL, *columns))
+            raise InputError(f"{path}: restamp: no topic {name!r} with stamps; there are {choices}")
     return [topic for topic in found.values() if topic is not None]
 
 
@@ -413,11 +414,11 @@ def _map_types(bag: BagReader, text: str, where: str) -> None:
     """Register the message types that a field map fits. Raises InputError if there is none."""
     opened = {kind: bag.typestore(topic) for topic, kind in bag.topics.items() if may_be_mapped(kind)}
     stores = {kind: store for kind, store in opened.items() if store is not None}
-    said = {kind: misfit(text, store, kind) for kind, store in stores.items()}
-    for kind, why in said.items():
+    misfits = {kind: misfit(text, store, kind) for kind, store in stores.items()}
+    for kind, why in misfits.items():
         if not why:
             mapped_type(kind, text)
-    if all(said.values()):
+    if all(misfits.values()):
         # a type with a suggested field map is the most likely one
-        nearest = min(said, key=lambda kind: not suggested(stores[kind], kind), default="")
-        raise InputError(f"{where}: dvl_fields: {said.get(nearest) or 'no topic is of a type that is not listed'}")
+        nearest = min(misfits, key=lambda kind: not suggested(stores[kind], kind), default="")
+        raise InputError(f"{where}: dvl_fields: {misfits.get(nearest) or 'no topic is of a type that is not listed'}")

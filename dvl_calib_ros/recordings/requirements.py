@@ -39,11 +39,11 @@ def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | Non
     if topics.imu in recording.types:
         return []
     if topics.gnss not in recording.types:
-        what = "nothing tells the heading"
+        what = "the heading is unknown"
     elif frame is VelocityFrame.BODY:
-        what = "no lever arm is taken out or found"
+        what = "no lever arm is corrected or estimated"
     else:
-        what = "a reference in the earth's frame cannot be compared with the DVL; no lever arm is found"
+        what = "a reference in the earth's frame cannot be compared with the DVL; no lever arm is estimated"
     return [finding("BAG_NO_IMU", what=what)]
 
 
@@ -53,14 +53,14 @@ def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> N
         held = recording.held.get(name)
         if held is None:
             continue
-        said = " and ".join(sorted(held.types))
+        types = " and ".join(sorted(held.types))
         if held.types - wanted:
             expected = " or ".join(wanted)
-            raise InputError(f"{recording.where}: topic {name} holds {said}, expected {expected}; set --{role}-topic")
+            raise InputError(f"{recording.where}: topic {name} holds {types}, expected {expected}; set --{role}-topic")
         if len(held.types) > 1:
-            raise InputError(f"{recording.where}: topic {name} holds {said}; replay bags of one type together")
+            raise InputError(f"{recording.where}: topic {name} holds {types}; replay bags of one type together")
         if held.lacks_definition:
-            found.append(finding("BAG_NO_DEFINITION", type=said))
+            found.append(finding("BAG_NO_DEFINITION", type=types))
 
 
 _WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}

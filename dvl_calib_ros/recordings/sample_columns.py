@@ -154,14 +154,14 @@ def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBloc
         codes = np.zeros(len(laid.frames), dtype=np.uint8)
         axes: dict[Axes, Mask] = {}
         for place, name in names.items():
-            said = decoder.reference_frame(name)
-            is_other[place] = said is None
-            codes[place] = 0 if said is None else FRAME_CODES[said.frame]
-            if said is not None and said.axes is not AS_SENT:
-                axes.setdefault(said.axes, np.zeros(len(laid.frames), dtype=bool))[place] = True
+            declared = decoder.reference_frame(name)
+            is_other[place] = declared is None
+            codes[place] = 0 if declared is None else FRAME_CODES[declared.frame]
+            if declared is not None and declared.axes is not AS_SENT:
+                axes.setdefault(declared.axes, np.zeros(len(laid.frames), dtype=bool))[place] = True
         frames = codes[laid.frame]
-        for own, of_frame in axes.items():
-            values, covariances = _turned(own, values, covariances, of_frame[laid.frame])
+        for frame_axes, of_frame in axes.items():
+            values, covariances = _turned(frame_axes, values, covariances, of_frame[laid.frame])
     for reason, is_broken in [(WRONG_FRAME, is_other[laid.frame]), *broken]:
         new = is_broken & (refused == 0)
         if new.any():
@@ -178,11 +178,11 @@ def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBloc
 
 def _turned(axes: Axes, values: Array, covariances: Covariances, which: Mask) -> tuple[Array, Covariances]:
     """Convert the velocities (N, 3) marked by `which` (N,) from other axes, with their covariances."""
-    turned = axes.covariance(covariances.distinct)
+    rotated = axes.covariance(covariances.distinct)
     if which.all():
-        return axes.velocity(values), Covariances(turned, covariances.index)
+        return axes.velocity(values), Covariances(rotated, covariances.index)
     n = len(covariances.distinct)
-    both = np.concatenate([covariances.distinct, turned])
+    both = np.concatenate([covariances.distinct, rotated])
     index = np.where(which & (covariances.index >= 0), covariances.index + n, covariances.index)
     return np.where(which[:, None], axes.velocity(values), values), Covariances(both, index.astype(np.intp))
 

@@ -131,14 +131,14 @@ def look_of(
     found = numbers.in_order()
     if found is None:
         return None
-    stamps_ns, log_ns, values, beside, kept = found
+    stamps_ns, log_ns, values, extra, kept = found
     clock_rate = _clock_rate(stamps_ns, log_ns)
     ahead_s = 1e-9 * float(median(stamps_ns - start_ns - clock_rate * (log_ns - start_ns)))
     stamps_s = 1e-9 * (stamps_ns[kept] - start_ns)
     rate_hz = count / (seconds * clock_rate) if seconds else 0.0
-    rates, pose = beside[kept, :3], beside[kept, 3:] if msgtype == ODOMETRY else None
+    rates, pose = extra[kept, :3], extra[kept, 3:] if msgtype == ODOMETRY else None
     if msgtype == IMU_TYPE:
-        values, rates = np.hstack([values, beside]), np.full((0, 3), np.nan)
+        values, rates = np.hstack([values, extra]), np.full((0, 3), np.nan)
     turns = None if np.isnan(rates).all() else rates
     frame_id, claimed = numbers.frame_id, numbers.claimed_std
     return Look(
@@ -247,10 +247,10 @@ class _Numbers:
             messages = _differences(messages, self._kind.position, self._window_s)
         for arrival, log_ns, message in messages:
             with suppress(*UNREADABLE):
-                values, beside = self._of(message)
+                values, extra = self._of(message)
                 row = np.array([[arrival], [log_ns], [stamped(message, log_ns)]])
                 name = frame_name(str(message.header.frame_id if self._kind is None else self._kind.frame_id(message)))
-                self._rows.append((row[0], row[1], row[2], np.array([values], dtype=float), beside))
+                self._rows.append((row[0], row[1], row[2], np.array([values], dtype=float), extra))
                 self._names += [(arrival, name)] if name else []
                 self._variances.append(np.array([self._claimed_variance(message)]))
                 self.world = self.world or frame_name(str(message.header.frame_id))
@@ -284,15 +284,15 @@ class _Numbers:
         """Return stamps, log times, values, additional values, and the indices of valid rows in order of stamps."""
         if not self._rows:
             return None
-        arrival, log_ns, stamps_ns, values, beside = (np.concatenate(each) for each in zip(*self._rows, strict=True))
+        arrival, log_ns, stamps_ns, values, extra = (np.concatenate(each) for each in zip(*self._rows, strict=True))
         whole = np.ones(len(values), dtype=bool)
         if self._msgtype != IMU_TYPE:
             values[(values == 0.0).all(axis=1)] = np.nan  # sent by drivers without a measurement
             whole = (np.abs(values) < FASTEST).all(axis=1)
-        for each in (values, beside[:, :3]):
+        for each in (values, extra[:, :3]):
             each[~(np.abs(each) < FASTEST)] = np.nan  # so that squares are finite
         order = np.lexsort((arrival, stamps_ns))
-        return stamps_ns, log_ns, values, beside, order[whole[order]]
+        return stamps_ns, log_ns, values, extra, order[whole[order]]
 
 
 def _differences(

@@ -51,6 +51,7 @@ def _effect(name: str) -> AnyEffect:
 
 
 def _checked(effect: AnyEffect, name: str, number: float | str) -> float:
+    """Return a parameter's value as number within its limits. Raises InputError."""
     parameters = {parameter.name: parameter for parameter in effect.parameters}
     if name not in parameters:
         meant = _meant(name, list(parameters))

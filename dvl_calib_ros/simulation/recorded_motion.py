@@ -101,6 +101,7 @@ def recorded_motion(recording: MotionSource, rate_hz: float, seconds: float | No
 
 
 def _read(recording: MotionSource) -> _Samples:
+    """Read valid reference velocities and attitudes. Raises InputError for less than two."""
     opened = recording.opened
     topics = recording.topics.found_in(opened.types)
     _check_topics(recording, topics, opened.types)
@@ -181,5 +182,5 @@ def _in_body(samples: _Samples, attitude: RotationSpline) -> Array:
     is_body = samples.frames == FRAME_CODES[VelocityFrame.BODY]
     earth[is_ned] = earth[is_ned] @ ENU_FROM_NED.T
     span = np.clip(samples.velocity_time, samples.attitude_time[0], samples.attitude_time[-1])
-    turned = attitude(span).inv().apply(earth)
-    return np.where(is_body[:, None], samples.velocity, turned)
+    rotated = attitude(span).inv().apply(earth)
+    return np.where(is_body[:, None], samples.velocity, rotated)

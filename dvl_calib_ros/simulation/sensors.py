@@ -72,11 +72,11 @@ def measure_dvl(
     """
     misaligned = rotation_from_rpy(errors.misalignment_rpy).T
     if turn is None or not turn.any():
-        turned = velocity_body @ (misaligned @ rotation_dvl_from_body).T
+        rotated = velocity_body @ (misaligned @ rotation_dvl_from_body).T
     else:
         angles = Rotation.from_matrix(misaligned).as_rotvec() + turn
-        turned = Rotation.from_rotvec(angles).apply(velocity_body @ rotation_dvl_from_body.T)
-    scaled = turned * (1.0 + np.asarray(errors.scale))
+        rotated = Rotation.from_rotvec(angles).apply(velocity_body @ rotation_dvl_from_body.T)
+    scaled = rotated * (1.0 + np.asarray(errors.scale))
     beams = scaled @ BEAMS.T + np.asarray(errors.beam_bias)
     beams = beams + rng.normal(0.0, errors.beam_std, beams.shape)
     return beams @ AXES_FROM_BEAMS.T

@@ -127,13 +127,14 @@ def _finite(word: str) -> float:
 
 
 def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
+    """Describe the DVL by the calibration and effects of a diagnosis."""
     dvl, sizes = document["dvl"], {name: float(size) for name, size in document["dvl"]["sizes_mps"].items()}
     found = {each["name"]: _values(each["parameters"]) for each in document["effects"]}
     arm = found.get("lever_arm", {})
     bias = found.get("velocity_bias", {})
     phi, scale = (_values(document["calibration"][name]) for name in ("phi_rad", "delta_k"))
-    turned = Rotation.from_rotvec([phi.get(axis, 0.0) for axis in "xyz"]).as_matrix()
-    body_from_dvl = rotation_from_rpy(_three(dvl["mounting_rpy"])) @ turned.T
+    rotation = Rotation.from_rotvec([phi.get(axis, 0.0) for axis in "xyz"]).as_matrix()
+    body_from_dvl = rotation_from_rpy(_three(dvl["mounting_rpy"])) @ rotation.T
     return DvlDescription(
         source=str(path),
         mounting_rpy=_three(rpy_from_rotation(body_from_dvl)),
@@ -155,6 +156,7 @@ def _of_diagnosis(path: Path, document: Mapping[str, Any]) -> DvlDescription:
 def _others(
     document: Mapping[str, Any], found: Mapping[str, Mapping[str, float]], sizes: Mapping[str, float]
 ) -> tuple[Other, ...]:
+    """Return effects and noise without number of their own in a description, with their sizes."""
     systematic = {name: dict(values) for name, values in found.items() if name not in GIVEN_AS_NUMBERS}
     dvl = document["dvl"]
     for name, parameter, before in (
@@ -195,6 +197,7 @@ def _three(values: Sequence[float] | Any) -> Three:
 
 
 def _of_result(path: Path) -> DvlDescription:
+    """Describe the DVL by a calibration result. Raises InputError if it must not be used."""
     calibrated = load_calibrated_mounting(path)
     if calibrated.objections:
         raise InputError(f"{path}: {'; '.join(calibrated.objections)}: there is nothing to export")

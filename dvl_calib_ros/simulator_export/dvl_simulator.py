@@ -72,8 +72,8 @@ def write(description: DvlDescription) -> Settings:
             "beam_bias_noise_std": 0.0,
             "beam_bias_correlation_time": FOR_EVER_S,
         }
-    values, found, own = split(known, DEFAULTS)
-    own["model_enable_settings"] = "all true"
+    values, found, assumed = split(known, DEFAULTS)
+    assumed["model_enable_settings"] = "all true"
     document = {
         "dvl_simulator": {
             "general_settings": {name: values[name] for name in GENERAL},
@@ -81,18 +81,18 @@ def write(description: DvlDescription) -> Settings:
             "model_enable_settings": {f"enable_{name}": True for name in ENABLED},
         }
     }
-    above = "".join(f"# {line}\n" for line in comment(TITLE, description, found, own).splitlines())
+    above = "".join(f"# {line}\n" for line in comment(TITLE, description, found, assumed).splitlines())
     return Settings(
         above + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120),
         found,
-        own,
+        assumed,
         beams.axis_std if beams else None,
         scale,
         (
             f"the intervals of scale and biases are made for the constant seed {SEED}: leave it; every run then has "
             "the same noise, and another C++ library than libstdc++ may draw others",
-            "rotation_body_to_sensor_frame holds yaw, pitch, roll, and the lever arm is in the sensor's axes: so its "
-            "sources take them",
+            "rotation_body_to_sensor_frame has yaw, pitch, roll, and the lever arm is in the sensor's axes, as the "
+            "simulator's sources use them",
         ),
         frozenset({"scale", "velocity_bias"}),
     )

@@ -37,10 +37,10 @@ def write(description: DvlDescription) -> Settings:
         "stddev": beams.std if beams else None,
         "tilt": math.degrees(beams.angle) if beams and beams.is_found else None,
     }
-    values, found, own = split(known, DEFAULTS)
+    values, found, assumed = split(known, DEFAULTS)
     ET.register_namespace("gz", GZ)
     root = ET.Element("sdf", version="1.9")
-    root.append(ET.Comment(comment(TITLE, description, found, own)))
+    root.append(ET.Comment(comment(TITLE, description, found, assumed)))
     link = ET.SubElement(ET.SubElement(root, "model", name="vehicle"), "link", name="base_link")
     sensor = ET.SubElement(link, "sensor", {"name": "dvl", "type": "custom", f"{{{GZ}}}type": "dvl"})
     for name, text in (
@@ -63,7 +63,7 @@ def write(description: DvlDescription) -> Settings:
     for name in ("resolution", "maximum_range", "minimum_range"):
         ET.SubElement(dvl, name).text = repr(values[name])
     ET.SubElement(dvl, "reference_frame").text = values["reference_frame"]
-    return Settings(xml_text(root), found, own, beams.axis_std if beams else None)
+    return Settings(xml_text(root), found, assumed, beams.axis_std if beams else None)
 
 
 SIMULATOR = Simulator(

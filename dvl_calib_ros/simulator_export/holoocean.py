@@ -31,7 +31,7 @@ def write(description: DvlDescription) -> Settings:
         "VelSigma": beams.std if beams else None,
         "Elevation": math.degrees(beams.angle) if beams and beams.is_found else None,
     }
-    values, found, own = split(known, DEFAULTS)
+    values, found, assumed = split(known, DEFAULTS)
     configuration = {name: values[name] for name in DEFAULTS if name != "Hz"}
     sensor = {
         "sensor_type": "DVLSensor",
@@ -44,11 +44,11 @@ def write(description: DvlDescription) -> Settings:
     return Settings(
         json.dumps(sensor, indent=2, allow_nan=False) + "\n",
         found,
-        own,
+        assumed,
         beams.axis_std if beams else None,
         remarks=(
             "no socket is named, so location is from the agent's centre: add what lies between",
-            "pitch is about y, which points left; its documentation also calls that axis right: look at the sign",
+            "pitch is about y, which points left; its documentation also says right: check the sign",
             f"Hz must divide ticks_per_sec of the scenario; this is {values['Hz']:g}",
         ),
     )

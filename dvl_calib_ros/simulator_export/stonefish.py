@@ -35,9 +35,9 @@ def write(description: DvlDescription) -> Settings:
         "rate": description.rate_hz,
         "velocity": std,
     }
-    values, found, own = split(known, DEFAULTS)
+    values, found, assumed = split(known, DEFAULTS)
     sensor = ET.Element("sensor", name="dvl", rate=repr(values["rate"]), type="dvl")
-    sensor.append(ET.Comment(comment(TITLE, description, found, own)))
+    sensor.append(ET.Comment(comment(TITLE, description, found, assumed)))
     ET.SubElement(sensor, "specs", beam_angle=repr(values["beam_angle"]))
     noise = ("velocity", "velocity_percent", "altitude", "water_velocity", "water_velocity_percent")
     ET.SubElement(sensor, "noise", {name: repr(values[name]) for name in noise})
@@ -47,7 +47,7 @@ def write(description: DvlDescription) -> Settings:
     return Settings(
         xml_text(sensor),
         found,
-        own,
+        assumed,
         None if std is None else (std, std, std),
         remarks=("velocity_percent stays 0: its noise follows the signed velocity, and would decrease astern",),
     )

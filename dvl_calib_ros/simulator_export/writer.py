@@ -70,7 +70,7 @@ def export(name: str, simulator: Simulator, description: DvlDescription) -> Expo
     settings = simulator.write(description)
     missing = sorted(_missing(simulator.title, settings, description), key=lambda each: -(each.error or 0.0))
     ambiguous = tuple(
-        f"the data could not tell {', '.join(names)} apart; {names[0]} is taken" for names in description.ambiguous
+        f"the data could not distinguish {', '.join(names)}; {names[0]} is used" for names in description.ambiguous
     )
     return Export(name, settings, tuple(missing), (*description.doubts, *settings.remarks, *ambiguous, simulator.where))
 
@@ -89,12 +89,13 @@ def export_document(export: Export, description: DvlDescription, version: str) -
 
 
 def _missing(title: str, settings: Settings, description: DvlDescription) -> list[Missing]:
+    """Return what the settings cannot represent, each with size and reason."""
     why = _WHY_NOT.format(title)
     found = []
     bias = description.velocity_bias
     if any(bias) and "velocity_bias" not in settings.represented:
-        says = f"{', '.join(f'{value:.3g}' for value in bias)} m/s; {why}"
-        found.append(Missing("velocity_bias", says, float(np.linalg.norm(bias))))
+        text = f"{', '.join(f'{value:.3g}' for value in bias)} m/s; {why}"
+        found.append(Missing("velocity_bias", text, float(np.linalg.norm(bias))))
     found += _scale(title, settings, description)
     found += _noise(settings, description)
     for other in description.others:
@@ -114,10 +115,10 @@ def _missing(title: str, settings: Settings, description: DvlDescription) -> lis
 
 def _scale(title: str, settings: Settings, description: DvlDescription) -> list[Missing]:
     """Report the remaining scale-factor errors, if the simulator has no scale or one for all axes."""
-    left = np.array(description.scale) - settings.scale
-    if not np.any(np.abs(left) > 1e-9):
+    residual = np.array(description.scale) - settings.scale
+    if not np.any(np.abs(residual) > 1e-9):
         return []
-    error = None if description.speed is None else float(np.linalg.norm(left * description.speed))
+    error = None if description.speed is None else float(np.linalg.norm(residual * description.speed))
     per_axis = ", ".join(f"{100.0 * value:+.2f}" for value in description.scale)
     only = "one for all axes" if "scale" in settings.represented else "no setting for it"
     return [Missing("scale", f"{per_axis} % along x, y, z; {title} has {only}", error)]
@@ -131,11 +132,11 @@ def _noise(settings: Settings, description: DvlDescription) -> list[Missing]:
     error = math.sqrt(float(np.abs(has**2 - wanted**2).sum()))
     if error <= SAME_NOISE * float(np.linalg.norm(wanted)):
         return []
-    says = " and ".join(
+    text = " and ".join(
         f"{', '.join(f'{1e3 * value:.1f}' for value in values)} mm/s {what}"
         for values, what in ((wanted, "found along x, y, z"), (has, "with these settings"))
     )
-    return [Missing("noise", says, error)]
+    return [Missing("noise", text, error)]
 
 
 def mixed_scale(description: DvlDescription) -> float:
@@ -198,8 +199,8 @@ def split(
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Return all settings, the known ones, and the simulator's defaults. known: None if not found."""
     found = {name: tidy(value) for name, value in known.items() if value is not None}
-    own = {name: value for name, value in defaults.items() if name not in found}
-    return {**defaults, **found}, found, own
+    assumed = {name: value for name, value in defaults.items() if name not in found}
+    return {**defaults, **found}, found, assumed
 
 
 def comment(title: str, description: DvlDescription, found: Mapping[str, Any], own: Mapping[str, Any]) -> str:

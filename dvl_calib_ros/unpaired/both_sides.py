@@ -100,8 +100,8 @@ def is_copied(recordings: Sequence[RecordedStreams], residuals: Sequence[Array])
     """Return whether the DVL's residual has much less noise than the DVL itself, which then shares its reference's."""
     if not residuals:
         return False
-    left = [
+    deviations = [
         float(np.linalg.norm(Curve(one.dvl.time, r).roughness)) for one, r in zip(recordings, residuals, strict=True)
     ]
-    own = [float(np.linalg.norm(one.dvl.roughness)) for one in recordings]
-    return all(one < COPIED * other for one, other in zip(left, own, strict=True))
+    roughness = [float(np.linalg.norm(one.dvl.roughness)) for one in recordings]
+    return all(one < COPIED * other for one, other in zip(deviations, roughness, strict=True))

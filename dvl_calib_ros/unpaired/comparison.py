@@ -52,10 +52,7 @@ def compare(
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> UnpairedComparison:
-    """Compare bags of a vehicle with bags of a simulator, from any motions.
-
-    Raises InputError if they cannot be compared.
-    """
+    """Compare bags of a vehicle with bags of a simulator. Raises InputError if they cannot be compared."""
     real = read_log(vehicle, lambda share: on_progress(0.4 * share), effects, with_series)
     made = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
     comparison = compare_logs(real, made, effects)
@@ -79,8 +76,8 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
     noise.sort(key=lambda each: (ORDER.index(each.status), each.p))
     status = {each.name: each.status for each in found}
     both = {name: (*compared.sizes[name], status[name]) for name in compared.p}
-    own = [compared.sizes[name][0].effect for name in names[0].values() if name in compared.sizes]
-    shrunk = shrink(vehicle, simulator, models(both, own))
+    own_effects = [compared.sizes[name][0].effect for name in names[0].values() if name in compared.sizes]
+    shrunk = shrink(vehicle, simulator, models(both, own_effects))
     levels = [levels_by_regime(log) for log in (vehicle, simulator)]
     verdict = _verdict(found, noise, vehicle.diagnosis, simulator.diagnosis)
     return UnpairedComparison(
@@ -146,18 +143,18 @@ class _Compared:
     def effect(self, name: str, p: float) -> ComparedEffect:
         """Compare an effect that both sides can be tested for. p: adjusted."""
         vehicle, simulator = self.sizes[name]
-        there = is_there(vehicle, simulator), is_there(simulator, vehicle)
-        status = _status(there, p < LEVEL)
+        is_present = is_there(vehicle, simulator), is_there(simulator, vehicle)
+        status = _status(is_present, p < LEVEL)
         needs = ""
         if status is ComparisonStatus.CANNOT_TELL:
-            blind = "simulator" if there[0] else "vehicle"
+            blind = "simulator" if is_present[0] else "vehicle"
             least = smallest_difference(vehicle, simulator, len(self.p))
             smallest = ", ".join(f"{key} {value:.2g}" for key, value in least.items())
             needs = (
                 f"the two logs together would show a difference of {smallest}; with the {blind}: "
                 f"{self._effects[name].manoeuvre}"
             )
-        side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not there[0] else 0
+        side = 1 if status is ComparisonStatus.ONLY_SIMULATOR or not is_present[0] else 0
         trace = trace_of(self._selections[side], self._fits[side], self.sizes[name][side].effect)
         adds = float(np.sqrt((trace**2).sum(axis=1).mean()))
         where = lies(self._selections[side], self._fits[side], trace)
@@ -169,7 +166,7 @@ class _Compared:
         """Report an effect that one side cannot be tested for, or whose observable parts differ between the sides."""
         shown = [side[name].intervals() if name in side else {} for side in self._per_side]
         effect = self._effects[name]
-        needs = f"the two logs show nothing of it that is the same: {effect.manoeuvre}"
+        needs = f"no common part of it is observable in both logs: {effect.manoeuvre}"
         for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True):
             if name not in selection.testable:
                 lacks = ", ".join(sorted(need.value for need in effect.needs))

@@ -62,7 +62,7 @@ class Size:
 
     def taking(self, names: Sequence[str]) -> Array:
         """Return the matrix (q, p) that maps its parameters to other names; missing ones become 0."""
-        return np.array([[float(name == own) for own in self.names] for name in names])
+        return np.array([[float(name == name_kept) for name_kept in self.names] for name in names])
 
     @property
     def mean(self) -> tuple[Array, Array]:
@@ -107,9 +107,9 @@ def p_alike(vehicle: Size, simulator: Size) -> float:
     mean, covariance = simulator.mean
     n = len(vehicle.stacked)
     each, design = np.kron(np.eye(n), vehicle.taking(names)), np.tile(simulator.taking(names), (n, 1))
-    apart = each @ vehicle.stacked.ravel() - design @ mean
+    difference = each @ vehicle.stacked.ravel() - design @ mean
     covariance = each @ vehicle.covariance @ each.T + design @ covariance @ design.T
-    return _wald(apart, covariance, min(vehicle.dof, simulator.dof))
+    return _wald(difference, covariance, min(vehicle.dof, simulator.dof))
 
 
 def _wald(values: Array, covariance: Array, dof: int) -> float:
@@ -140,15 +140,15 @@ def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str
 
     An effect that one side cannot distinguish from one found on the other side gets that name.
     """
-    own = [{each.name: each.equivalent_to for each in log.diagnosis.effects} for log in (vehicle, simulator)]
-    names: list[dict[str, str]] = [{name: name for name in side} for side in own]
-    for here, there in ((0, 1), (1, 0)):
-        for name, equivalent in own[here].items():
-            if name in own[there] or names[here][name] != name:
+    equals = [{each.name: each.equivalent_to for each in log.diagnosis.effects} for log in (vehicle, simulator)]
+    names: list[dict[str, str]] = [{name: name for name in side} for side in equals]
+    for one, other_side in ((0, 1), (1, 0)):
+        for name, equivalent in equals[one].items():
+            if name in equals[other_side] or names[one][name] != name:
                 continue
-            shared = [other for other in equivalent if other in own[there] and other not in own[here]]
+            shared = [other for other in equivalent if other in equals[other_side] and other not in equals[one]]
             if shared:
-                names[here][name] = shared[0]
+                names[one][name] = shared[0]
     return names[0], names[1]
 
 
@@ -188,8 +188,8 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
         if not p:  # no part is observable
             continue
         stacked = vector[part].reshape(r, p)
-        own = tuple(selection.fitter.problem.recordings[i].name for i in whose if i is not None)
-        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found, own)
+        recordings = tuple(selection.fitter.problem.recordings[i].name for i in whose if i is not None)
+        result[effect.name] = Size(effect, stacked, covariance[part, part], dof, effect.name in found, recordings)
     return result
 
 

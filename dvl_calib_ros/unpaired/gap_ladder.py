@@ -120,7 +120,7 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
     # the vehicle's residual includes its reference's noise; the simulator's reference is noise-free
     of_reference = _reference_noise(problem, selection.fit.hypothesis, rng)
     drawn = [_random_noise(simulator.residuals, a, rng) + b[0] for a, b in zip(truth, of_reference, strict=True)]
-    own = [
+    own_noise = [
         turned_over(a - b, noise_spectrum(of_it, one.dvl.noise), rng)
         for a, b, of_it, one in zip(truth, everything, of_reference, problem.recordings, strict=True)
     ]
@@ -130,7 +130,7 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
         is_everything = set(model.added) == set(ladder[-1].added) and not model.kept
         predicted = everything if is_everything else _held_out(selection, model)
         off = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
-        noise = own if model.vehicle_noise else drawn
+        noise = own_noise if model.vehicle_noise else drawn
         made = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
         known = np.isfinite(off).all(axis=1)
         distance, null95, p = two_samples(recorded[known], made[known], windows[known], rng)
@@ -254,8 +254,8 @@ def features(values: Array, windows: Array) -> Array:
     _, index = np.unique(windows, return_inverse=True)
     count = np.bincount(index).astype(float)
     mean = np.stack([np.bincount(index, column) for column in values.T], axis=1) / count[:, None]
-    left = values - mean[index]
-    variance = np.stack([np.bincount(index, column**2) for column in left.T], axis=1) / count[:, None]
+    residual = values - mean[index]
+    variance = np.stack([np.bincount(index, column**2) for column in residual.T], axis=1) / count[:, None]
     full = count >= np.maximum(4.0, 0.5 * np.median(count))
     return np.column_stack([mean, 0.5 * np.log(np.maximum(variance, 1e-12))])[full]
 
@@ -265,7 +265,7 @@ def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generat
     a, b = features(one, windows), features(other, windows)
     scale = np.maximum(robust_std(np.concatenate([a, b])), 1e-9)
     both = np.concatenate([a, b]) / scale
-    apart = np.linalg.norm(both[:, None] - both[None], axis=2)
+    distances = np.linalg.norm(both[:, None] - both[None], axis=2)
     w = len(a)
     if w < 4:
         return np.nan, np.nan, np.nan
@@ -273,7 +273,7 @@ def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generat
 
     def energy(signs: Array) -> Array:
         """Return -s'Ds / w², which is 2 E|X-Y| - E|X-X'| - E|Y-Y'|."""
-        return -np.einsum("...i,ij,...j->...", signs, apart, signs) / w**2
+        return -np.einsum("...i,ij,...j->...", signs, distances, signs) / w**2
 
     swap = rng.choice([-1.0, 1.0], (PERMUTATIONS, w))
     null = energy(np.concatenate([swap, -swap], axis=1))

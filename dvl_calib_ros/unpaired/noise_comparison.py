@@ -127,8 +127,8 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
     larger = 0 if intervals[0][0] >= intervals[1][0] else 1
     own_levels = [np.asarray(each) for each in blocks]
     if of_reference[larger] > 0.0:
-        own = np.exp(2.0 * own_levels[larger]) - of_reference[larger] ** 2
-        own_levels[larger] = 0.5 * np.log(np.maximum(own, 1e-12))
+        own_variance = np.exp(2.0 * own_levels[larger]) - of_reference[larger] ** 2
+        own_levels[larger] = 0.5 * np.log(np.maximum(own_variance, 1e-12))
     ratio = float(np.exp(own_levels[larger].mean() - own_levels[1 - larger].mean()))
     note = "DVL and reference together" if max(of_reference) > 0.0 else ""
     return Candidate(
@@ -169,7 +169,7 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
         if not all(name in each for each in slopes):
             continue
         (a, std_a), (b, std_b) = (each[name] for each in slopes)
-        there = tuple(_is_significant(each, name) for each in slopes)
+        is_present = tuple(_is_significant(each, name) for each in slopes)
         p = float(2.0 * norm.sf(abs(a - b) / np.hypot(std_a, std_b)))
         found.append(
             Candidate(
@@ -178,8 +178,8 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
                 around(a, std_a),
                 around(b, std_b),
                 p,
-                (there[0], there[1]),
-                matters=any(there),
+                (is_present[0], is_present[1]),
+                matters=any(is_present),
             )
         )
     return found
@@ -200,10 +200,10 @@ def at_one_motion(both: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -
         if not all(name in each for side in columns for each in side):
             continue
         usual = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
-        for side, of, own in zip(even, slopes, columns, strict=True):
+        for side, of, own_columns in zip(even, slopes, columns, strict=True):
             if name in of and _is_significant(of, name):
                 for index, each in enumerate(side):
-                    quieter = np.exp(-of[name][0] * (own[index][name] - usual))
+                    quieter = np.exp(-of[name][0] * (own_columns[index][name] - usual))
                     side[index] = replace(each, values=each.values * quieter[:, None])
     return even
 
@@ -234,8 +234,8 @@ def slopes_of(scattered: Sequence[Scatter]) -> Slopes:
     inverse = np.linalg.pinv(x.T @ x)
     parameters = inverse @ x.T @ log_square
     block = np.arange(len(x)) // BLOCK
-    left = (log_square - x @ parameters)[:, None] * x
-    scores = np.stack([np.bincount(block, column) for column in left.T], axis=1)
+    sample_scores = (log_square - x @ parameters)[:, None] * x
+    scores = np.stack([np.bincount(block, column) for column in sample_scores.T], axis=1)
     n = len(scores)
     covariance = inverse @ (scores.T @ scores) @ inverse * n / max(n - x.shape[1], 1)
     std = np.sqrt(np.diag(covariance))

@@ -95,11 +95,11 @@ class ClosedGap(Answering):
             return (*first.comparison.reasons, finding("SIMULATOR_NO_ROUNDS"))
         floor = 1e3 * best.comparison.floor_mps
         before, after = 1e3 * first.error_mps, 1e3 * best.error_mps
-        said = finding("SIMULATOR_ROUNDS", round=self.best, before=before, after=after, floor=floor)
+        outcome = finding("SIMULATOR_ROUNDS", round=self.best, before=before, after=after, floor=floor)
         if self.best == 0:
-            said = finding("SIMULATOR_ROUNDS_IN_VAIN", before=before, floor=floor)
-        left = tuple(each for each in best.comparison.reasons if each.code != "SIMULATOR_PUT_RIGHT")
-        return (said, *left)
+            outcome = finding("SIMULATOR_ROUNDS_IN_VAIN", before=before, floor=floor)
+        other_reasons = tuple(each for each in best.comparison.reasons if each.code != "SIMULATOR_PUT_RIGHT")
+        return (outcome, *other_reasons)
 
 
 def close_gap(

@@ -29,6 +29,7 @@ def compare_streams(vehicle: Log, simulator: Log) -> list[Candidate]:
 
 
 def _outliers(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the shares of outliers: spikes of a fast stream, otherwise large residuals."""
     counts = []
     for log in (vehicle, simulator):
         far = n = 0
@@ -90,9 +91,9 @@ def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
     rates = [1.0 / float(np.median([f.interval for f in log.facts])) for log in (vehicle, simulator)]
     if not np.isfinite(rates).all():
         return None
-    apart = abs(rates[0] / rates[1] - 1.0)
+    change = abs(rates[0] / rates[1] - 1.0)
     shown: list[Triple] = [(rate, rate * (1.0 - 0.5 * RATE_SHARE), rate * (1.0 + 0.5 * RATE_SHARE)) for rate in rates]
-    return Candidate("rate", "Hz", shown[0], shown[1], 0.0 if apart > RATE_SHARE else 1.0, matters=apart > RATE_SHARE)
+    return Candidate("rate", "Hz", shown[0], shown[1], 0.0 if change > RATE_SHARE else 1.0, matters=change > RATE_SHARE)
 
 
 def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
@@ -124,8 +125,8 @@ def _times(name: str, vehicle: Array, simulator: Array, worth: float) -> Candida
     if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
         return None
     shown: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
-    there = tuple(abs(float(each.mean())) > worth for each in (vehicle, simulator))
-    apart = abs(float(vehicle.mean() - simulator.mean()))
+    is_present = tuple(abs(float(each.mean())) > worth for each in (vehicle, simulator))
+    gap = abs(float(vehicle.mean() - simulator.mean()))
     return Candidate(
-        name, "s", shown[0], shown[1], welch(vehicle, simulator), (there[0], there[1]), matters=apart > worth
+        name, "s", shown[0], shown[1], welch(vehicle, simulator), (is_present[0], is_present[1]), matters=gap > worth
     )

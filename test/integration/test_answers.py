@@ -53,7 +53,7 @@ def test_without_an_imu_a_reference_in_the_body_is_compared_and_not_said_to_be_i
     told.dvl("/dvl", TWIST, "dvl_link")
     vehicle(told, "base_link")
     out, _ = succeed(capsys, "replay", told.write(tmp_path / "bag"))
-    assert "no IMU in the bag: no lever arm is taken out or found" in " ".join(out.split())
+    assert "no IMU in the bag: no lever arm is corrected or estimated" in " ".join(out.split())
     assert "earth's frame cannot" not in " ".join(out.split())
 
 
@@ -322,7 +322,7 @@ def test_the_answer_says_against_what_its_angles_are(tmp_path, capsys, has_refer
     out, _ = succeed(capsys, "replay", told.write(tmp_path / "bag"))
     said = " ".join(out.split())
     own = "a constant error of its heading is in the yaw, one of its level in roll and pitch"
-    crab = "driving astern looks like a DVL turned by 180°"
+    crab = "driving astern looks like a DVL rotated by 180°"
     assert (own in said, crab in said) == (has_reference, not has_reference)
 
 

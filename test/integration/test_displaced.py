@@ -111,7 +111,7 @@ def test_the_report_says_where_the_dvl_is_and_how_late(tmp_path, monkeypatch):
         for name in ("lever arm, ahead", "lever arm, to port", "stamps late")
     )
     np.testing.assert_allclose((ahead, to_port, late), (1.3, 0.2, -2.2), atol=0.05)
-    assert re.search(r"<span>lever arm, up</span><b>.*not shown by this data", page)
+    assert re.search(r"<span>lever arm, up</span><b>.*not observable in this data", page)
 
 
 @pytest.mark.slow

@@ -116,7 +116,7 @@ def test_an_autopilot_takes_place_quarter_turns_and_delay(saved):
         (["--instrument", "cerulean", "--now", "velocity_adjustment=0"], "0.8 to 1.25"),
         (["--instrument", "cerulean", "--now", "roll=1000"], "-360 to 360"),
         (["--instrument", "ardupilot", "--now", "VISO_DELAY_MS=900"], "0 to 250"),
-        (["--instrument", "waterlinked", "--launch", "tf.launch.xml"], "turned twice"),
+        (["--instrument", "waterlinked", "--launch", "tf.launch.xml"], "corrected twice"),
         (["--instrument", "cerulean", "--send", "192.0.2.1"], "--send is for waterlinked"),
         (["--instrument", "ardupilot", "--send", "host"], "--send is for waterlinked"),
         (["--now", "speed_of_sound=1500"], "go with --instrument"),

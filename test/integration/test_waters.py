@@ -82,7 +82,7 @@ def test_apply_takes_the_speed_of_sound_that_the_recording_says_was_used(saved, 
     assert "not both" not in said
     said = applied(capsys, saved, "cerulean")
     assert "SET-VELOCITY-ADJUSTMENT 0.98" in said and "That explains the scale" in said
-    assert "velocity_adjustment takes the scale out: set it or the speed of sound, not both" in said
+    assert "velocity_adjustment corrects the scale: set it or the speed of sound, not both" in said
     shown, _ = succeed(capsys, "apply", saved, "--force")
     assert "water: Scale +1." in " ".join(shown.split())
     told = fail(capsys, "apply", saved, "--force", "--instrument", "waterlinked", "--now", "speed_of_sound=1450")

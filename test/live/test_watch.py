@@ -80,7 +80,7 @@ def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_
     wrong = drawn(status(2, "the data contradict the configuration", usable="no", **GOOD), 100.0)
     assert "not to be used" in wrong and "good enough: save" not in wrong and "contradict the configuration" in wrong
     early = drawn(status(usable="no"), 100.0)
-    assert "not to be used, the data do not show it yet" in early and "next: drive straight" in early
+    assert "not to be used, not observable yet" in early and "next: drive straight" in early
 
 
 def test_the_speed_of_sound_is_said_in_a_line_where_the_water_is_known():

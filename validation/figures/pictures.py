@@ -26,7 +26,7 @@ COLOURS = 64
 WIDTH = 1000  # pixels
 BARS = ("#bd1f01", "#ffa90e", "#b9ac70", "#3f90da")
 
-MEASURED = ": measured and as the effect says"  # in the heading of what each effect makes
+MEASURED = ": measured and explained"  # in the heading of what each effect makes
 
 COMMIT = "commit"  # key of the text in a picture's metadata
 

@@ -83,6 +83,7 @@ def read_summary(path: Path) -> Summary | None:
 
 
 def _summary(file: BinaryIO) -> Summary | None:
+    """Return the summary at the end of the file. Raises DamagedError."""
     size = file.seek(0, os.SEEK_END)
     if size < _FOOTER.size:
         raise DamagedError("it is cut off")
@@ -190,6 +191,7 @@ def _overlapping(indexes: Collection[ChunkIndex], wanted: Collection[int]) -> It
 def _whole_chunk(
     file: BinaryIO, size: int, index: ChunkIndex, tables: Tables, channels: Mapping[int, Channel]
 ) -> Batch:
+    """Return an undamaged chunk's messages, by its index if possible. Raises DamagedError."""
     at = index.chunk_start_offset
     opcode, length = record_head(file, at)
     if opcode != Opcode.CHUNK:
@@ -219,15 +221,15 @@ def _indexed_starts(file: BinaryIO, index: ChunkIndex) -> NDArray[np.uint64] | N
     file.seek(index.chunk_start_offset + index.chunk_length)
     content = file.read(index.message_index_length)
     starts = []
-    here = 0
-    while here + _INDEX_HEAD.size <= len(content):
-        opcode, length, _, size = _INDEX_HEAD.unpack_from(content, here)
-        end = here + RECORD_HEAD.size + length
-        if opcode != Opcode.MESSAGE_INDEX or end != here + _INDEX_HEAD.size + size or size % 16 or end > len(content):
+    at = 0
+    while at + _INDEX_HEAD.size <= len(content):
+        opcode, length, _, size = _INDEX_HEAD.unpack_from(content, at)
+        end = at + RECORD_HEAD.size + length
+        if opcode != Opcode.MESSAGE_INDEX or end != at + _INDEX_HEAD.size + size or size % 16 or end > len(content):
             return None
-        starts.append(np.frombuffer(content, "<u8", size // 8, here + _INDEX_HEAD.size)[1::2])
-        here = end
-    return np.concatenate(starts) if starts and here == len(content) else None
+        starts.append(np.frombuffer(content, "<u8", size // 8, at + _INDEX_HEAD.size)[1::2])
+        at = end
+    return np.concatenate(starts) if starts and at == len(content) else None
 
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:
@@ -314,16 +316,16 @@ class _FileWalk:
         has_ended: set at the end of the data. held: messages of the record at `at` itself, which count only if the
         record leads on to another.
         """
-        found, self.held, here = self.held, [], None
+        found, self.held, before = self.held, [], None
         try:
-            self.held, end, here = self._record(at)
+            self.held, end, before = self._record(at)
         except DamagedError as error:
             place, is_before_damaged = self._resumed(at)
             if is_before_damaged and self._before is not None:
                 found, at = [], self._before
             self._damage.note(str(error), place - at)
             end = place
-        self._before = here
+        self._before = before
         return found, end
 
     def _record(self, at: int) -> tuple[list[Found], int, int | None]:
@@ -373,6 +375,7 @@ class _FileWalk:
         return index if holes_in(self._file, at, at + len(self._file.read(_CHUNK_BEGIN_SIZE))) else None
 
     def _chunk(self, at: int, length: int, index: ChunkIndex | None = None) -> tuple[list[Found], int]:
+        """Return a chunk's messages and the place after it. Raises DamagedError if its content is not trusted."""
         self._holds_chunks, self._before = True, None
         chunk = open_chunk(self._file, at, length, self._size, index)
         # of a chunk that is not trusted, use only the channels, which later chunks need
@@ -401,6 +404,7 @@ class _FileWalk:
         return found._replace(place=min(headless, default=found.place))
 
     def _searched(self, at: int) -> Resumed:
+        """Search where to continue after damage: at a chunk, or without chunks at a record."""
         if self._may_hold_chunks:
             start = at if self._before is None else self._before
             place = search(self._file, start + 1, self._size, (Opcode.CHUNK, Opcode.CHUNK), self._is_chunk_at)

@@ -104,14 +104,14 @@ class Tables:
 
     def note(self, at: int, opcode: int, content: bytes) -> None:
         """Note a schema or channel. Raises DamagedError if it is invalid or contradicts the known one."""
-        kind, known, says = _DEFINITIONS[opcode]
+        kind, known, meaning = _DEFINITIONS[opcode]
         table = getattr(self, known)
         try:
             record = kind.read(ReadDataStream(BytesIO(content)))
         except PARSING as error:
             raise DamagedError(f"the record at byte {at} is damaged") from error
-        if (opcode, record.id) in self._met and says(table[record.id]) != says(record):
-            raise DamagedError(f"the record at byte {at} says otherwise of {known} {record.id} than others")
+        if (opcode, record.id) in self._met and meaning(table[record.id]) != meaning(record):
+            raise DamagedError(f"the record at byte {at} contradicts others about {known} {record.id}")
         self._met.add((opcode, record.id))
         table[record.id] = record
         self._made.clear()
@@ -152,8 +152,8 @@ def search(
     for window in range(start, size, _WINDOW):
         file.seek(window)
         data = np.frombuffer(file.read(_WINDOW + RECORD_HEAD.size - 1), dtype=np.uint8)
-        here = data[: max(len(data) - RECORD_HEAD.size + 1, 0)]
-        places = np.flatnonzero((here >= opcodes[0]) & (here <= opcodes[1]))
+        first_bytes = data[: max(len(data) - RECORD_HEAD.size + 1, 0)]
+        places = np.flatnonzero((first_bytes >= opcodes[0]) & (first_bytes <= opcodes[1]))
         for high in range(5, RECORD_HEAD.size):  # the upper half of the length
             places = places[data[places + high] == 0]
         for place in places.tolist():
@@ -235,6 +235,7 @@ def _begins(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
 
 
 def _is_definition(file: BinaryIO, at: int, opcode: int, length: int) -> bool:
+    """Return whether a record holds a definition that ends where the record does."""
     if length > LARGEST_RECORD:
         return False
     file.seek(at + RECORD_HEAD.size)
@@ -287,15 +288,15 @@ def message_head(
 
 def places_of(records: bytes, tables: Tables) -> Places | None:
     """Return the messages of sound records in order; None if something is wrong, to be handled by `messages_of`."""
-    places, here, n = [], 0, len(records)
+    places, at, n = [], 0, len(records)
     head = RECORD_HEAD.unpack_from
     try:
-        while here < n:
-            places.append(here)
-            here += 9 + head(records, here)[1]
+        while at < n:
+            places.append(at)
+            at += 9 + head(records, at)[1]
     except struct.error:
         return None
-    if here != n or n < _HEAD_AT.itemsize:
+    if at != n or n < _HEAD_AT.itemsize:
         return None
     start = np.array(places, dtype=np.intp)
     end = np.append(start[1:], n)
@@ -434,10 +435,7 @@ class ChunkHead(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Unpacked chunk. damage: '' if complete. is_believed: no sign of wrong records.
-
-    holes: unreadable parts of the records.
-    """
+    """Unpacked chunk. damage: '' if complete. is_believed: no sign of wrong records. holes: unreadable parts."""
 
     records: bytes
     damage: str
@@ -497,6 +495,7 @@ def open_chunk(file: BinaryIO, at: int, length: int, size: int, index: ChunkInde
 
 
 def _unpack_chunk(file: BinaryIO, at: int, start: int, head: ChunkHead, packed_size: int, size: int) -> Chunk:
+    """Decompress a chunk as far as readable, and note its damage."""
     file.seek(start)
     packed = file.read(packed_size)
     is_cut = len(packed) < packed_size

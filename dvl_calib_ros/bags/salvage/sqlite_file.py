@@ -124,8 +124,8 @@ class _Pages:
         self._file = file
         self.unread: set[int] = set()
         self.count = -(-size // self.size)  # the last may be cut
-        (said,) = struct.unpack_from(">I", header, 28)
-        self.missing = max(0, said * self.size - size) if is_sound else 0
+        (page_count,) = struct.unpack_from(">I", header, 28)
+        self.missing = max(0, page_count * self.size - size) if is_sound else 0
 
     def rows(self, number: int) -> Iterator[_TableRow]:
         """Yield the whole rows of a page, if it is a leaf of a table."""
@@ -142,6 +142,7 @@ class _Pages:
                 continue
 
     def _read(self, number: int) -> bytes:
+        """Return a page; empty, and noted as unread, if the disk cannot read it."""
         at = (number - 1) * self.size
         self._file.seek(at)
         page = self._file.read(self.size)
@@ -181,6 +182,7 @@ class _Pages:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
+    """Return SQLite's variable-length integer at a place, and the place after it."""
     value = 0
     for i in range(8):
         byte = data[at + i]
@@ -194,22 +196,22 @@ def _columns(payload: bytes) -> list[Any]:
     """Return the values of a record. Raises ValueError if they do not match its header exactly."""
     header_size, at = _varint(payload, 0)
     values: list[Any] = []
-    here = header_size
+    offset = header_size
     while at < header_size:
         kind, at = _varint(payload, at)
         if kind >= 12:
             size = (kind - 12) // 2
-            value: Any = payload[here : here + size]
+            value: Any = payload[offset : offset + size]
             value = value.decode() if kind % 2 else value
         elif kind in _INTEGER_SIZES:
             size = _INTEGER_SIZES[kind]
-            value = int.from_bytes(payload[here : here + size], "big", signed=True)
+            value = int.from_bytes(payload[offset : offset + size], "big", signed=True)
         elif kind in (0, 8, 9):
             size, value = 0, {0: None, 8: 0, 9: 1}[kind]
         else:
             raise ValueError("no column of a recording")
-        here += size
+        offset += size
         values.append(value)
-    if here != len(payload):
+    if offset != len(payload):
         raise ValueError("not as long as it says")
     return values

@@ -120,7 +120,7 @@ WRONG = {
     "round_brackets.csv": ("Time (s),Vx (knots),Vy (knots),Vz (knots)\n0,1,2,3\n", "'Vx (knots)' is not in m/s"),
     "milliseconds.csv": ("Time [ms],Vx [m/s],Vy [m/s],Vz [m/s]\n0,1,2,3\n", "'Time [ms]' is not in s"),
     "time_last.csv": ("Vx,Vy,Vz,Time\n1,2,3,0\n", "first column is 'Vx', expected time"),
-    "nan.csv": (HEADER + "0,1,nan,3\n1,1,,3\n", "row 1 holds a value that is not a finite number, and so does every"),
+    "nan.csv": (HEADER + "0,1,nan,3\n1,1,,3\n", "every row has a value that is not a finite number"),
     "unsorted.csv": (HEADER + "0,1,2,3\n2,1,2,3\n1,1,2,3\n", "time does not increase at row 3"),
     "repeated.csv": (HEADER + "0,1,2,3\n0,1,2,3\n", "time does not increase at row 2"),
     "five.csv": (HEADER + "0,1,2,3,4\n", "data row 1 has 5 columns"),
@@ -170,7 +170,7 @@ def test_a_row_without_a_number_is_left_out_counted_and_named_as_an_invalid_samp
     imported = import_recording(tmp_path / "a.csv", None, None, tmp_path / "bag", ImportOptions())
     assert imported.counts["dvl/twist"] == 2
     (note,) = imported.notes
-    assert "a.csv: 1 of 3 rows hold no finite number somewhere, left out; the first is row 2" in note
+    assert "a.csv: 1 of 3 rows have a value that is not finite, left out; the first is row 2" in note
     assert read_columns(tmp_path / "a.csv", "m/s").values.tolist() == TABLE[[0, 2], 1:].tolist()
 
 

@@ -454,7 +454,7 @@ def test_the_replay_says_what_the_dvls_data_are_in_the_terminal_and_in_json(tmp_
     changes = {5: lambda m: setattr(m, "num_good_beams", 1)}
     bag = write_driver_bag(tmp_path / "bag", steady_run(50), MARINE, changes=changes)
     assert main(["replay", str(bag), "-v", "--json", str(tmp_path / "out.json")]) == 0
-    said = "marine_acoustic_msgs/msg/Dvl, turned from forward-right-down to forward-left-up"
+    said = "marine_acoustic_msgs/msg/Dvl, converted from forward-right-down to forward-left-up"
     shown = capsys.readouterr().out
     assert said in shown and "1 few beams" in shown
     document = json.loads((tmp_path / "out.json").read_text())

@@ -236,7 +236,7 @@ def test_a_figure_that_is_not_over_time_has_no_data_for_the_script():
 def test_a_bag_without_gnss_has_no_residuals(tmp_path):
     samples = [sample for sample in run() if not isinstance(sample, ReferenceSample)]
     page = Page(replay_page(tmp_path, samples)[0])
-    assert "No reference is beside enough of them for residuals" in page.text
+    assert "Too few of them have a reference for residuals" in page.text
     assert "Residual" not in page.text and "Models with GNSS" not in page.text and "Models without GNSS" in page.text
 
 
