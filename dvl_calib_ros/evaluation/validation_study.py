@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.models import LINEAR_MODELS, MODELS
+from ..calibration.models import BY_VELOCITY, MODELS
 from ..calibration.models.base import Observations
 from ..calibration.models.parameters import SCHEMA, Parameters
 from ..calibration.numerics.frames import Array
@@ -50,8 +50,7 @@ from .results import (
     mean_of_known,
 )
 
-# The procedure has no lever arm and no delay, so the model that finds them would only be another name of G1
-EVALUATED = tuple(model.name for model in LINEAR_MODELS)
+EVALUATED = BY_VELOCITY
 # What evaluation sets otherwise than a live calibration: the published procedure has no gate, and M5 and M6 come out
 # as published with the prior from the reference velocity. Its GNSS measures three axes, also where heave is zero.
 DEFAULTS: Mapping[str, Any] = {"gate_probability": 0.0, "prior_source": "reference", "gnss_axes": "xyz"}
@@ -137,7 +136,7 @@ def evaluate(
         baselines=dict(
             zip(BASELINES, mean_of_known(np.array([each.baselines for each in outcomes]), 0).T, strict=True)
         ),
-        convergence=curves(procedure.models, np.stack([each.convergence for each in outcomes])),
+        convergence=curves(procedure.studied, np.stack([each.convergence for each in outcomes])),
         failures=tuple(failures),
     )
 
@@ -187,7 +186,7 @@ def _each_study(
 
 
 def _errors_in_variables(procedure: Procedure, outcomes: Sequence[SeedOutcome]) -> ErrorsInVariables | None:
-    models = models_in_noise_study(procedure.models)
+    models = models_in_noise_study(procedure.studied)
     if not models:
         return None
     pull = np.concatenate([each.pull for each in outcomes], axis=-1)

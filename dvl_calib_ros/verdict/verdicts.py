@@ -269,12 +269,6 @@ SELECTIONS = (
     ),
     _Selected("TRIM_KNOWN", "the trim is known", "The IMU gives roll and pitch, which a model with attitude uses.", ""),
     _Selected(
-        "FULL_HAS_DATA",
-        "attitude and angular velocity are known, so that the full model has data",
-        "It fits mounting, lever arm, delays and slow errors together.",
-        "",
-    ),
-    _Selected(
         "ARM_LOOKS_LIKE_ANGLE",
         "on this track a {metres:g} m error of the lever arm looks like {degrees:.1f}° of {angle}",
         "Turns to one side at one speed do not tell a lever arm from an angle.",
@@ -291,8 +285,5 @@ SELECTIONS = (
         "positions come too seldom to make velocities of them, so these are compared over legs",
         "More than three times position_window between two.",
         "",
-    ),
-    _Selected(
-        "NO_EVIDENCE", "{model} explains the data as well", "Nothing speaks for another lever arm or a delay.", ""
     ),
 )

@@ -47,7 +47,7 @@ class Parameters:
         read_only=False,
     )
     gnss_model: str = _parameter(
-        "G1",
+        "full",
         "Model that auto runs while GNSS is available. Under iac it is M3, unless this says M4.",
         choices=_AIDED,
         read_only=False,
@@ -301,8 +301,7 @@ class Parameters:
     )
     motion_std: float = _parameter(
         ASSUMPTIONS.motion_std,
-        "Standard deviation of sway and heave about what is modelled, straight ahead: noise of A1 and F1; of the mean "
-        "heave of 20 s in G1 and the full model, as long as the run has not shown its own.",
+        "Standard deviation of sway and heave about what is modelled, straight ahead: the noise of A1 and F1.",
         unit="m/s",
         low=1e-4,
         high=10.0,
@@ -316,32 +315,30 @@ class Parameters:
     )
     heave_offset_std: float = _parameter(
         ASSUMPTIONS.heave_offset_std,
-        "Prior standard deviation of a constant heave, such as of trim (G1, A1, F1).",
+        "Prior standard deviation of a constant heave, such as of trim (A1, F1).",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     reference_offset_std: float = _parameter(
         0.005,
-        "Prior standard deviation, east and north, of a constant error of a reference velocity in an earth frame, as "
-        "of an inertial navigation (G1, full). On one heading, σ of yaw and scale is at least four times this; several "
-        "headings find the error.",
+        "Prior standard deviation, east, north and up, of a constant error of a reference velocity in an earth frame, "
+        "as of an inertial navigation (full). Several headings find the error.",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     heading_deviation_std: float = _parameter(
         math.radians(0.5),
-        "Prior standard deviation of the heading's error: with the course (one and two cycles, as of a compass), and "
-        "over the run (G1, as a gyro drifts). On one heading the σ of yaw includes it; several headings show "
-        "its true size. 0: the heading is exact.",
+        "Prior standard deviation of the heading's error with the course (one and two cycles, as of a compass). On one "
+        "heading the σ of yaw includes it; several headings show its true size. 0: the heading is exact.",
         unit="rad",
         low=0.0,
         high=0.5,
     )
     dvl_bias_std: float = _parameter(
         0.008,
-        "Prior standard deviation of a constant error of the DVL's velocity, along each of its axes (G1, full). At one "
+        "Prior standard deviation of a constant error of the DVL's velocity, along each of its axes (full). At one "
         "speed σ of roll, pitch, yaw and scale includes it; several speeds show its size. 0.008: as the beam biases "
         "of the paper's data make it; the worst that is known is under three times that. 0: the DVL has none.",
         unit="m/s",
