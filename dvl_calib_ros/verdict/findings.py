@@ -429,7 +429,7 @@ FINDINGS = (
     Kind(
         "REFERENCE_OFFSET",
         "the reference has a constant error of {millimetres:.0f} mm/s towards {course:.0f}°{where}",
-        "A constant error of an inertial navigation, or a current where the DVL tracks the water. G1 and full estimate "
+        "A constant error of an inertial navigation, or a current where the DVL tracks the water. full estimates "
         "it, so it does not harm them; errors and drift against this reference include it.",
         "judge the drift by another reference",
     ),

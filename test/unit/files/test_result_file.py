@@ -50,7 +50,7 @@ def bag(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def result(bag) -> Result:
     return replayed(
-        bag, mounting_rpy=MOUNTING, lever_arm=(1.0, 0.0, -0.5), dvl_position="told", gate_probability=0.0, model="G1"
+        bag, mounting_rpy=MOUNTING, lever_arm=(1.0, 0.0, -0.5), dvl_position="told", gate_probability=0.0, model="full"
     ).result
 
 
@@ -78,8 +78,8 @@ def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
     loaded = load_initial_calibration(saved, MOUNTING)
     for name, estimate in result.estimates.items():
         x, p = estimate.state.copy(), estimate.recording_covariance.copy()
-        if name in ("G1", "full"):  # the constant error of the reference
-            of_day = [6, 7] if name == "G1" else [16, 17, 18, 19]
+        if name == "full":  # the constant error of the reference
+            of_day = [16, 17, 18, 19]
             x[of_day] = p[of_day] = p[:, of_day] = 0.0
             p[of_day, of_day] = Parameters().reference_offset_std ** 2
             if name == "full":
@@ -90,7 +90,7 @@ def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
 
 @pytest.fixture(scope="module")
 def of_biased(bag) -> Result:
-    return replayed(bag, model="G1", dvl_bias_std=0.01).result
+    return replayed(bag, model="full", dvl_bias_std=0.01).result
 
 
 def test_what_a_bias_of_the_dvl_makes_comes_back_and_two_files_of_one_dvl_share_it(of_biased, tmp_path):
@@ -112,7 +112,7 @@ def test_a_file_of_before_the_bias_was_kept_is_read_and_one_that_claims_too_much
     save_text(path, result_text(document))
     with pytest.raises(InputError, match="damaged, its by_dvl_bias is more than its covariance"):
         load_extrinsics(path, "a")
-    document["models"]["G1"]["by_dvl_bias"] = [[1.0, 2.0]]
+    document["models"]["full"]["by_dvl_bias"] = [[1.0, 2.0]]
     save_text(path, result_text(document))
     with pytest.raises(InputError, match="damaged, or of another version"):
         load_extrinsics(path, "a")
@@ -398,16 +398,16 @@ def test_a_file_of_before_the_end_was_announced_is_read(saved, result):
 
 
 def test_a_file_of_before_g1_had_the_error_of_the_reference_is_read_with_its_prior(saved):
-    now = load_initial_calibration(saved)["G1"]
+    now = load_initial_calibration(saved)["full"]
 
     def as_before(content):
-        g1 = content["models"]["G1"]
+        g1 = content["models"]["full"]
         g1["state_names"], g1["state"] = g1["state_names"][:6], g1["state"][:6]
         g1["covariance"] = [row[:6] for row in g1.pop("covariance_of_recording")[:6]]
-        if content["model"] == "G1":
+        if content["model"] == "full":
             content.update(copy.deepcopy(g1))
 
-    before = load_initial_calibration(change(saved, as_before))["G1"]
+    before = load_initial_calibration(change(saved, as_before))["full"]
     np.testing.assert_array_equal(before.x, [*now.x[:6], 0.0, 0.0])
     np.testing.assert_array_equal(before.p[:6, :6], now.p[:6, :6])
     np.testing.assert_array_equal(before.p[6:], np.eye(8)[6:] * Parameters().reference_offset_std ** 2)
