@@ -100,17 +100,17 @@ def recordings(folder: Path) -> Found:
         found[f"{name}.uncorrected"] = held_out["uncorrected_mps"]
         found[f"{name}.corrected"] = held_out["corrected_mps"]
         found[f"{name}.iac"] = published["verification"][found[f"{name}.iac_model"]]["held_out"]["corrected_mps"]
-        for model in ("G1", "full"):
+        for model in ("M3", "full"):
             found[f"{name}.{model}"] = replayed["verification"][model]["held_out"]["corrected_mps"]
         navigation = replayed["navigation"]
         found[f"{name}.drift_before"] = navigation["drift_m_per_km"]["before"]
         found[f"{name}.drift_after"] = navigation["drift_m_per_km"]["after"]
         found[f"{name}.noise_m_per_km"] = navigation["noise_m_per_km"]
         estimates[name] = each = _estimate(replayed["models"]["full"])
-        g1 = _estimate(replayed["models"]["G1"])
-        found[f"{name}.g1_yaw_deg"], found[f"{name}.std_g1_yaw"] = (
-            -np.degrees(g1["phi_z"][0]),
-            np.degrees(g1["phi_z"][1]),
+        published_here = _estimate(replayed["models"]["M3"])
+        found[f"{name}.m3_yaw_deg"], found[f"{name}.std_m3_yaw"] = (
+            -np.degrees(published_here["phi_z"][0]),
+            np.degrees(published_here["phi_z"][1]),
         )
         found[f"{name}.yaw_deg"], found[f"{name}.std_yaw"] = -np.degrees(each["phi_z"][0]), np.degrees(each["phi_z"][1])
         found[f"{name}.lever_x"], found[f"{name}.std_lever_x"] = each["lever_arm_x"][:2]
@@ -200,12 +200,12 @@ def diagnosed(folder: Path) -> Found:
     for name in RECORDINGS:
         bag, answer, applied = folder / "bags" / name, folder / f"{name}.json", folder / f"{name}.yaml"
         dvl_calib("diagnose", bag, "--json", answer, "--apply", applied)
-        dvl_calib("replay", bag, "--params", applied, "-p", "model:=G1", "--json", folder / f"{name}.replayed.json")
+        dvl_calib("replay", bag, "--params", applied, "-p", "model:=M3", "--json", folder / f"{name}.replayed.json")
         document = _json(answer)
         found[f"{name}.names"] = "; ".join(_named(each["name"], each["parameters"]) for each in document["effects"])
         found[f"{name}.verdict"] = document["verdict"]
-        replayed = _json(folder / f"{name}.replayed.json")["verification"]["G1"]["held_out"]
-        found[f"{name}.then_G1"] = replayed["corrected_mps"]
+        replayed = _json(folder / f"{name}.replayed.json")["verification"]["M3"]["held_out"]
+        found[f"{name}.then_M3"] = replayed["corrected_mps"]
         found[f"{name}.not_explained"] = document["gap"]["not_explained_mps"]
     three = [folder / "bags" / name for name in ("T01", "T03", "T05")]
     dvl_calib("diagnose", *three, "--json", folder / "three.json")
