@@ -201,7 +201,9 @@ def test_the_data_of_an_explorable_figure_is_what_the_figure_draws():
     seconds = np.arange(3000)
     time = TimeAxis(SECOND * seconds)
     value = np.where(seconds == 7, np.nan, np.sin(seconds / 300.0))
-    figure = estimate_over_time(time, SECOND * seconds, [ModelLine("full", value, 0.5 + 0.0 * value)], "full", "roll, °")
+    figure = estimate_over_time(
+        time, SECOND * seconds, [ModelLine("full", value, 0.5 + 0.0 * value)], "full", "roll, °"
+    )
     plot = json.loads(zlib.decompress(base64.b64decode(explorable(figure))))
     (line,), (sleeve,) = plot["lines"], plot["sleeves"]
     assert (line["name"], plot["y_label"], plot["x_label"]) == ("full", "roll, °", "time from the start, min")
