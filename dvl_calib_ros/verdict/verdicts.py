@@ -17,7 +17,7 @@ _KINDS = (
         "NO_SAMPLE_USED",
         "no sample was used",
         "The model had nothing to learn from: no reference, no attitude, or every sample was refused.",
-        "there is nothing to apply",
+        "there is nothing to apply; the model `full` needs 25 s of data",
         Severity.REJECT,
     ),
     Kind(

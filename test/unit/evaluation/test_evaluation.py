@@ -127,7 +127,7 @@ def test_the_truth_to_find_is_in_the_frame_of_the_estimates(runs):
     truth = true_state(MODELS["M3"])
     error = found[:, : truth.shape[1]] - truth
     assert np.degrees(np.abs(error[:, 1:3]).max()) < 0.4
-    assert np.abs(error[:, 3]).max() < 0.01
+    assert np.abs(error[:, 3]).max() < 0.015  # one scale for all axes
 
 
 def test_vrmse_from_moments_is_that_of_the_samples(rng):
@@ -183,11 +183,11 @@ def test_calibrations_are_judged_on_samples_that_they_had_not_seen(evaluation):
     }
     for each in found.values():
         assert sum(each.verdicts.values()) == len(protocol.MISALIGNMENTS_DEG)
-    full = found["E4", "full"]
+    m3 = found["E4", "M3"]
     gnss_noise = 0.2 * np.sqrt(3)
-    assert gnss_noise * 0.95 < full.corrected < gnss_noise * 1.05
-    assert full.corrected < full.uncorrected - 0.005
-    assert full.corrected == pytest.approx(full.predicted, rel=0.03)
+    assert gnss_noise * 0.95 < m3.corrected < gnss_noise * 1.05
+    assert m3.corrected < m3.uncorrected - 0.005
+    assert m3.corrected == pytest.approx(m3.predicted, rel=0.03)
 
 
 def test_a_verdict_is_worked_out_with_the_models_that_are_evaluated_alone(runs, monkeypatch):
@@ -207,7 +207,7 @@ def test_errors_in_variables_pull_the_scale_as_predicted(evaluation):
     assert dict(zip(study.models, study.noisy_axes, strict=True)) == {"M1": 3, "M2": 1, "M3": 2, "M4": 1}
     assert (np.abs(study.measured - study.predicted) < 4 * study.standard_error + 0.1 * np.abs(study.predicted)).all()
     at_300_mm = study.measured[:, -1]
-    assert at_300_mm[0] < -0.05 and abs(at_300_mm[-1]) < 0.03
+    assert at_300_mm[0] < -0.1 and abs(at_300_mm[-1]) < 0.05
 
 
 def test_a_run_of_one_heading_is_told_from_one_of_many(evaluation):
