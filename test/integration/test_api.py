@@ -137,7 +137,7 @@ def test_the_other_functions_give_dataclasses(tmp_path, bag):
     assert dc.doctor(made).verdict == "partly"  # of a minute no yaw to speak of: a replay of it claims ± 2.4°
     checked = dc.evaluate([bag, made], models=["M3"])
     assert checked.models == ("M3",)
-    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on G1 leaves ")
+    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on M3 leaves ")
     assert dc.replay([made], gnss_topic="none").model == "F1"
     with pytest.raises(dc.InputError, match="none of"):
         dc.evaluate(models=["M9"])
@@ -201,7 +201,7 @@ def test_topics_are_named_for_an_evaluation_as_for_a_replay(bag, tmp_path):
     other = dc.simulate(tmp_path / "other", seconds=60.0, seed=3)
     checked = dc.evaluate([bag, other], models=["M3"], dvl_topic="dvl/twist", gnss_topic="gnss/twist")
     assert checked.models == ("M3",)
-    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on G1 leaves ")
+    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on M3 leaves ")
     with pytest.raises(dc.InputError, match="no topic 'nowhere'"):
         dc.evaluate([bag, other], models=["M3"], gnss_topic="nowhere")
 

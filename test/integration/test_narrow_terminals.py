@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
 
 
 COMMANDS = {
-    "replay": ("replay", "one", "--verbose"),
+    "replay": ("replay", "one", "--verbose", "-p", "model:=M3"),
     "evaluate": ("evaluate", "one", "two", "--jobs", "1"),
     "apply": ("apply", "result.yaml"),
 }
