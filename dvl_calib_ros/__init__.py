@@ -1,12 +1,12 @@
 """Calibrate a Doppler velocity log before a dive: live on ROS 2 Jazzy and over recorded bags.
 
-The public interface, which is `api`: what the commands do, as functions, and what they take and give. It is imported
-when it is asked for, since the command line must not wait for NumPy to print its help.
+The public interface is `api`: the commands as functions. It is imported on first use, so that the command line need not
+wait for NumPy to print its help.
 """
 
 from .version import __version__ as __version__
 
-TYPE_CHECKING = False  # as in typing, which takes longer than all else here
+TYPE_CHECKING = False  # as in typing, whose import takes longer than the rest of this module
 if TYPE_CHECKING:
     from .api import Calibration, InputError, Mounting, ParameterError, Parameters, Scenario
     from .api.analyse import diagnose, evaluate, simulate

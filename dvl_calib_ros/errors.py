@@ -1,16 +1,16 @@
-"""The error that users see, and what makes texts from outside fit to be seen."""
+"""The error that users see, and escaping of texts from outside."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 
 class InputError(Exception):
-    """A file, topic or value that cannot be used; the message names it and says what to do about it."""
+    """A file, topic or value that cannot be used; the message names it and the remedy."""
 
 
 @contextmanager
 def needing_ros(what: str) -> Iterator[None]:
-    """Say of imports within that fail what is to be installed. what: who needs it. Raises InputError."""
+    """Turn failed ROS imports inside into InputError with the remedy. what: the command or part that needs ROS."""
     try:
         yield
     except ImportError as error:
@@ -20,10 +20,10 @@ def needing_ros(what: str) -> Iterator[None]:
 
 
 def printable(text: str) -> str:
-    """Text for a terminal: control characters, which names in a bag may hold, shown as escapes."""
+    """Escape control characters in a text for a terminal; names in a bag may have them."""
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def as_cell(value: object) -> object:
-    """Return a value for a spreadsheet's cell: a text that would be run as a formula is quoted, all else as it is."""
+    """Return a value for a spreadsheet cell; text that would run as a formula is quoted."""
     return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@")) else value

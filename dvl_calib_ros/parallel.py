@@ -1,7 +1,7 @@
-"""The same work on the cores of this machine (joblib's loky) or on a Dask cluster.
+"""Parallel work on the cores of this machine (joblib's loky) or on a Dask cluster.
 
-Items are independent and results come back in the order of the items, so that neither the number of workers nor the
-order in which they finish changes anything.
+Items are independent and results come back in their order, so neither the number of workers nor the order in which they
+finish changes anything.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from .errors import InputError
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
-# A scheduler that has not answered, or has no worker, after this long will not; nor will one come back
+# time limits, s: scheduler's answer, first worker, and return of a worker after all were lost
 CONNECT_TIMEOUT_S = 5.0
 WORKERS_TIMEOUT_S = 10.0
 ALL_WORKERS_LOST_S = 60.0
-# Pieces that are handed to each process of this machine, so that it never waits for the next.
+# items queued per process, so that none waits for the next
 HANDED_OUT = 2
-# A worker process ends so soon (s) after the process that it works for.
+# interval in which a worker process checks its parent, s
 PARENT_LOOKED_FOR_S = 1.0
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Where to work. jobs: processes on this machine, 0: one per core. dask: address of a scheduler, '' for none."""
+    """Choice of workers. jobs: local processes, 0: one per core. dask: address of a scheduler, '' for none."""
 
     jobs: int = 1
     dask: str = ""
@@ -43,7 +43,7 @@ class Workers:
 
 @dataclass(frozen=True)
 class Lost:
-    """Stands for the outcome of an item with which every worker died that tried it. why: in a sentence."""
+    """Outcome of an item that killed every worker that tried it. why: a sentence."""
 
     why: str
 
@@ -54,15 +54,15 @@ def run_all(
     workers: Workers,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> list[Outcome]:
-    """`work` of every item, in order; on_progress is told the share (0..1) that is done.
+    """Return `work` of every item, in order. on_progress receives the finished share (0..1).
 
-    Exceptions of `work` go through. Raises InputError for a cluster that does not answer, or workers that died.
+    Exceptions of `work` propagate. Raises InputError for a cluster that does not answer, or workers that died.
     """
     if workers.dask:
         found: dict[int, Outcome] = {}
         for index, outcome in outcomes_as_done(work, items, workers):
             if isinstance(outcome, Lost):
-                raise InputError(f"--dask {workers.dask}: {outcome.why}; start the cluster anew")
+                raise InputError(f"--dask {workers.dask}: {outcome.why}; restart the cluster")
             found[index] = outcome
             on_progress(len(found) / len(items))
         return [found[index] for index in range(len(items))]
@@ -86,10 +86,10 @@ def _on_cores(
 
 
 def outcomes_on_cores(work: Callable[[Item], Outcome], items: Iterable[Item], jobs: int) -> Iterator[Outcome]:
-    """`work` of every item in order, each as soon as it and those before it are done. jobs: processes, 0: one per core.
+    """Yield `work` of every item in order, as soon as possible. jobs: number of processes, 0: one per core.
 
-    An item is taken when a process is about to be free for it. Exceptions of `work` go through. Raises InputError for
-    an item that kills its worker.
+    An item is read only when a process is about to be free. Exceptions of `work` propagate. Raises InputError for an
+    item that kills its worker.
     """
     early: dict[int, Outcome] = {}
     following = 0
@@ -105,9 +105,9 @@ def outcomes_on_cores(work: Callable[[Item], Outcome], items: Iterable[Item], jo
 def outcomes_as_done(
     work: Callable[[Item], Outcome], items: Sequence[Item], workers: Workers
 ) -> Iterator[tuple[int, Outcome | Lost]]:
-    """Index of an item and `work` of it, as they are done; `Lost` where that kills the worker, which costs no other.
+    """Yield index and `work` of each item as it finishes; `Lost` if the item killed its workers.
 
-    Exceptions of `work` go through. Raises InputError for a cluster that does not answer, or has no workers any more.
+    Exceptions of `work` propagate. Raises InputError for a cluster that does not answer or lost all workers.
     """
     if workers.dask:
         with _quiet_logs():
@@ -120,7 +120,7 @@ def outcomes_as_done(
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """Return the number of cores that this process may use."""
     from joblib import cpu_count
 
     count: int = cpu_count()
@@ -140,20 +140,20 @@ def _as_done_on_cores(
 def _until_one_dies(
     work: Callable[[Item], Outcome], left: Iterator[tuple[int, Item]], jobs: int
 ) -> Generator[tuple[int, Outcome | Lost], None, list[tuple[int, Item]]]:
-    """`work` of the items that are left. Returns those that were under way when a process died; none if all is done."""
+    """Yield `work` of the items. Return the items in progress when a process died, none if all are done."""
     from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
     under_way: dict[Any, tuple[int, Item]] = {}
     broken: list[tuple[int, Item]] = []
-    # one thread of linear algebra per process: the matrices are tiny, and the processes fill the cores
+    # one thread of linear algebra per process: the matrices are small, and the processes fill the cores
     executor = ProcessPoolExecutor(
-        jobs, initializer=_begin, initargs=(os.getpid(), work), env=dict.fromkeys(_THREADS, "1")
+        jobs, initializer=_start_worker, initargs=(os.getpid(), work), env=dict.fromkeys(_THREADS, "1")
     )
     try:
         while not broken:
             for item in islice(left, HANDED_OUT * jobs - len(under_way)):
                 try:
-                    under_way[executor.submit(_do, item[1])] = item
+                    under_way[executor.submit(_work_on, item[1])] = item
                 except BrokenProcessPool:
                     broken.append(item)
                     break
@@ -172,22 +172,22 @@ def _until_one_dies(
     return [*broken, *under_way.values()]
 
 
-# What a worker process does with its items, handed to it once
+# the function of a worker process, set once by `_start_worker`
 _work: Callable[[Any], Any]
 
 
-def _begin(parent: int, work: Callable[[Any], Any]) -> None:
+def _start_worker(parent: int, work: Callable[[Any], Any]) -> None:
     global _work
     _work = work
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=_end_with_parent, args=(parent,), daemon=True).start()
 
 
-def _do(item: Any) -> Any:
+def _work_on(item: Any) -> Any:
     return _work(item)
 
 
-def _end_with(parent: int) -> None:
-    """End this process when that one has ended, which may have been killed and so have told nobody."""
+def _end_with_parent(parent: int) -> None:
+    """End this process when its parent ends; a killed parent cannot tell it to."""
     while os.getppid() == parent:
         time.sleep(PARENT_LOOKED_FOR_S)
     os._exit(1)
@@ -205,7 +205,7 @@ def _as_done_on_dask(
     except ImportError as error:
         raise InputError(f"--dask needs Dask ({error}); pip install 'dvl_calib_ros[dask]'") from error
     try:
-        asyncio.run(_greet(address))  # Client's own timeout does not hold where a port is open and silent
+        asyncio.run(_greet(address))  # Client's own timeout does not work for an open but silent port
         client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         raise InputError(f"--dask {address}: no scheduler answers there; start one, or leave --dask out") from error
@@ -214,7 +214,7 @@ def _as_done_on_dask(
             client.wait_for_workers(1, timeout=WORKERS_TIMEOUT_S)
         except TimeoutError as error:
             raise InputError(f"--dask {address}: the scheduler has no workers; start some") from error
-        # Dask runs what a dead worker had done or was doing again elsewhere, as long as somebody holds the futures
+        # Dask repeats the work of a dead worker elsewhere, as long as the futures exist
         try:
             yield from _as_done(client, dict(enumerate(client.map(work, items, pure=False))), address)
         except ImportError as error:
@@ -222,11 +222,11 @@ def _as_done_on_dask(
                 f"--dask {address}: workers lack something ({error}); install this package there"
             ) from error
         except (CancelledError, CommClosedError) as error:
-            raise InputError(f"--dask {address}: the cluster was lost on the way; start it anew") from error
+            raise InputError(f"--dask {address}: the connection to the cluster was lost; restart it") from error
 
 
 async def _greet(address: str) -> None:
-    """See that a scheduler answers. Raises OSError if none does."""
+    """Check that a scheduler answers. Raises OSError if none does."""
     from distributed.comm.core import connect
     from distributed.security import Security
 
@@ -240,13 +240,13 @@ async def _greet(address: str) -> None:
 
     try:
         await asyncio.wait_for(greet(), CONNECT_TIMEOUT_S)
-    except Exception as error:  # what another service says is read as anything, MemoryError among it
+    except Exception as error:  # an unrelated service's bytes can be decoded to anything, even a MemoryError
         raise OSError(f"{type(error).__name__}: {error}") from error
 
 
 @contextmanager
 def _quiet_logs() -> Iterator[None]:
-    """Dask logs what it raises as well, with tracebacks."""
+    """Silence Dask, which logs a traceback for each error that it raises."""
     before = logging.root.manager.disable
     logging.disable(logging.ERROR)
     try:
@@ -256,7 +256,7 @@ def _quiet_logs() -> Iterator[None]:
 
 
 def _as_done(client: Any, pending: dict[int, Any], address: str) -> Iterator[tuple[int, Any]]:
-    """Outcomes of futures. Raises InputError once there has been no worker for ALL_WORKERS_LOST_S."""
+    """Yield outcomes of futures. Raises InputError after ALL_WORKERS_LOST_S without a worker."""
     from distributed import KilledWorker
     from distributed import wait as wait_for
 
@@ -274,6 +274,6 @@ def _as_done(client: Any, pending: dict[int, Any], address: str) -> Iterator[tup
             except TimeoutError:
                 if pending[index].status == "error":
                     raise
-                continue  # its worker died before it gave the outcome: it is done again
+                continue  # its worker died before sending the outcome: it is repeated
             del pending[index]
             yield index, outcome

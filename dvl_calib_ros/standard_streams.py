@@ -1,4 +1,4 @@
-"""Standard streams as a process may be given them: closed, full, or with nobody at the other end."""
+"""Standard streams that may be closed, full, or without a reader."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TextIO
 
 
 def open_streams() -> None:
-    """Let those of standard input, output and error that are closed lead to nowhere.
+    """Open closed standard streams on /dev/null.
 
-    Else the next file that is opened would be taken for one of them, and what is said would be written into it.
+    Otherwise the next opened file would get the number of a standard stream, and messages would be written into it.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
@@ -27,7 +27,7 @@ def open_streams() -> None:
 
 
 def say(line: str) -> None:
-    """Print a line on standard error, if there is somebody to read it."""
+    """Print a line on standard error, if it has a reader."""
     from .errors import printable
 
     with suppress(OSError, ValueError):
@@ -35,7 +35,7 @@ def say(line: str) -> None:
 
 
 def show(*lines: str) -> None:
-    """Print lines, each of which is one whatever is in it, on standard output."""
+    """Print lines on standard output, each escaped to one line."""
     from .errors import printable
 
     for line in lines:
@@ -43,7 +43,7 @@ def show(*lines: str) -> None:
 
 
 def give_up(stream: TextIO) -> None:
-    """Let what is still to be written to a standard stream, and cannot be, lead to nowhere."""
+    """Redirect a standard stream that cannot be written to /dev/null, with its buffered text."""
     handle = os.open(os.devnull, os.O_WRONLY)
     with suppress(OSError, ValueError):
         os.dup2(handle, stream.fileno())

@@ -1,6 +1,6 @@
 """Recordings damaged as power losses and bad disks do it, and what this and other readers get out of them.
 
-`python test/damage.py` prints the table of docs/bags_and_drivers.md: messages recovered, of those that are whole.
+`python test/damage.py` prints a table: messages that each reader recovers, and the number of whole ones.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""What a command does a function does; it gives a dataclass.
+"""Python interface: one function per command; each returns a dataclass.
 
     import dvl_calib_ros as dc
     run = dc.replay("my_bag")
     run.mounting
     run.plot()
 
-Angles are in degrees and lengths in metres where a name says so, else SI. Wrong files, topics and values are
+Angles are in degrees and lengths in metres where a name says so, else SI. Wrong files, topics and values raise
 `InputError`, wrong parameters `ParameterError`: one sentence each, with the remedy.
 """
 

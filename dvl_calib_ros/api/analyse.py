@@ -37,35 +37,35 @@ def diagnose(
     params: StrPath | None = None,
     **parameters: Any,
 ) -> Diagnosis | UnpairedComparison | ClosedGap:
-    """Find what a simulation lacks beside recorded bags of one vehicle, as ``dvl-calib diagnose``.
+    """Find the unmodelled DVL errors of one vehicle's recorded bags, as ``dvl-calib diagnose``.
 
     Parameters
     ----------
     bags
-        As of `replay`.
+        See `replay`.
     simulator
-        Bags of a simulator, from any motion, with its true velocity: what its DVL lacks is then said instead.
+        Bags of a simulator with its true velocity, from any motion: compare its DVL with the recorded one instead.
     rounds
-        With simulator: so many times at most its DVL is put right, simulated on its motion and compared again, 1 .. 9.
+        With simulator: improve its DVL, simulate its motion again and compare, up to this number of times, 1 .. 9.
     keep
-        With rounds: a folder, which must not exist, that keeps each round's DVL (round_1.json, for `export`) and bag.
+        With rounds: new folder for the DVL (round_1.json, for `export`) and the bag of each round.
     dvl_topic, gnss_topic, imu_topic
-        As of `replay`.
+        See `replay`.
     params
-        As of `replay`.
+        See `replay`.
     **parameters
-        As of `replay`.
+        See `replay`.
 
     Returns
     -------
     Diagnosis, UnpairedComparison or ClosedGap
-        ``verdict``, ``effects`` with 95 % intervals, ``noise``, and what could not be told. The second with simulator;
-        the third, with rounds, has one for each of its ``rounds`` and says which is ``best``.
+        ``verdict``, ``effects`` with 95 % intervals, ``noise``, and the effects that were not observable. With
+        simulator the second type; with rounds the third: one comparison per round (``rounds``), and the ``best``.
 
     Raises
     ------
     InputError, ParameterError
-        As `replay`.
+        See `replay`.
     """
     topics = (dvl_topic, gnss_topic, imu_topic)
     sides = [
@@ -100,9 +100,9 @@ def simulate(
     bag
         Folder to write; must not exist.
     scenario
-        What to simulate; by default ten minutes along a box.
+        Motion, sensors and errors to simulate; by default ten minutes along a box.
     effects
-        By name, each with its parameters, such as ``{"lever_arm": {"x_m": 0.5}}``.
+        Effects by name, each with its parameters, such as ``{"lever_arm": {"x_m": 0.5}}``.
     **scenario_fields
         Fields of `Scenario` instead, such as ``seconds=120.0, trajectory="free"``.
 
@@ -114,7 +114,7 @@ def simulate(
     Raises
     ------
     InputError
-        If the bag exists, or cannot be written; for an effect, parameter or field that there is not.
+        If the bag exists or cannot be written, or an effect, parameter or field is unknown.
     """
     from ..bags.writer import Compression, Storage
     from ..simulation.injection import injection_of
@@ -132,7 +132,7 @@ def simulate(
 
 
 def _scenario(given: Mapping[str, Any]) -> Scenario:
-    """Return a scenario by its fields. Raises InputError for a field or a value that is none."""
+    """Build a scenario from its fields. Raises InputError for an unknown field or an invalid value."""
     known = [each.name for each in fields(Scenario)]
     for name, value in given.items():
         if name not in known:
@@ -162,29 +162,29 @@ def evaluate(
     Parameters
     ----------
     paths
-        A folder of trajectories for the published procedure, None for the project's own trajectories, or two bags and
-        more, of which each calibrates and all others verify.
+        A folder of trajectories for the published procedure, None for simulated trajectories, or at least two bags:
+        each calibrates, all others verify.
     models
         Names; all by default.
     dvl_topic, gnss_topic, imu_topic
-        Of bags, as of `replay`.
+        Topics of bags, see `replay`.
     **parameters
         Any of the node's parameters, in SI units.
 
     Returns
     -------
     Evaluation or CrossCheck
-        ``verdict``: better, not_better or not_known; velocity errors by model and set of trajectories, of bags by the
-        bag that calibrated and the one that verified.
+        ``verdict``: better, not_better or not_known; velocity errors by model and set of trajectories, for bags by
+        calibrating and verifying bag.
 
     Raises
     ------
     InputError, ParameterError
-        For trajectories or bags that cannot be read, and for a model or parameter that there is not.
+        For unreadable trajectories or bags, and for an unknown model or parameter.
 
     References
     ----------
-    Avg.VRMSE and the procedure are those of Yampolsky and Klein; see the page Evaluation.
+    Avg.VRMSE and the procedure are by Yampolsky and Klein; see the page Evaluation.
     """
     from ..evaluation.cross_check import cross_check
     from ..evaluation.validation_study import DEFAULTS, EVALUATED

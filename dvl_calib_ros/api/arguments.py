@@ -1,4 +1,4 @@
-"""Arguments that several functions of the interface take."""
+"""Arguments that several functions of the interface share."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def as_path(given: StrPath | None) -> Path | None:
 
 
 def storage_and_compression(storage: str, compression: str) -> tuple[Storage, Compression]:
-    """Of a bag to write. Raises InputError."""
+    """Check storage and compression of a new bag. Raises InputError."""
     from ..bags.writer import Compression, Storage
 
     try:
@@ -45,7 +45,7 @@ def as_paths(bags: Bags) -> list[Path]:
 
 
 def parameters_from(params: StrPath | None, given: Mapping[str, Any]) -> tuple[Parameters, frozenset[str]]:
-    """Parameters of a file and of a call, and the names that either sets."""
+    """Merge the parameters of a file and of a call; also return the names that either sets."""
     from ..files.parameter_files import given_parameters, load_parameters
 
     path = None if params is None else Path(params)
@@ -58,7 +58,7 @@ def discovered_in(
     params: StrPath | None,
     given: Mapping[str, Any],
 ) -> tuple[Recording, Discovery]:
-    """Return what a recording says of itself, with what was named instead of what would be found."""
+    """Open recordings and discover their topics, mounting and frames, except those that the call names."""
     parameters, names = parameters_from(params, given)
     dvl, gnss, imu = topics
     recording = open_recording(paths, None, parameters)

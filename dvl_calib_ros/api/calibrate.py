@@ -28,20 +28,20 @@ def replay(
     merge: bool = False,
     **parameters: Any,
 ) -> Calibration:
-    """Calibrate with recorded bags, as ``dvl-calib replay`` does.
+    """Calibrate with recorded bags, as ``dvl-calib replay``.
 
     Parameters
     ----------
     bags
         A rosbag2 folder, a .mcap, .db3 or (ROS 1) .bag file, or several of them, which are read as one.
     dvl_topic, gnss_topic, imu_topic
-        Topics; found by type, name and content where not named. gnss_topic, imu_topic: "none" does without.
+        Topics; by default found by type, name and content. gnss_topic, imu_topic: "none" ignores the sensor.
     params
         A ROS 2 parameter file.
     history
-        Keep the run over time, for `Calibration.plot`, `to_pandas` and `report`.
+        Keep the estimates over time, for `Calibration.plot`, `to_pandas` and `report`.
     merge
-        Take several bags together even if the mounting moved between them.
+        Calibrate several bags together even if the mounting moved between them.
     **parameters
         Any of the node's parameters, in SI units, such as ``mounting_rpy=(0, 0, 0.785)``.
 
@@ -53,11 +53,11 @@ def replay(
     Raises
     ------
     InputError, ParameterError
-        For what is no bag, has no DVL, or cannot be a parameter.
+        For a file that is no bag or has no DVL, and for an unknown or invalid parameter.
 
     References
     ----------
-    The models M1 to M7 are those of Yampolsky and Klein, Information-Aided DVL Calibration; see the page Models.
+    The models M1 to M7 are by Yampolsky and Klein, Information-Aided DVL Calibration; see the page Models.
     """
     from ..bag_replay.checked_replay import checked_replay
 
@@ -83,28 +83,28 @@ def compare(
     params: StrPath | None = None,
     **parameters: Any,
 ) -> Comparison:
-    """Compare calibrations of one DVL, as ``dvl-calib compare``: has the mounting moved?
+    """Compare calibrations of one DVL to detect a moved mounting, as ``dvl-calib compare``.
 
     Parameters
     ----------
     *results
-        Result files, bags, or what `replay` gave; two or more. A bag is calibrated first.
+        Two or more result files, bags, or return values of `replay`. A bag is calibrated first.
     dvl_topic, gnss_topic, imu_topic
-        Of bags, as of `replay`.
+        Topics of bags, see `replay`.
     params
-        Of bags, as of `replay`.
+        Parameters of bags, see `replay`.
     **parameters
-        Of bags, as of `replay`.
+        Parameters of bags, see `replay`.
 
     Returns
     -------
     Comparison
-        ``word``: same, suspicious or moved, and all behind it; `calibration.comparison` has its `reasons`.
+        ``word``: same, suspicious or moved, with the differences; `calibration.comparison` has its `reasons`.
 
     Raises
     ------
     InputError
-        For what is no result file, holds no sample, is one of the others, or has nothing in common with them.
+        For a result that is no result file, has no sample, repeats another, or shares no quantity with the others.
     """
     from ..bag_replay.checked_replay import calibrated
     from ..bag_replay.replay import extrinsics_of_replay
@@ -151,32 +151,32 @@ def fleet(
     places
         Folders, files, or URLs that fsspec opens, such as ``s3://bucket/dives``; one or several.
     out
-        Folder of the catalogue; what is done there and unchanged is not done again.
+        Folder of the catalogue; its unchanged recordings are skipped.
     dvl_topic, gnss_topic, imu_topic
-        As of `replay`, for all recordings.
+        See `replay`; for all recordings.
     params
-        As of `replay`.
+        See `replay`.
     vehicle_from
-        A regular expression whose first group in a recording's path is the vehicle; by default the first folder below
-        a place.
+        Regular expression whose first group in a recording's path is the vehicle; by default the first folder below a
+        place.
     jobs
-        Processes; 0: one per core, 1: this one.
+        Number of processes; 0: one per core, 1: no other process.
     dask
-        Address of a Dask scheduler to work on instead.
+        Address of a Dask scheduler to use instead.
     **parameters
-        As of `replay`.
+        See `replay`.
 
     Returns
     -------
     Fleet
-        ``vehicles`` with where each mounting moved, ``persons``: the recordings that need one; ``out`` has
-        ``rows/*.parquet`` and ``index.html``.
+        ``vehicles`` with the moves of each mounting, ``persons``: the recordings that need a person's decision; ``out``
+        has ``rows/*.parquet`` and ``index.html``.
 
     Raises
     ------
     InputError, ParameterError
-        For a place that is none or holds no recording, for a catalogue that cannot be written, and without pyarrow.
-        What is wrong with a recording is its row.
+        For a place without recordings, a catalogue that cannot be written, and a missing pyarrow. A faulty recording
+        raises nothing: its row has the error.
     """
     from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers
@@ -199,28 +199,28 @@ def doctor(
     params: StrPath | None = None,
     **parameters: Any,
 ) -> Examination:
-    """Say what is in recordings, what is wrong with them, and whether they can calibrate, as ``dvl-calib doctor``.
+    """Examine recordings for content, faults and fitness for calibration, as ``dvl-calib doctor``.
 
     Parameters
     ----------
     bags
-        As of `replay`.
+        See `replay`.
     dvl_topic, gnss_topic, imu_topic
-        As of `replay`.
+        See `replay`.
     params
-        As of `replay`.
+        See `replay`.
     **parameters
-        As of `replay`.
+        See `replay`.
 
     Returns
     -------
     Examination
-        ``verdict``: yes, partly or no; ``findings``, and what the motion ``shown`` is good for, with σ to expect.
+        ``verdict``: yes, partly or no; ``findings``; ``shown``: what the motion makes observable, with expected σ.
 
     Raises
     ------
     InputError, ParameterError
-        As `replay`.
+        See `replay`.
     """
     from ..examination.examine import examine
 

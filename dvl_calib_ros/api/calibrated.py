@@ -1,4 +1,4 @@
-"""What a replay gives: the mounting, and the calibration that it is of."""
+"""Results of a replay: the mounting and the calibration."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Mounting:
-    """How the DVL is mounted, as it was calibrated.
+    """Calibrated mounting of the DVL.
 
     Parameters
     ----------
@@ -37,16 +37,17 @@ class Mounting:
     std_deg
         Their standard deviations (1σ), degrees.
     nominal_rpy_deg
-        What the calibration began with.
+        Configured roll, pitch, yaw, degrees.
     xyz_m, xyz_std_m
-        Lever arm: position of the DVL from the reference point, body frame, m, as it was found, else as it was given;
-        its standard deviations, nan where the model has no lever arm.
+        Lever arm: position of the DVL from the reference point, body frame, m, estimated or else configured; its
+        standard deviations, nan if the model has no lever arm.
     position_m
-        The DVL in the body, m; None where nothing says where the reference point is.
+        Position of the DVL in the body, m; None if the position of the reference point is unknown.
     time_offset_s, time_offset_std_s
-        By how much the DVL's stamps are late, s, likewise; of several recordings in the last one (`Result.delays`).
+        Delay of the DVL's stamps, s, estimated or else configured; of several recordings the last one's
+        (`Result.delays`).
     scale_percent, scale_std_percent
-        How much too long a motion ahead is measured; nan where the model has no scale.
+        Scale error of forward motion, positive if the DVL measures too much; nan if the model has no scale.
     base_frame, dvl_frame
         Names of the frames.
     """
@@ -66,7 +67,7 @@ class Mounting:
 
     @property
     def urdf(self) -> str:
-        """The origin of the DVL's joint, to paste into a URDF: of forward-left-up axes, as `mounting_rpy` is."""
+        """Origin of the DVL's joint for a URDF, in forward-left-up axes as `mounting_rpy`."""
         from ..files.urdf import origin_tag
 
         return origin_tag(self.position_m, np.radians(self.rpy_deg))
@@ -89,16 +90,16 @@ class Mounting:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What a replay gives.
+    """Result of a replay.
 
     Parameters
     ----------
     replayed
-        All of it: every model's estimate, counts, verification, history.
+        Every model's estimate, counts, verification and history.
     discovery
-        What was found in the bags, and with which topics and parameters they were replayed.
+        Findings in the bags, and the topics and parameters of the replay.
     bags
-        Where the bags are.
+        Paths of the bags.
     """
 
     replayed: Replayed = field(repr=False)
@@ -116,38 +117,38 @@ class Calibration:
 
     @property
     def model(self) -> str:
-        """Name of the model that was selected."""
+        """Name of the selected model."""
         return self.replayed.result.selected
 
     @property
     def verdict(self) -> str:
-        """What the held-out data say: accept, marginal or reject."""
+        """Verdict of the held-out data: accept, marginal or reject."""
         return self.replayed.result.verifications[self.model].verdict.value
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """Why, in sentences, the decisive one first."""
+        """Reasons for the verdict, in sentences, the decisive one first."""
         return tuple(each.sentence for each in self.replayed.result.verifications[self.model].reasons)
 
     @property
     def codes(self) -> tuple[str, ...]:
-        """The codes of ``reasons``, which never change their meaning."""
+        """Codes of ``reasons``, which never change their meaning."""
         return tuple(each.code for each in self.replayed.result.verifications[self.model].reasons)
 
     @property
     def found(self) -> tuple[str, ...]:
-        """What was found in the bags, in sentences."""
+        """Sentences on what was found in the bags."""
         return self.discovery.found
 
     @property
     def findings(self) -> tuple[Reason, ...]:
-        """What is wrong with the data for the selected model, each with its code and remedy."""
+        """Faults of the data for the selected model, each with its code and remedy."""
         others = tuple(f"{name}: " for name in self.replayed.result.estimates if name != self.model)
         return tuple(each for each in self.replayed.findings if not each.says.startswith(others))
 
     @property
     def mounting(self) -> Mounting:
-        """The corrected mounting with its standard deviations."""
+        """Corrected mounting with its standard deviations."""
         result = self.replayed.result
         estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
         found = {each.name: each for each in quantities(result)}
@@ -171,20 +172,20 @@ class Calibration:
         )
 
     def correct(self, velocity_dvl: Array, angular_velocity: Array | None = None) -> Array:
-        """Turn measured velocities into corrected ones in the body.
+        """Correct measured velocities and rotate them to the body.
 
         Parameters
         ----------
         velocity_dvl
             Measured velocities (..., 3), m/s, in the DVL's forward-left-up axes.
         angular_velocity
-            Angular velocities (..., 3), rad/s, in the body's axes; takes out what the lever arm adds in turns.
+            Angular velocities (..., 3), rad/s, in the body's axes, to subtract the lever arm's velocity in turns.
 
         Returns
         -------
         ndarray
-            Velocities (..., 3), m/s, in the body's axes: of the reference point with angular_velocity, else of the
-            DVL's own place. They are of ``mounting.time_offset_s`` before their stamps.
+            Velocities (..., 3), m/s, in the body's axes: of the reference point with angular_velocity, else of the DVL.
+            They are valid ``mounting.time_offset_s`` before their stamps.
 
         Raises
         ------
@@ -202,13 +203,14 @@ class Calibration:
         return velocity - np.cross(turning, self.mounting.xyz_m)
 
     def tables(self) -> dict[str, pandas.DataFrame]:
-        """Give the tables of its page as data frames.
+        """Return the tables of the report as data frames.
 
         Returns
         -------
         dict of str to pandas.DataFrame
-            ``mounting``, a row for each quantity in its unit; ``held_out``, ``models`` and ``streams``. Columns of
-            numbers end with their unit (``_deg``, ``_percent``, ``_mps``) and with ``_std`` for a σ (1σ).
+            ``mounting``, one row per quantity in its unit; ``held_out``, ``models`` and ``streams``. Names of numeric
+            columns end in their unit (``_deg``, ``_percent``, ``_mps``), then in ``_std`` for a standard deviation
+            (1σ).
 
         Raises
         ------
@@ -228,7 +230,7 @@ class Calibration:
         return {"mounting": mounting} | {key: each.rename(columns=_column) for key, each in named.items()}
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Give the selected model over time.
+        """Return the states of the selected model over time.
 
         Returns
         -------
@@ -260,7 +262,7 @@ class Calibration:
         return pandas.DataFrame(columns, index=time)
 
     def plot(self) -> Figure:
-        """Draw the mounting over time with its ±1σ, and the velocity error before and after.
+        """Draw the mounting over time with ±1σ, and the velocity error before and after correction.
 
         Returns
         -------
@@ -279,12 +281,12 @@ class Calibration:
         return calibration_figure(self.replayed)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the result file, from which the node and `dvl-calib apply` go on.
+        """Write the result file, which the node and `dvl-calib apply` read.
 
         Parameters
         ----------
         path
-            File to write (YAML); earlier ones are kept beside it.
+            File to write (YAML); earlier files are kept as backups next to it.
 
         Returns
         -------
@@ -329,7 +331,7 @@ class Calibration:
         return target
 
     def document(self, models: Sequence[str] = tuple(MODELS)) -> dict[str, Any]:
-        """Give all of it as plain data: what `dvl-calib replay --json` writes.
+        """Return everything as plain data, as `dvl-calib replay --json` writes it.
 
         Parameters
         ----------
@@ -346,14 +348,14 @@ class Calibration:
         return replay_document(self.replayed, models) | {"discovery": self.discovery.document()}
 
 
-# Tables of a replay: key, and the heading on its page
+# Tables of a replay: key -> heading on the report's page
 TABLES = {"held_out": "Held-out verification", "models": "Estimates", "streams": "Data"}
 SUFFIXES = {"°": "deg", "%": "percent", "m/s": "mps"}
 _MPS = ("uncorrected", "corrected", "predicted")
 
 
 def _column(heading: str) -> str:
-    """Return the heading of a table as a name, such as ``phi_x_deg_std``."""
+    """Turn a table heading into a column name, such as ``phi_x_deg_std``."""
     name, _, unit = heading.removesuffix(" ±1σ").removesuffix(" shown").partition(", ")
     name = name.replace("φ", "phi_").replace("δk", "scale").replace("NIS/m", "nis_per_component").replace(" ", "_")
     words = [name or "stream", SUFFIXES.get(unit, unit) or ("mps" if name in _MPS else "")]
@@ -373,5 +375,5 @@ def _vectors(name: str, given: Array) -> Array:
 
 
 def _none(value: float) -> Quantity:
-    """What a model does not have, but for what was given."""
+    """Return a quantity that the model does not estimate, with its configured value."""
     return Quantity("", value, value, math.nan, "", False)

@@ -1,4 +1,4 @@
-"""Recordings, results and settings in other forms: salvage, import, apply, export, report."""
+"""Conversion of recordings, results and settings: salvage, import, apply, export, report."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 
 def salvage(bags: Bags, output: StrPath, *, storage: str = "mcap", compression: str = "none") -> Recovered:
-    """Write all that can be read of damaged recordings into a new bag, as ``dvl-calib salvage``.
+    """Copy the readable messages of damaged recordings into a new bag, as ``dvl-calib salvage``.
 
     Parameters
     ----------
     bags
-        As of `replay`.
+        See `replay`.
     output
         Folder to write; must not exist.
     storage, compression
@@ -38,12 +38,12 @@ def salvage(bags: Bags, output: StrPath, *, storage: str = "mcap", compression: 
     Returns
     -------
     Recovered
-        ``counts`` of messages by topic, and ``notes`` of what was lost.
+        ``counts`` of messages by topic, and ``notes`` on the losses.
 
     Raises
     ------
     InputError
-        For what is no bag or holds no message, and if the new one cannot be written.
+        For a path that is no bag or holds no message, and if the new bag cannot be written.
     """
     from ..bags.recover import recover
 
@@ -74,22 +74,22 @@ def import_files(
     output
         Bag to write; for a folder the folder of bags.
     gnss, attitude
-        Files of the reference's velocity, and of roll, pitch, yaw or heading.
+        Files of the reference velocity, and of roll, pitch, yaw or heading.
     frame, gnss_frame
-        Of the velocities: frd or flu; of the reference also enu or ned.
+        Axes of the velocities: frd or flu; of the reference also enu or ned.
     dvl_std, gnss_std
         Standard deviations to write as covariance, m/s; 0: none.
     start
         Stamp of time 0, s since 1970.
     columns
-        Columns of the DVL's file, where it is a table of another layout: ``"time=t,vx=u,vy=v,vz=w,valid=lock"``.
+        Columns of a DVL table with another layout: ``"time=t,vx=u,vy=v,vz=w,valid=lock"``.
     storage, compression
-        As of `salvage`.
+        See `salvage`.
 
     Returns
     -------
     dict
-        Of each bag written: ``counts`` of messages by topic, and ``notes`` of what was left out.
+        Bag -> ``counts`` of messages by topic, and ``notes`` on omitted data.
 
     Raises
     ------
@@ -118,38 +118,38 @@ def apply(
     force: bool = False,
     dry_run: bool = False,
 ) -> Applied:
-    """Write a saved calibration into the files that a vehicle is configured by, as ``dvl-calib apply``.
+    """Write a saved calibration into a vehicle's configuration files, as ``dvl-calib apply``.
 
-    All are written or none; the one before is kept beside each.
+    Either all files are written or none; each previous file is kept next to the new one.
 
     Parameters
     ----------
     result
-        Result file, as `Calibration.save` writes it.
+        Result file of `Calibration.save`.
     urdf
-        URDF whose joint of the DVL is turned and moved.
+        URDF in which to rotate and move the DVL's joint.
     joint
-        Name of that joint, where the DVL's frame does not tell.
+        Name of that joint; by default found by the DVL's frame.
     output
         URDF to write instead.
     keep_position
-        Leave the joint's position as it is.
+        Keep the joint's position.
     params, launch, fusion
         Parameter file of the node, launch file with a static transform, parameters of robot_localization.
     force
-        Also what is rejected, not converged, or of another mounting.
+        Also apply a calibration that is rejected, not converged, or of another mounting.
     dry_run
-        Write nothing; ``changes`` is what would change.
+        Write nothing; ``changes`` has the planned changes.
 
     Returns
     -------
     Applied
-        Files ``written`` and ``unchanged``, where the one before is (``kept``), and ``notes``.
+        Files ``written`` and ``unchanged``, paths of the previous ones (``kept``), and ``notes``.
 
     Raises
     ------
     InputError
-        For what is no result file, must not be applied, or cannot be written.
+        For a file that is no result, a calibration that must not be applied, or a file that cannot be written.
     """
     from ..files.apply import Targets, write_calibration
     from ..files.mounting import load_calibrated_mounting
@@ -163,29 +163,29 @@ def apply(
 def instrument_settings(
     result: StrPath, instrument: str, now: Mapping[str, float] | None = None, *, force: bool = False
 ) -> InstrumentSettings:
-    """What to set in the instrument itself for its data to come out corrected, as ``dvl-calib apply --instrument``.
+    """Compute the instrument's own settings that correct its data, as ``dvl-calib apply --instrument``.
 
     Parameters
     ----------
     result
-        Result file, as `Calibration.save` writes it.
+        Result file of `Calibration.save`.
     instrument
         ``"waterlinked"``, ``"cerulean"`` or ``"ardupilot"``.
     now
-        What it was set to when the data were recorded, by the setting's name; else as it is delivered.
+        Settings during the recording, by name; by default the factory settings.
     force
-        Also of a calibration that is rejected or not converged.
+        Also for a calibration that is rejected or not converged.
 
     Returns
     -------
     InstrumentSettings
-        Each setting with old and new value, the ``text`` to type or load, the ``document`` that it follows, and in
-        ``notes`` what the instrument cannot be told.
+        Each setting with old and new value, the ``text`` to type or load, the vendor ``document`` that describes it,
+        and in ``notes`` the corrections that the instrument has no setting for.
 
     Raises
     ------
     InputError
-        For another instrument or setting, what it cannot be set to, or what must not be applied.
+        For an unknown instrument or setting, a value out of range, or a calibration that must not be applied.
     """
     from ..files.mounting import load_calibrated_mounting
     from ..instruments.settings import instrument_settings as settings_of
@@ -194,26 +194,26 @@ def instrument_settings(
 
 
 def export(simulator: str, source: StrPath, output: StrPath) -> Export:
-    """Write what was found of a DVL as the settings of another simulator, as ``dvl-calib export``.
+    """Write a diagnosed DVL as the settings of another simulator, as ``dvl-calib export``.
 
     Parameters
     ----------
     simulator
-        Such as ``"gazebo"``.
+        Name, such as ``"gazebo"``.
     source
-        What ``report(diagnosis, "found.json")`` wrote; or a result or parameter file.
+        A diagnosis as written by ``report(diagnosis, "found.json")``, or a result or parameter file.
     output
-        File to write; what the simulator cannot represent is beside it, as FILE.missing.json.
+        File to write; FILE.missing.json next to it lists what the simulator cannot represent.
 
     Returns
     -------
     Export
-        ``settings``, and what is ``missing`` in the simulator with the error that it makes.
+        ``settings``, and the effects ``missing`` in the simulator with the resulting error.
 
     Raises
     ------
     InputError
-        For another simulator, a source that is none of these, or a file that cannot be written.
+        For an unknown simulator, another kind of source, or a file that cannot be written.
     """
     from ..simulator_export.registry import write_settings
 
@@ -224,16 +224,16 @@ def report(
     result: Calibration | Comparison | Examination | Diagnosis | UnpairedComparison | Evaluation | CrossCheck,
     path: StrPath,
 ) -> Path:
-    """Write a result as a page (HTML), or with all its figures as JSON where the path ends in .json.
+    """Write a result as a page (HTML), or with all its numbers as JSON if the path ends in .json.
 
-    They are what ``--report`` and ``--json`` of the commands write.
+    The commands write the same files with ``--report`` and ``--json``.
 
     Parameters
     ----------
     result
-        What a function of this module returned.
+        Return value of a function of this module.
     path
-        File to write: .html, .json, and of a `Comparison` .png as well.
+        File to write: .html, .json, and for a `Comparison` also .png.
 
     Returns
     -------
@@ -243,7 +243,7 @@ def report(
     Raises
     ------
     InputError
-        If the file cannot be written, or a page needs what was not kept or is not installed.
+        If the file cannot be written, or the page needs a missing history or library.
     """
     from .reports import write
 

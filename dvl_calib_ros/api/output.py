@@ -1,4 +1,4 @@
-"""Results as text, as HTML of a notebook, and as data frames."""
+"""Results as text, as HTML for a notebook, and as data frames."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from ..present.document import Document
 if TYPE_CHECKING:
     import pandas
 
-# Columns of what is printed, as of the commands into a pipe
+# Width of printed output in columns, equal to the commands' output into a pipe.
 WIDTH = 160
 
 
 def printed(result: object, as_html: bool) -> str:
-    """The answer of a result, with its tables."""
+    """Format a result with its tables, as text or HTML."""
     from ..present.result_documents import DOCUMENTS
 
     return text_of(DOCUMENTS[type(result)](result), as_html)
 
 
 def framed(result: object) -> dict[str, pandas.DataFrame]:
-    """Tables of a result by their headings. Raises InputError without pandas."""
+    """Return the tables of a result by their headings. Raises InputError without pandas."""
     from ..present.result_documents import DOCUMENTS
 
     return frames_of(DOCUMENTS[type(result)](result))
 
 
 def frames_of(document: Document) -> dict[str, pandas.DataFrame]:
-    """Tables of a document by their headings. Raises InputError without pandas."""
+    """Return the tables of a document by their headings. Raises InputError without pandas."""
     try:
         return document.frames()
     except ModuleNotFoundError:
@@ -38,7 +38,7 @@ def frames_of(document: Document) -> dict[str, pandas.DataFrame]:
 
 
 def text_of(document: Document, as_html: bool) -> str:
-    """A document as it would be on a terminal, as text or as HTML."""
+    """Render a document as on a terminal, as text or as HTML."""
     if as_html:
         from ..present.page import fragment
 
@@ -47,7 +47,7 @@ def text_of(document: Document, as_html: bool) -> str:
 
     from ..present.terminal import shown
 
-    # in a notebook rich would show it by itself, beside what is returned
+    # force_jupyter: rich would otherwise also display the text by itself in a notebook
     console = Console(file=io.StringIO(), record=True, width=WIDTH, force_jupyter=False, highlight=False, emoji=False)
     for each in shown(document):
         console.print(each)

@@ -1,4 +1,4 @@
-"""Results as pages and as JSON."""
+"""Results as pages and as JSON files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .calibrated import Calibration
 
 
 def write(result: object, path: Path) -> None:
-    """Write a result as JSON where the path ends so, else as a page. Raises InputError."""
+    """Write a result as JSON if the path ends in .json, else as a page. Raises InputError."""
     document = _plain(result)
     if path.suffix.lower() == ".json":
         write_json(path, document())
@@ -33,7 +33,7 @@ def write(result: object, path: Path) -> None:
 
 
 def _plain(result: Any) -> Callable[[], Any]:
-    """What makes plain data of a result. Raises InputError for what is none."""
+    """Return the function that makes plain data of a result. Raises InputError for other objects."""
     if isinstance(result, Calibration):
         return result.document
     if isinstance(result, Examination):

@@ -1,7 +1,6 @@
-"""A replay that first checks that the recordings belong together, and recordings calibrated each by itself.
+"""Replay with checks that the recordings belong together and that `initial_calibration` fits the data.
 
-Several recordings are calibrated each for itself, and compared: one mounting averaged of two is that of neither. So is
-what an `initial_calibration` says that the data contradict.
+Several recordings are also calibrated individually and compared, because the average of two mountings is neither.
 """
 
 from __future__ import annotations
@@ -33,19 +32,19 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding, is_cause
 from .replay import Replayed, extrinsics_of_replay, replay
 
-# Files of one recording may overlap by what was on its way when the next began.
+# longest overlap of the files of one recording, by messages in transit when the next file began
 OVERLAP_NS = 10_000_000_000
-# The finding on dropouts, which pauses between recordings are not.
+# pauses between recordings are no dropouts
 DROPOUTS = "DVL_DROPOUTS"
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """What several recordings say, each for itself.
+    """Comparison of several recordings that were calibrated individually.
 
-    comparison: None where less than two could be calibrated for themselves. unchecked: names of those that could not.
-    overlapping: names of two that hold the DVL at the same time. pauses_ns: times without any, between two of them.
-    number: how many there are, bags of the same time being one.
+    comparison: None if fewer than two recordings could be calibrated. unchecked: names of recordings that could not be.
+    overlapping: names of two with DVL data at the same time. pauses_ns: gaps between recordings. number: number of
+    recordings, counting bags of the same time as one.
     """
 
     comparison: Comparison | None
@@ -55,9 +54,10 @@ class Recordings:
     number: int
 
     def objections(self, model: str, parted: bool) -> list[Reason]:
-        """Why an estimate of all of them together by this model is not to be used as it is.
+        """Return reasons against using a common estimate of all recordings by this model.
 
-        parted: whether it has a delay for each."""
+        parted: whether the model has a delay per recording.
+        """
         found: list[Reason] = []
         if self.overlapping is not None:
             first, second = self.overlapping
@@ -86,13 +86,12 @@ def checked_replay(
     mounting_is_guessed: bool = False,
     contradictions: Sequence[Reason] = (),
 ) -> Replayed:
-    """`replay`, after several recordings, or an initial calibration, have been held against each other.
+    """Replay after checking several recordings, or an initial calibration, for consistency.
 
-    merge: take several recordings together even if the mounting moved between them; that stays a note, not the verdict.
-    What `initial_calibration` says is left out, and said to be, if the data contradict it. mounting_is_guessed: nobody
-    told mounting_rpy; of a mounting far from it none is misaligned: it is taken, and all is done once more.
-    contradictions: those of the discovery, of which some bear on the verdict.
-    Raises InputError.
+    merge: calibrate several recordings together even if the mounting moved; the move becomes a note instead of the
+    verdict. An `initial_calibration` that the data contradict is not used, with a finding. mounting_is_guessed:
+    mounting_rpy was not configured; if the estimate is far from it, the estimate becomes the mounting, and the replay
+    is repeated. contradictions: findings of discovery; those on frames affect the verdict. Raises InputError.
     """
     topics = topics or Topics()
     if not isinstance(recording, Recording):
@@ -105,9 +104,9 @@ def checked_replay(
         return lambda share: on_progress((index + share) / total)
 
     if parts:
-        recordings = _each_by_itself(recording, parameters, topics, progress_of)
-    replayed = _with_fitting_start(recording, parameters, topics, progress_of, parts, with_history)
-    if mounting_is_guessed and (rpy := _mounting_found(replayed.result)) is not None:
+        recordings = _calibrated_individually(recording, parameters, topics, progress_of)
+    replayed = _replay_from_valid_start(recording, parameters, topics, progress_of, parts, with_history)
+    if mounting_is_guessed and (rpy := _mounting_instead_of_guess(replayed.result)) is not None:
         better = parameters.replace(mounting_rpy=rpy)
         return checked_replay(
             recording,
@@ -120,20 +119,20 @@ def checked_replay(
         )
     if contradictions:
         result = replayed.result
-        judged = {name: _contradicted(each, contradictions) for name, each in result.verifications.items()}
+        judged = {name: _with_frame_doubts(each, contradictions) for name, each in result.verifications.items()}
         replayed = replace(replayed, result=replace(result, verifications=judged))
-    return replayed if recordings is None else _judged(replayed, recordings, merge)
+    return replayed if recordings is None else _with_common_verdict(replayed, recordings, merge)
 
 
-def _contradicted(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
-    """With frames that the data do not settle; and with the cause, where a calibration is rejected anyhow."""
+def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
+    """Add ambiguous frames to the verdict and, if the calibration is rejected anyway, their likely cause."""
     is_rejected = verification.verdict is Severity.REJECT
     said = [each for each in contradictions if each.severity is Severity.MARGINAL or (is_rejected and is_cause(each))]
     return verification.with_objections(said) if said else verification
 
 
-def _mounting_found(result: Result) -> tuple[float, float, float] | None:
-    """The mounting (rad, whole degrees) that a calibration found instead of one that was guessed; None near that."""
+def _mounting_instead_of_guess(result: Result) -> tuple[float, float, float] | None:
+    """Return the mounting (rad, whole degrees) that replaces a guessed one; None if it is close to the guess."""
     parameters, estimate = Parameters.from_mapping(result.parameters), result.estimate
     model, state = MODELS[estimate.model], estimate.of_recording
     about = shown_misalignment(model, state, parameters)
@@ -141,14 +140,11 @@ def _mounting_found(result: Result) -> tuple[float, float, float] | None:
         return None
     t = parameters.rotation_dvl_from_body
     found = np.array(whole_degrees(corrected_mounting(t @ about, t)))
-    # what may as well be a misalignment stays one
+    # a difference that may be a misalignment remains one
     guessed = np.array(parameters.mounting_rpy)
     is_other = np.cos(found - guessed) < math.cos(0.5 * parameters.reject_misalignment)
     roll, pitch, yaw = np.where(is_other, found, guessed).tolist()
     return roll, pitch, yaw
-
-
-# ------------------------------------------------------------------ several recordings
 
 
 class _Bag(NamedTuple):
@@ -159,17 +155,17 @@ class _Bag(NamedTuple):
     has_dvl: bool
 
 
-def _each_by_itself(
+def _calibrated_individually(
     recording: Recording, parameters: Parameters, topics: Topics, progress_of: Callable[[int], Callable[[float], None]]
 ) -> Recordings:
-    """Calibrate with each recording alone, without any initial calibration."""
+    """Calibrate with each recording individually, without any initial calibration."""
     bags = _bags(recording, topics)
     alone = parameters.replace(initial_calibration="")
     found: list[Extrinsics] = []
     unchecked: list[str] = []
     groups = _recordings(bags)
     overlapping = next((pair for pair in map(_overlap, groups) if pair is not None), None)
-    # of bags that hold the DVL at the same time each is one
+    # bags with DVL data at the same time are calibrated individually
     groups = [part for group in groups for part in ([[bag] for bag in group] if _overlap(group) else [group])]
     for index, group in enumerate(groups):
         name = " + ".join(bag.name for bag in group)
@@ -179,7 +175,7 @@ def _each_by_itself(
             replayed = replay(
                 together([bag.recording for bag in group]), alone, topics, progress_of(index), judged=False
             )
-        except InputError:  # too little of the DVL to be a calibration; all together will say what is wrong with it
+        except InputError:  # too little DVL data; the replay of all recordings reports the fault
             unchecked.append(name)
             continue
         extrinsics = extrinsics_of_replay(replayed, name)
@@ -188,7 +184,7 @@ def _each_by_itself(
         else:
             found.append(extrinsics)
     aided = [each for each in found if MODELS[each.model].aided]
-    found = aided or found  # what a model without GNSS assumes of currents is no measure of one with
+    found = aided or found  # models without GNSS assume no current, so they are not compared with models with GNSS
     try:
         comparison = compare(found) if len(found) > 1 else None
     except InputError:
@@ -201,7 +197,7 @@ def _each_by_itself(
 
 
 def _bags(recording: Recording, topics: Topics) -> list[_Bag]:
-    """In order of time; those without any message are left out."""
+    """Return the bags in order of time, without empty ones."""
     short = [path.name or str(path) for path in recording.paths]
     names = short if len(set(short)) == len(short) else list(map(str, recording.paths))
     bags = []
@@ -213,7 +209,7 @@ def _bags(recording: Recording, topics: Topics) -> list[_Bag]:
 
 
 def _recordings(bags: Sequence[_Bag]) -> list[list[_Bag]]:
-    """Bags that overlap in time are parts of one recording."""
+    """Group bags that overlap in time: they are parts of one recording."""
     groups: list[list[_Bag]] = []
     until_ns = 0
     for bag in bags:
@@ -227,7 +223,7 @@ def _recordings(bags: Sequence[_Bag]) -> list[list[_Bag]]:
 
 
 def _overlap(group: Sequence[_Bag]) -> tuple[str, str] | None:
-    """Names of two bags with the DVL at the same time, for longer than parts of one recording would."""
+    """Return the names of two bags whose DVL data overlap for longer than `OVERLAP_NS`."""
     own = [bag for bag in group if bag.has_dvl]
     for index, bag in enumerate(own):
         for other in own[index + 1 :]:
@@ -236,8 +232,8 @@ def _overlap(group: Sequence[_Bag]) -> tuple[str, str] | None:
     return None
 
 
-def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed:
-    """With the verdict and the notes that follow from holding recordings against each other."""
+def _with_common_verdict(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed:
+    """Add the verdict and notes from comparing the recordings."""
     result = replayed.result
     verifications = {}
     notes: list[str] = []
@@ -266,7 +262,7 @@ def _judged(replayed: Replayed, recordings: Recordings, merge: bool) -> Replayed
 def _without_pauses(
     findings: tuple[Reason, ...], counts: Mapping[str, Mapping[str, int]], pauses: int
 ) -> tuple[tuple[Reason, ...], Mapping[str, Mapping[str, int]]]:
-    """Dropouts without the times between recordings."""
+    """Remove the pauses between recordings from the dropouts."""
     dropouts = counts["dvl"]["dropouts"]
     left = max(dropouts - pauses, 0)
     if left == dropouts:
@@ -277,10 +273,7 @@ def _without_pauses(
     return tuple(kept), {**counts, "dvl": {**counts["dvl"], "dropouts": left}}
 
 
-# ------------------------------------------------------------------ initial calibration
-
-
-def _with_fitting_start(
+def _replay_from_valid_start(
     recording: Recording,
     parameters: Parameters,
     topics: Topics,
@@ -288,7 +281,7 @@ def _with_fitting_start(
     first: int,
     with_history: bool,
 ) -> Replayed:
-    """Replay from `initial_calibration`, unless the data alone contradict it; then from nothing, with a finding."""
+    """Replay from `initial_calibration`, or without it and with a finding if the data contradict it."""
     saved = parameters.initial_calibration
     replayed = replay(recording, parameters, topics, progress_of(first), with_history=with_history)
     if not saved:
@@ -305,7 +298,7 @@ def _with_fitting_start(
 
 
 class Calibrated(NamedTuple):
-    """extrinsics: what a recording says. notes: in sentences, what of it is damaged or missing."""
+    """Calibration with one recording. notes: sentences on damaged or missing data."""
 
     extrinsics: Extrinsics
     notes: list[str]
@@ -318,7 +311,7 @@ def calibrated(
     name: str,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> Calibrated:
-    """Calibrate with a recording, which `name` names in what is said of it. Raises InputError."""
+    """Calibrate with a recording, called `name` in messages. Raises InputError."""
     replayed = replay(recording, parameters, topics, on_progress)
     found = extrinsics_of_replay(replayed, name)
     if found is None:

@@ -1,4 +1,4 @@
-"""The calibration over recorded bags: the same estimator as the node's, fed from files; and its JSON."""
+"""Calibration with recorded bags by the node's estimator, and its JSON document."""
 
 from __future__ import annotations
 
@@ -40,21 +40,20 @@ from ..verdict.reasons import Reason, finding, of_consequence
 from ..version import __version__
 from .run_history import Recorder, RunHistory
 
-# Samples that the models are updated by at once: more make the arrays too large for the processor's caches.
+# samples per update of the models; larger arrays do not fit the processor's caches
 BLOCK_SIZE = 2048
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """What a replay gives: the calibration's result, what the user should know of the data, the DVL's frame_id.
+    """Result of a replay.
 
-    notes: all that the user should know in words, the findings among it. history: the run over time, if it was asked
-    for. reference_frame: of the reference's messages, None without any.
-    dvl_type: message type of the DVL's topic. turned: whether its data were forward-right-down, and were turned.
-    recordings: what several recordings say, each for itself; None where they were not looked at so (`checked`).
-    pause_s: how much of the time from the first to the last sample is between two recordings.
-    navigation: dead reckoning without and with the selected model's correction, on data that it had not seen; None
-    without a reference. water: what the recording says of it; None if nothing.
+    notes: all messages to the user, including the findings. history: estimates over time, if requested.
+    reference_frame: of the reference's messages, None without any. dvl_frame: frame_id of the DVL. dvl_type: message
+    type of its topic. turned: whether its data were converted from forward-right-down. recordings: comparison of
+    several recordings; None without one. pause_s: time between recordings within the first to the last sample.
+    navigation: dead reckoning without and with the selected model's correction, on held-out data; None without a
+    reference. water: its properties in the recording, if any.
     """
 
     result: Result
@@ -77,25 +76,25 @@ class Replayed:
 
     @property
     def cause_of_scale(self) -> CauseOfScale | None:
-        """The scale as what the speed of sound makes of it; None where the recording tells nothing."""
+        """The scale error as explained by the speed of sound; None if the recording has no information."""
         estimate, parameters = self.result.estimate, Parameters.from_mapping(self.result.parameters)
         return cause_of_scale(MODELS[estimate.model], estimate.of_recording, parameters, self.water)
 
 
 @contextmanager
 def memory_given_back() -> Iterator[None]:
-    """Return to the system, at the end, the memory of what was made within and is no longer used.
+    """At the end, return unused memory to the system.
 
-    A calibrator and its estimators refer to each other: only the garbage collector frees them, and by itself rarely.
+    A calibrator and its estimators refer to each other, so only the garbage collector frees them, and by itself rarely.
     """
-    kept = not gc.get_freeze_count()  # unless someone else keeps something away from the collector
+    kept = not gc.get_freeze_count()  # unless other code uses the freezing
     if kept:
-        gc.freeze()  # looking through all that was imported takes a quarter of a short recording's time
+        gc.freeze()  # examining all imported objects takes a quarter of a short replay's time
     try:
         yield
     finally:
         gc.collect()
-        with suppress(OSError, AttributeError):  # another C library: glibc keeps a megabyte more with each recording
+        with suppress(OSError, AttributeError):  # another C library; glibc keeps an additional megabyte per recording
             ctypes.CDLL(None).malloc_trim(0)
         if kept:
             gc.unfreeze()
@@ -114,12 +113,11 @@ def replay(
     on_restart: Callable[[], None] = lambda: None,
     on_finished: Callable[[Calibrator], None] = lambda _: None,
 ) -> Replayed:
-    """Calibrate with a recording, or with bags, read as one in order of log time.
+    """Calibrate with a recording, or with bags that are read as one in order of log time.
 
-    on_progress: told the share (0..1) that is read. with_history: collect a `RunHistory` on the way, else on_rows is
-    given the aligned rows, and on_restart told, as by `Calibrator`. judged: say what it is worth on data held out, its
-    verifications and navigation. on_finished: given the calibrator at its end.
-    Raises InputError if there is no bag or no usable DVL topic.
+    on_progress: receives the share (0..1) read. with_history: collect a `RunHistory`; else on_rows receives the aligned
+    rows and on_restart is called, as by `Calibrator`. judged: verify on held-out data, including dead reckoning.
+    on_finished: receives the calibrator at the end. Raises InputError if there is no bag or no usable DVL topic.
     """
     saved = parameters.initial_calibration
     initial = load_initial_calibration(Path(saved), parameters.mounting_rpy) if saved else None
@@ -153,7 +151,7 @@ def replay(
     on_finished(calibrator)
     found += [*missing_imu(recording, chosen, decoder.frame_of_reference), *decoder.problems.values()]
     result = calibrator.result()
-    result = replace(result, days=_named(result.days, recording))
+    result = replace(result, days=_days_by_recording(result.days, recording))
     found += _warnings(result, topics, decoder)
     history = recorder.history(calibrator, result.estimates) if recorder else None
     navigation = calibrator.navigation(result.selected) if judged else None
@@ -193,8 +191,8 @@ def replay(
     )
 
 
-def _named(days: Sequence[Day], recording: Recording) -> tuple[Day, ...]:
-    """Days by the recording that each began with, where there is one for each; else by their dates."""
+def _days_by_recording(days: Sequence[Day], recording: Recording) -> tuple[Day, ...]:
+    """Name days by their first recording if each has its own, else by date."""
     names = []
     for day in days:
         own = [
@@ -209,7 +207,7 @@ def _named(days: Sequence[Day], recording: Recording) -> tuple[Day, ...]:
 
 
 def extrinsics_of_replay(replayed: Replayed, name: str) -> Extrinsics | None:
-    """What the selected model found, to be compared; None if it used no sample."""
+    """Return the selected model's estimate for a comparison; None if it used no sample."""
     result = replayed.result
     estimate, judged = result.estimate, result.verifications.get(result.selected)
     if not estimate.used or result.first_ns is None or result.last_ns is None:
@@ -245,9 +243,9 @@ def _feed_all(
 
 
 def reference_prior(recording: Recording, parameters: Parameters, topics: Topics) -> tuple[float, float]:
-    """Mean sway and heave (m/s, body frame) of the reference velocity's first prior_window. Raises InputError.
+    """Return the mean sway and heave (m/s, body frame) of the reference in the first prior_window. Raises InputError.
 
-    A velocity in an earth frame is turned by the attitude that came last before it.
+    A velocity in an earth frame is rotated by the last attitude before it.
     """
     velocities: list[Array] = []
     first_ns: int | None = None
@@ -280,9 +278,9 @@ def reference_prior(recording: Recording, parameters: Parameters, topics: Topics
 
 
 def _in_body(reference: SampleBlock, attitude: SampleBlock) -> Array:
-    """Those velocities (N, 3) m/s of a reference that an attitude, which came before them, turns into the body frame.
+    """Return the reference velocities (N, 3) m/s in the body frame.
 
-    Attitudes all have one.
+    A velocity that needs an attitude is omitted if none came before it. All attitudes must have an orientation.
     """
     before = np.searchsorted(attitude.arrival, reference.arrival) - 1
     is_body = reference.frames == FRAME_CODES[VelocityFrame.BODY]
@@ -297,10 +295,10 @@ def _in_body(reference: SampleBlock, attitude: SampleBlock) -> Array:
 
 
 def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[Reason]:
-    """What the counts say that a user should not overlook."""
+    """Return warnings from the counts."""
     dvl = result.counts["dvl"]
     if not dvl["accepted"]:
-        raise InputError(f"no valid sample on {topics.dvl}: {_counted(dvl)}. {_remedy(decoder, dvl)}")
+        raise InputError(f"no valid sample on {topics.dvl}: {_counts_in_words(dvl)}. {_refusal_advice(decoder, dvl)}")
     found = message_warnings(result.counts) + decoder.dvl_type.advice(dvl) + recording_warnings(result.counts)
     if decoder.zero_stamps:
         found.append(finding("STAMPS_MISSING_IN_BAG", count=decoder.zero_stamps))
@@ -309,19 +307,19 @@ def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[R
     return found + reference_warnings(result.estimate, result.own_days)
 
 
-def _remedy(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:
-    """What is known of the DVL's messages that were refused."""
+def _refusal_advice(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:
+    """Return what is known about refused DVL messages."""
     known = [str(found) for kind, found in decoder.problems.items() if kind.startswith("dvl")]
     known += map(str, decoder.dvl_type.advice(counts))
     return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."
 
 
-def _counted(counts: Any) -> str:
+def _counts_in_words(counts: Any) -> str:
     return ", ".join(f"{value} {name}" for name, value in counts.items() if value) or "none received"
 
 
 def replay_document(replayed: Replayed, models: Sequence[str]) -> dict[str, Any]:
-    """Plain data of a replay, of the models asked for. Segments are in s since the first DVL sample."""
+    """Return plain data of a replay for the requested models. Segments are in s since the first DVL sample."""
     result = replayed.result
     told = [name for name in models if name in result.estimates]
     segments = []

@@ -1,4 +1,4 @@
-"""What a run looked like over time: estimates and velocities, thinned so that a run of any length fits in memory."""
+"""Estimates and velocities over a run, thinned so that a run of any length fits in memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import AlignedBlock, Codes, Pairing, Stamps
 from ..calibration.results.results import Estimate
 
-# Rows kept of each series at most: a figure shows no more.
+# largest number of rows per series; a figure has no finer detail
 KEPT_STATES, KEPT_VELOCITIES = 300, 800
 
 
@@ -27,7 +27,7 @@ class ModelHistory:
 
     state: (N, n), misalignment in rad in the DVL frame, then as the model's state_names; std: (N, n).
     misalignment_covariance: (N, 3, 3) rad². nis: (N,) mean νᵀS⁻¹ν per measurement row over the samples used since the
-    stamp before (about 1 for a consistent filter), nan where it used none.
+    previous stamp (about 1 for a consistent filter), nan if none was used.
     """
 
     state: Array
@@ -40,10 +40,10 @@ class ModelHistory:
 class RunHistory:
     """A run over time.
 
-    stamps_ns: (N,) of the rows of `models` and paired_share; a model's state is that of the samples up to then.
-    paired_share: (N,) share of the DVL samples since the stamp before that had a reference, nan where none was decided.
-    dvl_ns (M,), dvl_velocity (M, 3): usable DVL samples, m/s, DVL frame, moved to the reference point.
-    paired_ns (P,), reference_velocity (P, 3): those that had a reference, and that, m/s, in the body frame.
+    stamps_ns: (N,) of the rows of `models` and paired_share; a model's state includes all samples up to the stamp.
+    paired_share: (N,) share of the DVL samples since the previous stamp with a reference, nan if none was decided.
+    dvl_ns (M,), dvl_velocity (M, 3): usable DVL samples, m/s, DVL frame, corrected to the reference point. paired_ns
+    (P,), reference_velocity (P, 3): DVL samples with a reference, and the reference, m/s, body frame.
     """
 
     stamps_ns: Stamps
@@ -56,9 +56,9 @@ class RunHistory:
 
 
 class Thinned:
-    """Keeps evenly spread rows of an endless series: every stride-th, the stride doubles when there are too many.
+    """Evenly spread rows of an endless series: every stride-th row; the stride doubles at the limit.
 
-    limit: rows kept at most. expected: length of the series as far as it is known.
+    limit: largest number of rows. expected: length of the series, if known.
     """
 
     def __init__(self, limit: int, expected: int = 0) -> None:
@@ -68,7 +68,7 @@ class Thinned:
         self._rows: list[tuple[Any, ...]] = []
 
     def add(self, *columns: Array | Stamps) -> None:
-        """Take the next rows, as columns (N, ...)."""
+        """Add the next rows, as columns (N, ...)."""
         n = len(columns[0])
         at = slice(-self._seen % self._stride, n, self._stride)
         self._seen += n
@@ -78,16 +78,16 @@ class Thinned:
             self._stride *= 2
 
     def columns(self, *shapes: tuple[int, ...]) -> list[Array]:
-        """What was kept, in columns of rows of these shapes."""
+        """Return the kept rows as columns of rows with these shapes."""
         columns = zip(*self._rows, strict=True) if self._rows else ((),) * len(shapes)
         return [np.array(column).reshape(-1, *shape) for column, shape in zip(columns, shapes, strict=True)]
 
 
 class Recorder:
-    """Collects a `RunHistory` beside a calibrator, without changing what it computes.
+    """Collector of a `RunHistory` from a calibrator, whose results it does not change.
 
-    Give `take` to the calibrator as its on_rows, `start` as its on_restart and `trace` as its trace. expected: about
-    how many DVL samples there will be.
+    Give `take` to the calibrator as its on_rows, `start` as its on_restart and `trace` as its trace. expected:
+    approximate number of DVL samples.
     """
 
     def __init__(self, parameters: Parameters, expected: int = 0) -> None:
@@ -97,14 +97,14 @@ class Recorder:
         self.start()
 
     def start(self) -> None:
-        """Start anew, as the calibration does."""
+        """Restart together with the calibration."""
         self._stamps_ns: list[Stamps] = []
         self._pairing: list[Codes] = []
         self._dvl = Thinned(KEPT_VELOCITIES, self._expected)
         self._paired = Thinned(KEPT_VELOCITIES, self._expected)
 
     def take(self, block: AlignedBlock) -> None:
-        """Take note of rows."""
+        """Add rows."""
         self._stamps_ns.append(block.stamps_ns)
         self._pairing.append(block.pairing)
         usable, paired = block.part(block.usable), block.part(block.paired)
@@ -117,7 +117,7 @@ class Recorder:
             self._paired.add(paired.stamps_ns, seen.reference_body)
 
     def history(self, calibrator: Calibrator, estimates: Mapping[str, Estimate]) -> RunHistory:
-        """What was collected until `Calibrator.finish`, with the estimates of its result at its end."""
+        """Return the history after `Calibrator.finish`, ending with the estimates of its result."""
         numbers = self.trace.numbers()
         stamps_ns = np.concatenate([*self._stamps_ns, np.zeros(0, dtype=np.int64)])
         pairing = np.concatenate([*self._pairing, np.zeros(0, dtype=np.uint8)])
@@ -161,6 +161,6 @@ def _model_history(
 
 
 def _share(sums: Array) -> Array:
-    """Growing sums (N, 2) -> what the first gained over what the second gained since the row before (N,)."""
+    """Divide the increments of cumulative sums (N, 2): first column by second, since the previous row (N,)."""
     gained = np.diff(sums.astype(float), axis=0, prepend=0.0)
     return np.divide(gained[:, 0], gained[:, 1], out=np.full(len(sums), np.nan), where=gained[:, 1] > 0)

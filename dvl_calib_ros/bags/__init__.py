@@ -1,1 +1,1 @@
-"""rosbag2 recordings, read and written; knows nothing of DVLs."""
+"""Reading and writing of rosbag2 recordings, independent of DVLs."""

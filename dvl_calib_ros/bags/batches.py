@@ -1,4 +1,4 @@
-"""Recorded messages by the thousand, located among bytes that are read at once, and sorted by log time."""
+"""Batches of recorded messages, located in shared bytes and sorted by log time."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 from .channels import Channel
 
-# What single messages are gathered to, and their bytes.
+# limits of a batch collected from single messages
 MOST_MESSAGES, MOST_BYTES = 4096, 4 << 20
-# No later log time fits int64, in which columns and SQLite have them
+# a later log time does not fit int64, the type of columns and SQLite
 LATEST_NS = 2**63 - 1
 
 Times = NDArray[Any]
-"""(N,) ns, int64; Python's integers where damage made some that int64 does not hold."""
+"""(N,) ns, int64; Python integers if damaged ones do not fit int64."""
 Index = NDArray[np.intp]
 
 
 class Batch(NamedTuple):
-    """N messages that follow each other in a recording, in order of log time.
+    """N consecutive messages of a recording, in order of log time.
 
-    log_ns: (N,). number: (N,) of each message's channel in `channels`. start, end: (N,) where it lies in `content`.
+    log_ns: (N,). number: (N,) of each message's channel in `channels`. start, end: (N,) bounds of each in `content`.
     """
 
     log_ns: Times
@@ -39,26 +39,26 @@ class Batch(NamedTuple):
 
     @property
     def size(self) -> int:
-        """N."""
+        """Number of messages."""
         return len(self.log_ns)
 
     def part(self, at: Any) -> Batch:
-        """Those of a slice, of indices or of a mask."""
+        """Return the messages of a slice, of indices or of a mask."""
         return self._replace(log_ns=self.log_ns[at], number=self.number[at], start=self.start[at], end=self.end[at])
 
     def data(self) -> Iterator[bytes]:
-        """The bytes of each message."""
+        """Yield the bytes of each message."""
         content = self.content
         return (content[start:end] for start, end in zip(self.start.tolist(), self.end.tolist(), strict=True))
 
     def messages(self) -> Iterator[BagMessage]:
-        """One by one."""
+        """Yield the messages individually."""
         channels = self.channels
         of_each = [channels[number] for number in self.number.tolist()]
         return zip(self.log_ns.tolist(), of_each, self.data(), strict=True)
 
     def begin_with(self, magic: bytes) -> NDArray[np.bool_]:
-        """Which (N,) messages begin so."""
+        """Return which messages (N,) begin with these bytes."""
         found = np.zeros(self.size, dtype=bool)
         at = np.flatnonzero(self.end - self.start >= len(magic))
         content = np.frombuffer(self.content, dtype=np.uint8)
@@ -68,18 +68,18 @@ class Batch(NamedTuple):
         return found
 
     def rows(self, at: Index, length: int) -> NDArray[Any]:
-        """A copy of messages of one length above zero, as (M,) items of so many bytes."""
+        """Return a copy of messages of one length above zero, as (M,) items of that many bytes."""
         item = np.dtype(("V", length))
         everywhere = np.ndarray((len(self.content) - length + 1,), item, self.content, strides=(1,))
-        return everywhere[self.start[at]]  # `take` would copy all that overlaps first
+        return everywhere[self.start[at]]  # `take` would first copy all overlapping items
 
     def compact(self) -> Batch:
-        """The same without bytes that are in no message."""
+        """Return the batch without unused bytes."""
         end = np.cumsum(self.end - self.start)
         return self._replace(start=end - (self.end - self.start), end=end, content=b"".join(self.data()))
 
     def merged(self, later: Batch) -> Batch:
-        """With another one's of the same channels, which come after those of the same time."""
+        """Merge with another batch of the same channels; at equal times its messages come later."""
         if not self.size:
             return later
         shift = len(self.content)
@@ -95,14 +95,14 @@ class Batch(NamedTuple):
         return joined.sorted()
 
     def sorted(self) -> Batch:
-        """In order of log time, those of one time as they are."""
+        """Return the batch in order of log time, stable for equal times."""
         if (self.log_ns[1:] >= self.log_ns[:-1]).all():
             return self
         return self.part(np.argsort(self.log_ns, kind="stable"))
 
 
 def times(log_ns: Any) -> Times:
-    """Log times (N,), of damaged recordings among them."""
+    """Return log times (N,), also of damaged recordings."""
     array = np.asarray(log_ns)
     if array.dtype.kind == "u":
         return array.astype(np.int64 if not len(array) or array.max() <= LATEST_NS else object)
@@ -113,7 +113,7 @@ def times(log_ns: Any) -> Times:
 
 
 def batched(messages: Iterable[BagMessage]) -> Iterator[Batch]:
-    """Single messages, which are in order of log time; those before what is raised come before it."""
+    """Group single messages in order of log time; those before an exception are yielded first."""
     held: list[BagMessage] = []
     size = 0
     try:
@@ -132,9 +132,9 @@ def batched(messages: Iterable[BagMessage]) -> Iterator[Batch]:
 
 
 def one_batch(messages: Iterable[BagMessage]) -> Batch:
-    """Messages as one batch, in the order that they have."""
+    """Return messages as one batch, in their order."""
     log_ns, channels, data = tuple(zip(*messages, strict=True)) or ((), (), ())
-    numbers: dict[int, int] = {}  # by the channel's id: its hash costs more than all else here
+    numbers: dict[int, int] = {}  # the channel's id is cheap; its hash would take most of the time
     number = np.array([numbers.setdefault(id(channel), len(numbers)) for channel in channels], dtype=np.intp)
     known = {numbers[id(channel)]: channel for channel in channels}
     end = np.cumsum([len(each) for each in data], dtype=np.intp)
@@ -142,12 +142,12 @@ def one_batch(messages: Iterable[BagMessage]) -> Batch:
     return Batch(times(log_ns), number, start, end, b"".join(data), known)
 
 
-# What is sorted in memory at once; the rest waits on disk.
+# bytes sorted in memory at a time; the rest waits on disk
 IN_MEMORY = 32 << 20
-_HEAD = struct.Struct("<QII")  # log time (ns), number of the channel, length
-# What a message takes in memory beside its bytes
+_HEAD = struct.Struct("<QII")  # log time (ns), channel number, length
+# memory per message in addition to its bytes
 _OVERHEAD = 200
-# Read at once of each sorted part
+# bytes read at a time from each sorted part
 _PART = 1 << 18
 
 BagMessage = tuple[int, Channel, bytes]
@@ -155,7 +155,7 @@ BagMessage = tuple[int, Channel, bytes]
 
 
 def by_log_time(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
-    """The messages in order of log time, those of one time in the order they come in."""
+    """Yield the messages in order of log time, stable for equal times."""
     channels: dict[Channel, int] = {}
     with tempfile.TemporaryFile() as file:
         spans: list[tuple[int, int]] = []
@@ -165,16 +165,16 @@ def by_log_time(messages: Iterable[BagMessage]) -> Iterator[BagMessage]:
             held.append(message)
             size += len(message[2]) + _OVERHEAD
             if size > IN_MEMORY:
-                spans.append(_spill(file, held, channels))
+                spans.append(_write_run(file, held, channels))
                 held, size = [], 0
         held.sort(key=itemgetter(0))
         known = list(channels)
-        runs = [_run(file, *span, known) for span in spans]
+        runs = [_read_run(file, *span, known) for span in spans]
         yield from heapq.merge(*runs, held, key=itemgetter(0))
 
 
-def _spill(file: BinaryIO, held: list[BagMessage], channels: dict[Channel, int]) -> tuple[int, int]:
-    """Write a sorted run to the end of the file; where it begins and ends."""
+def _write_run(file: BinaryIO, held: list[BagMessage], channels: dict[Channel, int]) -> tuple[int, int]:
+    """Append a sorted run to the file. Return its start and end."""
     start = file.seek(0, 2)
     held.sort(key=itemgetter(0))
     for log_ns, channel, data in held:
@@ -184,8 +184,8 @@ def _spill(file: BinaryIO, held: list[BagMessage], channels: dict[Channel, int])
     return start, file.tell()
 
 
-def _run(file: BinaryIO, at: int, end: int, channels: list[Channel]) -> Iterator[BagMessage]:
-    """A run from the file, read a part at a time: all runs share the file."""
+def _read_run(file: BinaryIO, at: int, end: int, channels: list[Channel]) -> Iterator[BagMessage]:
+    """Yield a run from the file, read in parts, because all runs share the file."""
     rest = b""
     while at < end:
         file.seek(at)

@@ -1,7 +1,7 @@
-"""Channels of a recording, and the message definitions that they bring along.
+"""Channels of a recording, and their embedded message definitions.
 
-rosbags generates a class and its decoder from a definition and runs the code. What a definition decides in that code is
-names, numbers and values of constants; here names must be plain, numbers bounded, and constants are left out.
+rosbags generates a class and its decoder from a definition and runs that code. A definition contributes names, numbers
+and constants to it. Here names must be plain, numbers are bounded, and constants are removed.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ FORMATS = {
     "ros2idl": MessageDefinitionFormat.IDL,
     "omgidl": MessageDefinitionFormat.IDL,
 }
-# What damaged bytes, or a definition that does not fit them, make rosbags' generated decoders raise
+# exceptions of rosbags' generated decoders for damaged bytes or an unsuitable definition
 DECODING = (SerdeError, struct.error, ValueError, LookupError, OverflowError, RecursionError)
 
 
 class Channel(NamedTuple):
-    """Messages of one topic, type and definition; a recording can hold two of one topic."""
+    """Messages of one topic, type and definition; a recording can have two for one topic."""
 
     topic: str
     msgtype: str
@@ -38,18 +38,18 @@ class Channel(NamedTuple):
 
 
 class DecodingError(Exception):
-    """A message that cannot be decoded, and why."""
+    """A message cannot be decoded; the text says why."""
 
 
 def definition_of(encoding: str, text: str) -> Definition:
-    """A definition as recordings name its format."""
+    """Return a definition by a recording's name of its format."""
     return Definition(FORMATS.get(encoding, MessageDefinitionFormat.NONE), text, encoding == "ros1msg")
 
 
 class Decoder:
-    """Decodes the messages of any channels.
+    """Decoder of messages of any channel.
 
-    known: type -> definitions of it that are about, the likeliest first, for recordings that bring none.
+    known: type -> known versions of its definition, the most likely first, for recordings without.
     """
 
     def __init__(self, known: Mapping[str, Sequence[str]] | None = None) -> None:
@@ -58,21 +58,21 @@ class Decoder:
         self._by_definition: dict[tuple[str, Definition | None], list[Typestore]] = {}
 
     def lacks_definition(self, channel: Channel) -> bool:
-        """Whether a channel is of a type that ROS does not bring, and does not say how it is laid out."""
+        """Return whether a channel's type is neither in ROS nor defined in the recording."""
         return channel.msgtype in self._known and is_empty(channel.definition)
 
     def typestore(self, channel: Channel) -> Typestore | None:
-        """The one that decodes all of a channel's messages; None if that is not known (yet)."""
+        """Return the type store that decodes all of a channel's messages; None if unknown so far."""
         with suppress(DefinitionError):
             stores = self._typestores(channel)
             return stores[0] if len(stores) == 1 else None
         return None
 
     def __call__(self, channel: Channel, data: bytes) -> Any:
-        """A message, by the definition of its channel, else by those known. Raises DecodingError."""
+        """Decode a message by its channel's definition, else by the known ones. Raises DecodingError."""
         try:
             stores = self._typestores(channel)
-            for store in stores[:-1]:  # of several versions, the one that a message fits from beginning to end
+            for store in stores[:-1]:  # of several versions, use the one that fits a message completely
                 with suppress(*DECODING):
                     message = store.deserialize_cdr(data, channel.msgtype)
                     self._stores[channel] = [store]
@@ -87,15 +87,15 @@ class Decoder:
         stores = self._stores.get(channel)
         if stores is None:
             try:
-                stores = self._made(channel)
-            except DefinitionError as error:  # once, not for every message
+                stores = self._make_typestores(channel)
+            except DefinitionError as error:  # raise the stored error for every message, without parsing again
                 stores = error
             self._stores[channel] = stores
         if isinstance(stores, DefinitionError):
             raise stores
         return stores
 
-    def _made(self, channel: Channel) -> list[Typestore]:
+    def _make_typestores(self, channel: Channel) -> list[Typestore]:
         _, msgtype, definition = channel
         key = (msgtype, definition)
         if key not in self._by_definition:
@@ -112,7 +112,7 @@ def _decoded(store: Typestore, data: bytes, msgtype: str) -> Any:
     try:
         return store.deserialize_cdr(data, msgtype)
     except KeyError as error:
-        raise DefinitionError(f"the definition of {msgtype} lacks that of {error.args[0]}") from error
+        raise DefinitionError(f"the definition of {msgtype} lacks the definition of {error.args[0]}") from error
     except SerdeError as error:
         if _TOO_LONG not in str(error):
             raise
@@ -123,25 +123,25 @@ def _decoded(store: Typestore, data: bytes, msgtype: str) -> Any:
         raise DefinitionError(f"it is longer than a {msgtype}; its definition may be of another version") from error
 
 
-# What rosbags says of a message with more bytes behind its end than the three of padding that it takes
+# rosbags' text for a message with more than three bytes of padding
 _TOO_LONG = "size mismatch"
-# Big-endian and little-endian
+# big-endian and little-endian
 PLAIN_CDR = (b"\0\0", b"\0\1")
 
-# Of the definitions that ROS ships the longest has 9 kB, with all that is nested in it, and the largest array 48.
+# the longest definition in ROS has 9 kB, including nested ones, and the largest array 48 elements
 LONGEST_DEFINITION = 1 << 18
 LARGEST_ARRAYS = 1 << 16
-# Types made of definitions that are kept: making them takes longer than reading a minute, and recordings are alike.
+# number of cached type stores: making one takes longer than reading a minute, and recordings share them
 KEPT = 32
 _FIELD = re.compile(r"[A-Za-z]\w*", re.ASCII)
 _TYPE = re.compile(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
-# rosbags evaluates the constants of IDL: a shift can take all memory, and nested brackets for ever to parse
+# rosbags evaluates constants of IDL: a shift can take all memory, and nested brackets can parse for ever
 _EXPENSIVE_IDL = re.compile(r"<<|\(\s*\(\s*\(")
 SEPARATOR = "=" * 80 + "\n"
 
 
 class Definition(NamedTuple):
-    """The text of a message definition. is_ros1: whether its messages are laid out as ROS 1 does (ros1.py)."""
+    """Text of a message definition. is_ros1: whether its messages have ROS 1's layout (ros1.py)."""
 
     format: MessageDefinitionFormat
     text: str
@@ -149,17 +149,17 @@ class Definition(NamedTuple):
 
 
 class DefinitionError(Exception):
-    """A definition that cannot be used."""
+    """A definition cannot be used."""
 
 
 def is_empty(definition: Definition | None) -> bool:
-    """Whether a recording does not say how messages are laid out; those of before ROS 2 Iron do not."""
+    """Return whether a recording lacks the message definition, as before ROS 2 Iron."""
     return definition is None or definition.format is MessageDefinitionFormat.NONE or not definition.text.strip()
 
 
 @lru_cache(maxsize=KEPT)
 def known_typestore(msgtype: str, text: str) -> Typestore:
-    """Jazzy's types and one that a definition is known of, in MSG format."""
+    """Return Jazzy's types and one with a known definition, in MSG format."""
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg(text, msgtype))
     return store
@@ -167,7 +167,7 @@ def known_typestore(msgtype: str, text: str) -> Typestore:
 
 @lru_cache(maxsize=KEPT)
 def typestore(definition: Definition | None, msgtype: str) -> Typestore:
-    """Types for a message: from its definition, or Jazzy's if that is empty. Raises DefinitionError."""
+    """Return types for a message: from its definition, or Jazzy's if it is empty. Raises DefinitionError."""
     if definition is None or is_empty(definition):
         return get_typestore(Stores.ROS2_JAZZY)
     try:
@@ -175,14 +175,14 @@ def typestore(definition: Definition | None, msgtype: str) -> Typestore:
     except DefinitionError:
         raise
     except Exception as error:
-        # The parser raises all sorts of things on what is damaged; one that parses nothing at all is not damage.
+        # The parser raises many types for damaged text. If it fails on a sound definition too, this is no damage.
         _typestore(_SOUND[definition.format], "a/msg/B")
         raise DefinitionError(f"the definition of {msgtype} is damaged ({type(error).__name__})") from error
 
 
 def _typestore(definition: Definition, msgtype: str) -> Typestore:
     store = get_typestore(Stores.EMPTY)
-    store.register(_harmless(_parsed(definition, msgtype)))
+    store.register(_without_constants(_parsed(definition, msgtype)))
     return store
 
 
@@ -209,14 +209,14 @@ def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
     return types
 
 
-def _harmless(types: dict[str, Any]) -> dict[str, Any]:
-    """The types without their constants. Raises DefinitionError for what no driver defines."""
+def _without_constants(types: dict[str, Any]) -> dict[str, Any]:
+    """Remove the constants from types. Raises DefinitionError for definitions that no driver has."""
     arrays = 0
     for name, (_, fields) in types.items():
         for field, (kind, description) in fields:
             if not _TYPE.fullmatch(name) or not _FIELD.fullmatch(field):
                 raise DefinitionError(f"{name!r} or its field {field!r} is no name")
-            if kind == Nodetype.ARRAY:  # decoders have a line of code for each element
+            if kind == Nodetype.ARRAY:  # decoders have a line of code per element
                 arrays += description[1]
     if arrays > LARGEST_ARRAYS:
         raise DefinitionError(f"arrays of {arrays} elements")
@@ -226,15 +226,15 @@ def _harmless(types: dict[str, Any]) -> dict[str, Any]:
 
 def _check_finite(types: dict[str, Any]) -> None:
     """Raise DefinitionError for a type that contains itself."""
-    inner = {name: {_named(description) for _, description in fields} for name, (_, fields) in types.items()}
+    inner = {name: {_message_type_of(description) for _, description in fields} for name, (_, fields) in types.items()}
     try:
         TopologicalSorter(inner).prepare()
     except CycleError as error:
         raise DefinitionError(f"the definition of {min(error.args[1])} contains itself") from error
 
 
-def _named(description: Any) -> str:
-    """Return the type that a field holds, or holds many of; '' for numbers and strings."""
+def _message_type_of(description: Any) -> str:
+    """Return the message type of a field or of its elements; '' for numbers and strings."""
     kind, what = description
     while kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         kind, what = what[0]

@@ -1,8 +1,8 @@
-"""Messages of recordings as columns, and their layout in CDR.
+"""Messages of recordings as columns, by their layout in CDR.
 
 CDR aligns every number to its size, counted from the end of the 4 bytes of encapsulation, so the lengths of strings
-decide where everything behind them lies. A `Layout` is that of one message; others of the same length in bytes share it
-where all their strings are as long. Messages with sequences have none.
+determine the positions of everything after them. A `Layout` belongs to one message. Messages with the same number of
+bytes share it if their strings have the same lengths. Messages with sequences have no layout.
 https://www.omg.org/spec/DDS-XTYPES, 7.4.3 (XCDR version 1, plain).
 """
 
@@ -24,10 +24,10 @@ from .batches import LATEST_NS, Batch, Index
 from .channels import PLAIN_CDR, Channel, Decoder, DecodingError
 from .reader import BagReader
 
-# Messages that are read at once, and their bytes: enough for columns to pay, few enough for any memory.
+# limits of a window: enough messages for columns to be efficient, few enough for the memory
 WINDOW_MESSAGES, WINDOW_BYTES = 4096, 4 << 20
 ENOUGH_MESSAGES = 1024
-# A recorder has one layout or a few; garbage could have ever new ones.
+# a recorder has few layouts; garbage could have ever new ones
 _MOST_LAYOUTS = 8
 Stamps = NDArray[np.int64]
 
@@ -36,8 +36,8 @@ Stamps = NDArray[np.int64]
 class Part:
     """Messages of one channel in a window, in order.
 
-    arrival: (N,) their places among all messages that are read. log_ns: (N,). columns: of these messages, None where
-    they are not laid out alike.
+    arrival: (N,) positions among all messages read. log_ns: (N,). columns: of these messages, None if their layouts
+    differ.
     """
 
     channel: Channel
@@ -51,11 +51,11 @@ class Part:
         return len(self.arrival)
 
     def data(self) -> Iterable[bytes]:
-        """The bytes of each message."""
+        """Return the bytes of each message."""
         return self._data if self.columns is None else self.columns.messages()
 
     def messages(self) -> Iterator[tuple[Any, str]]:
-        """One by one: the decoded message, None if it cannot be decoded, and then why."""
+        """Yield each decoded message, or None and the reason why it cannot be decoded."""
         for data in self.data():
             try:
                 yield self._decoder(self.channel, data), ""
@@ -65,14 +65,14 @@ class Part:
 
 @dataclass(frozen=True)
 class Window:
-    """Messages that follow each other in a recording. log_ns: of the last."""
+    """Consecutive messages of a recording. log_ns: of the last."""
 
     parts: list[Part]
     log_ns: int
 
 
 def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str] = ()) -> Iterator[Window]:
-    """Messages of these topics. one_by_one: topics of which no columns are asked for."""
+    """Yield windows of messages on these topics. one_by_one: topics without columns."""
     layouts = _Layouts(bag.decoder)
     arrived = 0
     for batches in _windows(bag.batches(topics)):
@@ -81,7 +81,8 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
         by_kind: dict[tuple[int, int], list[tuple[Batch, Index, Index]]] = {}
         for batch, first in zip(batches, places.tolist(), strict=False):
             for number, length, at in _kinds(batch):
-                kind = (id(batch.channels[number]), length)  # by the channel's id: its hash costs more than all else
+                # the channel's id is cheap; its hash would take most of the time
+                kind = (id(batch.channels[number]), length)
                 by_kind.setdefault(kind, []).append((batch, at, first + at))
         parts = []
         for (_, length), found in by_kind.items():
@@ -103,7 +104,7 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
 
 
 def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
-    """The messages of each window."""
+    """Yield the batches of each window."""
     taken: list[Batch] = []
     count = size = 0
     for batch in batches:
@@ -115,7 +116,7 @@ def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
             end = min(first + WINDOW_MESSAGES - count, full, batch.size)
             taken.append(batch.part(slice(first, end)))
             count, size, first = count + end - first, size + int(sizes[end - 1]) - before, end
-            # what comes by the thousand is taken as it comes: to join it with what follows would copy it
+            # large batches are used directly, because joining would copy them
             if count >= WINDOW_MESSAGES or size >= WINDOW_BYTES or (first == batch.size and count >= ENOUGH_MESSAGES):
                 yield taken
                 taken, count, size = [], 0, 0
@@ -124,7 +125,7 @@ def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
 
 
 def _kinds(batch: Batch) -> Iterator[tuple[int, int, Index]]:
-    """Channels' numbers and lengths of messages, each with where (M,) such messages are, in order of the first."""
+    """Yield channel number and length of messages, with the indices (M,) of such messages, by first occurrence."""
     kinds = batch.number + ((batch.end - batch.start) << 16)
     order = np.argsort(kinds, kind="stable")
     of_each = np.split(order, np.flatnonzero(np.diff(kinds[order])) + 1)
@@ -134,14 +135,14 @@ def _kinds(batch: Batch) -> Iterator[tuple[int, int, Index]]:
 
 
 class _Layouts:
-    """The layouts found so far, by channel and length of message."""
+    """Layouts found so far, by channel and length of message."""
 
     def __init__(self, decoder: Decoder) -> None:
         self._decoder = decoder
         self._known: dict[tuple[Channel, int], list[Layout]] = {}
 
     def split(self, channel: Channel, data: Rows) -> Iterator[tuple[MessageColumns | None, Index]]:
-        """Messages of one length, and which of them they are, by layout; those without any last, with None."""
+        """Yield columns and indices of messages of one length, by layout; those without one last, with None."""
         known = self._known.setdefault((channel, data.itemsize), [])
         left = np.arange(len(data))
         tried = 0
@@ -177,25 +178,25 @@ _FORMATS = {
     "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 ENCAPSULATION = 4
-# A message may end with as much padding; rosbags takes no more.
+# most padding at the end of a message, as in rosbags
 _PADDING = 3
-# Where a message has more fields than this, viewing it costs more than it spares.
+# with more fields than this, columns cost more than they save
 _MOST_FIELDS = 500
-# Parts of a dtype that are no fields of the message; no field's name begins so
+# parts of the dtype that are no fields of the message; no field's name begins with <
 _KIND, _LENGTH, _END = "<kind>", "<length>", "<end>"
 Rows = NDArray[Any]
 Mask = NDArray[np.bool_]
 
 
 class NoLayoutError(Exception):
-    """A message that others do not share their layout with."""
+    """A message does not share its layout with others."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """dtype: of one message; its names are paths, as ``twist.twist.linear.x`` or ``beams[2].valid``.
+    """Layout of a message. dtype: its names are paths, such as ``twist.twist.linear.x`` or ``beams[2].valid``.
 
-    lengths: path -> of the strings, bytes without terminator. flags: paths of what is bool.
+    lengths: path -> length of the string, bytes without terminator. flags: paths of bool fields.
     """
 
     dtype: np.dtype[Any]
@@ -205,28 +206,29 @@ class Layout:
 
     @cached_property
     def inner(self) -> frozenset[str]:
-        """Paths of what has fields of its own."""
+        """Paths of fields that have fields of their own."""
         paths = (path.split(".") for path in self.dtype.names or ())
         return frozenset(".".join(steps[:depth]) for steps in paths for depth in range(1, len(steps)))
 
     def view(self, messages: Rows) -> Rows:
-        """Messages (N,), items of this many bytes, as rows, of which those count that `shared` says."""
+        """Return messages (N,), items of this many bytes, as rows; only the rows in `shared` are valid."""
         return messages.view(self.dtype)
 
     def shared(self, rows: Rows) -> Mask:
-        """(N,) which rows are laid out so, with nothing but ASCII in their strings."""
+        """Return which rows (N,) have this layout, with only ASCII in their strings."""
         shared: Mask = rows[_KIND] == int.from_bytes(self.kind, "little")
         for path, length in self.lengths.items():
             shared &= (rows[_LENGTH + path] == length + 1) & (rows[_END + path] == 0)
-            if length and len(rows) and rows[path].max() >= 0x80:  # of all at once is a tenth of row by row
+            # one test of all takes a tenth of the time of tests by row
+            if length and len(rows) and rows[path].max() >= 0x80:
                 shared &= (rows[path] < 0x80).all(axis=1)
         return shared
 
 
 class MessageColumns:
-    """Rows with the names of a message's fields, as a message has them: ``columns.twist.twist.linear.x`` is (N,).
+    """Columns with the attribute names of a message: ``columns.twist.twist.linear.x`` is (N,).
 
-    Strings are (N, length) bytes, arrays of numbers (N, size). Raises AttributeError for what is no field.
+    Strings are (N, length) bytes, arrays of numbers (N, size). Raises AttributeError for a missing field.
     """
 
     def __init__(self, layout: Layout, rows: Rows, prefix: str = "") -> None:
@@ -248,16 +250,16 @@ class MessageColumns:
         return MessageColumns(layout, self._rows, f"{path}.")
 
     def messages(self) -> Iterator[bytes]:
-        """The bytes of each message, as recorded."""
+        """Yield the bytes of each message, as recorded."""
         return (row.tobytes() for row in self._rows.view(("V", self._rows.itemsize)))
 
     def part(self, at: Any) -> MessageColumns:
-        """The rows of a slice, of indices or of a mask."""
+        """Return the rows of a slice, of indices or of a mask."""
         return MessageColumns(self._layout, self._rows[at], self._prefix)
 
 
 def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
-    """The layout of a message. Raises NoLayoutError, also where rosbags makes something else of the message."""
+    """Return the layout of a message. Raises NoLayoutError if it has none or rosbags decodes it differently."""
     if len(data) < ENCAPSULATION or data[:2] not in PLAIN_CDR:
         raise NoLayoutError("no CDR")
     walk = _LayoutWalk(store, data)
@@ -283,7 +285,7 @@ def layout_of(store: Typestore, msgtype: str, data: bytes) -> Layout:
 
 
 class _LayoutWalk:
-    """Goes through a message's definition and the message at once."""
+    """Walk through a message's definition and its bytes in parallel."""
 
     def __init__(self, store: Typestore, data: bytes) -> None:
         self._store, self._data = store, data
@@ -353,7 +355,7 @@ class _LayoutWalk:
 
 
 def _compare(layout: Layout, rows: Rows, message: Any) -> None:
-    """Raise NoLayoutError unless a row holds to the last bit what rosbags made of the message."""
+    """Raise NoLayoutError unless a row equals rosbags' decoded message to the last bit."""
     if not layout.shared(rows)[0]:
         raise NoLayoutError("not only ASCII")
     for path in (*layout.dtype.names, *layout.lengths):  # type: ignore[misc]

@@ -1,4 +1,4 @@
-"""The files of recordings: which of a folder belong to it, unpacked, with the journal that a dead recorder left."""
+"""Files of recordings: the files of a folder, decompression, and the journal left by a dead recorder."""
 
 from __future__ import annotations
 
@@ -23,30 +23,30 @@ STORAGE_SUFFIXES = (".mcap", ".db3", ".bag")
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is that of a bag, by its name alone: a folder, or a file of one."""
+    """Return whether a path is a bag's, by its name only: a folder, or a file of a bag."""
     return path.is_dir() or path.suffix in STORAGE_SUFFIXES
 
 
-# A compressed file that unpacks to more than this and so many times its size is no recording.
+# a compressed file that unpacks to more than this size and this multiple of its own is no recording
 LARGEST_RATIO, SMALL_FILE = 100, 1 << 30
 
 NewFolder = Callable[[], Path]
-"""Makes a temporary folder, which lasts as long as its reader."""
+"""Creates a temporary folder, which lasts as long as its reader."""
 
 
 def storage_suffix(path: Path) -> str:
-    """The suffix that says in which storage a file is, compressed or not."""
+    """Return the suffix of the storage format, also of a compressed file."""
     return Path(path.stem).suffix if path.suffix == ".zstd" else path.suffix
 
 
 def files_of(folder: Path, notes: list[str]) -> list[Path]:
-    """The recordings in a folder: those that its metadata.yaml lists, or all if that is missing or damaged."""
+    """Return the recordings in a folder: those in its metadata.yaml, or all if that is missing or damaged."""
     files = sorted((file for file in folder.iterdir() if storage_suffix(file) in STORAGE_SUFFIXES), key=_natural_order)
     if not files:
         raise InputError(f"{folder}: no bag, there is no .mcap, .db3 or .bag file in it")
-    if all(storage_suffix(file) == ".bag" for file in files):  # ROS 1 lists nothing
+    if all(storage_suffix(file) == ".bag" for file in files):  # ROS 1 has no list
         return files
-    listed = _listed(folder, notes)
+    listed = _files_in_metadata(folder, notes)
     if not listed:
         return files
     chosen = [file for file in files if file.name in listed or file.name.removesuffix(".zstd") in listed]
@@ -62,8 +62,8 @@ def files_of(folder: Path, notes: list[str]) -> list[Path]:
     return chosen
 
 
-def _listed(folder: Path, notes: list[str]) -> list[str]:
-    """Names of the files that metadata.yaml lists; none, with a note, if there is nothing to go by."""
+def _files_in_metadata(folder: Path, notes: list[str]) -> list[str]:
+    """Return the file names in metadata.yaml; none, with a note, if it is unusable."""
     try:
         metadata = load_yaml(folder / "metadata.yaml", "metadata file")
         return [PurePath(name).name for name in metadata["rosbag2_bagfile_information"]["relative_file_paths"]]
@@ -73,18 +73,19 @@ def _listed(folder: Path, notes: list[str]) -> list[str]:
 
 
 def _natural_order(path: Path) -> list[tuple[int, str]]:
-    """bag_2 before bag_10."""
+    """Return the sort key that puts bag_2 before bag_10."""
     parts = "".join(c if c.isdecimal() else f" {c} " for c in path.name).split()
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
 
 
 def decompressed(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
-    """A compressed file, unpacked as far as that goes."""
+    """Decompress a file, as far as it is readable."""
     target = new_folder() / (path.stem if path.suffix == ".zstd" else path.name)
     most = max(SMALL_FILE, LARGEST_RATIO * path.stat().st_size)
     try:
         with open_raw(path) as raw, zstd.open(raw, "rb") as packed, target.open("wb") as unpacked:
-            while piece := packed.read1():  # as it comes: what precedes damage must be out before the damage
+            # in small pieces: data before the damage must be written before the damage raises
+            while piece := packed.read1():
                 unpacked.write(piece)
                 if unpacked.tell() > most:
                     raise EOFError(f"it unpacks to more than {most} bytes")
@@ -94,9 +95,9 @@ def decompressed(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
 
 
 def with_journal(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
-    """A database whose recorder died, with what lies in the journal beside it; `path` itself if there is none.
+    """Copy a dead recorder's database with its journal and return the copy; return `path` without a journal.
 
-    The journal of a link lies where the link leads, which is where SQLite wrote it, unless it is linked as well.
+    SQLite writes the journal of a link next to the link's target, unless the journal is linked as well.
     """
     journals = {suffix: _journal(path, suffix) for suffix in ("-wal", "-journal")}
     if not any(journals.values()):

@@ -1,4 +1,4 @@
-"""A recording's bytes from a disk that may not give all of them."""
+"""Reading of a file from a disk with unreadable sectors."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import os
 from pathlib import Path
 from typing import Any
 
-# What the system reads at once from a disk, and so the least that one bad sector takes with it.
+# bytes that the system reads at a time, so the smallest loss by one bad sector
 SECTOR = 4096
-# Heads of records are read one by one
+# heads of records are read individually
 _BUFFER = 1 << 16
 
 Hole = tuple[int, int]
-"""First byte and the one after the last of what cannot be read."""
+"""First unreadable byte and the one after the last."""
 
 
 class _RawFile(io.RawIOBase):
-    """Zeros stand where the disk reports an error; `holes` says where, in order, as far as has been read."""
+    """Raw file that has zeros for unreadable bytes; `holes` lists them, in order, as far as read."""
 
     def __init__(self, path: Path) -> None:
         self.holes: list[Hole] = []
@@ -41,7 +41,7 @@ class _RawFile(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         try:
             count = os.preadv(self._descriptor, [buffer], self._at)
-        except OSError:  # in pieces, and it is said what is wrong
+        except OSError:  # read in pieces, and note the holes
             data = self._read(len(buffer), self._at)
             count = len(data)
             buffer[:count] = data
@@ -54,14 +54,14 @@ class _RawFile(io.RawIOBase):
         super().close()
 
     def _read(self, size: int, at: int) -> bytes:
-        """What is there; after an error once more in halves, for a bad sector to cost no more than itself."""
+        """Read bytes; after an error read halves, so that a bad sector costs no more than itself."""
         data = self._attempt(size, at)
         if data is not None:
             return data
         size = min(size, os.fstat(self._descriptor).st_size - at)
         next_sector = (at // SECTOR + 1) * SECTOR
         if at + size <= next_sector:
-            data = self._attempt(size, at)  # what fails once may be anything
+            data = self._attempt(size, at)  # a single failure may be transient
             if data is None:
                 self._note(at, at + size)
                 return bytes(size)
@@ -73,7 +73,7 @@ class _RawFile(io.RawIOBase):
         try:
             return os.pread(self._descriptor, size, at)
         except OSError as error:
-            if at >= os.fstat(self._descriptor).st_size:  # a damaged index leads to places that no file has
+            if at >= os.fstat(self._descriptor).st_size:  # a damaged index has positions beyond the end of any file
                 return b""
             if error.errno != errno.EIO:
                 raise
@@ -88,17 +88,17 @@ class _RawFile(io.RawIOBase):
 
 
 def open_raw(path: Path) -> io.BufferedReader:
-    """Open a file to be read past unreadable places, which `holes_in` tells. Raises OSError."""
+    """Open a file for reading past unreadable places, listed by `holes_in`. Raises OSError."""
     return io.BufferedReader(_RawFile(path), _BUFFER)
 
 
 def holes_in(file: Any, start: int, end: int) -> list[Hole]:
-    """What between two places of an open file, which has been read, is not its content but zeros for want of it."""
+    """Return the unreadable parts between two positions of an open file that was read."""
     holes: list[Hole] = getattr(getattr(file, "raw", None), "holes", [])
     return [(max(first, start), min(last, end)) for first, last in holes if first < end and start < last]
 
 
 def unreadable(file: Any) -> int:
-    """Bytes of an open file that could not be read so far."""
+    """Return the number of unreadable bytes of an open file so far."""
     holes: list[Hole] = getattr(getattr(file, "raw", None), "holes", [])
     return sum(last - first for first, last in holes)

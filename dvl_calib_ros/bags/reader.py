@@ -1,4 +1,4 @@
-"""rosbag2 recordings: folders and single files, MCAP and SQLite, compressed or not, several at once, damaged ones."""
+"""Reader of rosbag2 recordings: folders and files, MCAP and SQLite, compressed, several together, damaged."""
 
 from __future__ import annotations
 
@@ -27,19 +27,18 @@ if sys.version_info >= (3, 14):
 else:
     from backports import zstd
 
-# Plain tuples: there is one per message, and a named one would cost as much as a third of its decoding.
+# a plain tuple per message, because a named one would cost a third of the decoding time
 DecodedMessage = tuple[str, int, Any, str]
-"""Topic, log time (ns), decoded message (None if it cannot be decoded), and then why."""
-# Where a recording begins
+"""Topic, log time (ns), decoded message (None if it cannot be decoded), and the reason for None."""
+# start of a recording
 _MARKER = Channel("", "")
 
 
 class BagReader:
-    """Reads one or more recordings as one, in order of log time. A context manager.
+    """Context manager that reads one or more recordings as one, in order of log time.
 
-    known: type -> definitions of it that are about, for recordings that do not say how its messages are laid out.
-    notes: what the user should know of what was read (damage), complete after the last message. Raises InputError
-    for what is no bag.
+    known: type -> known versions of its definition, for recordings without. notes: messages to the user on damage,
+    complete after the last message. Raises InputError for a path that is no bag.
     """
 
     def __init__(self, paths: Sequence[Path], known: Mapping[str, Sequence[str]] | None = None) -> None:
@@ -63,7 +62,7 @@ class BagReader:
         self.close()
 
     def close(self) -> None:
-        """Remove what was unpacked."""
+        """Remove decompressed files."""
         self._stack.close()
 
     @property
@@ -72,24 +71,24 @@ class BagReader:
         return {channel.topic: channel.msgtype for source in self._sources for channel in source.counts}
 
     def channels(self, topic: str) -> list[Channel]:
-        """All channels that the recordings hold of a topic; one, if all is well."""
+        """Return all channels of a topic; one, unless the recording is inconsistent."""
         return list(dict.fromkeys(channel for source in self._sources for channel in source.channels(topic)))
 
     def types_of(self, topic: str) -> set[str]:
-        """All types that the recordings hold on a topic; one, if all is well."""
+        """Return all types on a topic; one, unless the recording is inconsistent."""
         return {channel.msgtype for channel in self.channels(topic)}
 
     def lacks_definition(self, topic: str) -> bool:
-        """Whether a recording has a topic of a type that ROS does not bring, without its definition."""
+        """Return whether a topic's type is neither in ROS nor defined in a recording."""
         return any(self.decoder.lacks_definition(channel) for channel in self.channels(topic))
 
     def fields_of(self, topic: str) -> tuple[str, ...]:
-        """Names of the fields of a topic's messages; none if that is not known."""
+        """Return the names of the fields of a topic's messages; none if unknown."""
         store = self.typestore(topic)
         return () if store is None else tuple(name for name, _ in store.fielddefs[self.topics[topic]][1])
 
     def typestore(self, topic: str) -> Typestore | None:
-        """Types that decode a topic's messages; None if that is not known."""
+        """Return types that decode a topic's messages; None if unknown."""
         for channel in self.channels(topic):
             store = self.decoder.typestore(channel)
             if store is not None and channel.msgtype in store.fielddefs:
@@ -98,7 +97,7 @@ class BagReader:
 
     @property
     def message_counts(self) -> Counter[str]:
-        """Topic -> number of messages, as the recordings' indexes say."""
+        """Topic -> number of messages, by the recordings' indexes."""
         total: Counter[str] = Counter()
         for source in self._sources:
             for channel, count in source.counts.items():
@@ -112,11 +111,11 @@ class BagReader:
 
     @property
     def file_spans_ns(self) -> list[tuple[int, int]]:
-        """First and last log time of each file that holds a message."""
+        """First and last log time of each file with a message."""
         return [source.span_ns for source in self._sources if sum(source.counts.values())]
 
     def messages(self, topics: Iterable[str]) -> Iterator[DecodedMessage]:
-        """Messages of these topics."""
+        """Yield messages of these topics."""
         for log_ns, channel, data in self.raw_messages(topics):
             try:
                 message, why = self.decoder(channel, data), ""
@@ -125,7 +124,7 @@ class BagReader:
             yield channel.topic, log_ns, message, why
 
     def raw_messages(self, topics: Iterable[str]) -> Iterator[BagMessage]:
-        """Log time, channel and CDR bytes of the messages of these topics."""
+        """Yield log time, channel and CDR bytes of the messages of these topics."""
         chosen = frozenset(topics)
         if len(self._sources) == 1:
             return (message for batch in self._of_source(self._sources[0], chosen) for message in batch.messages())
@@ -133,14 +132,14 @@ class BagReader:
         return (message for message in heapq.merge(*streams, key=itemgetter(0)) if message[1] is not _MARKER)
 
     def batches(self, topics: Iterable[str]) -> Iterator[Batch]:
-        """Messages of these topics, by the thousand."""
+        """Yield batches of messages of these topics."""
         chosen = frozenset(topics)
         if len(self._sources) == 1:
             return self._of_source(self._sources[0], chosen)
         return batched(self.raw_messages(chosen))
 
     def _singly(self, source: Source, topics: frozenset[str]) -> Iterator[BagMessage]:
-        # a marker where it begins: merging opens a recording only when its time has come
+        # a marker at the start: merging opens a recording only when its time comes
         yield source.span_ns[0], _MARKER, b""
         for batch in self._of_source(source, topics):
             yield from batch.messages()
@@ -165,8 +164,6 @@ class BagReader:
         if lost:
             self.notes.append(f"{source.path}: {lost} compressed messages are damaged and left out")
 
-    # ------------------------------------------------------------------ opening
-
     def _open(self, path: Path) -> list[Source]:
         try:
             if path.is_dir():
@@ -182,7 +179,7 @@ class BagReader:
             raise _unreadable(path, error) from error
 
     def _open_folder(self, folder: Path) -> list[Source]:
-        """The recordings in a folder. One that gives nothing costs a note, not the others."""
+        """Open the recordings in a folder. An unusable one gives a note and does not affect the others."""
         sources, errors = [], []
         for file in files_of(folder, self.notes):
             try:
@@ -208,8 +205,8 @@ def _unreadable(path: Path, error: OSError) -> InputError:
 
 
 def _unpacked(batch: Batch) -> Batch:
-    """Messages that were compressed by themselves as they were before; without those that are damaged."""
-    packed = batch.begin_with(ZSTD_MAGIC)  # CDR begins otherwise
+    """Decompress individually compressed messages, and drop damaged ones."""
+    packed = batch.begin_with(ZSTD_MAGIC)  # CDR begins with other bytes
     if not packed.any():
         return batch
     each = zip(packed.tolist(), batch.messages(), strict=True)
@@ -219,7 +216,7 @@ def _unpacked(batch: Batch) -> Batch:
 
 
 def _unpacked_message(data: bytes) -> bytes | None:
-    """A message that was compressed by itself; None if it is damaged, or claims to be larger than messages are."""
+    """Decompress a message; None if it is damaged or claims an implausible size."""
     try:
         decompressor = zstd.ZstdDecompressor()
         unpacked = decompressor.decompress(data, max_length=LARGEST_RECORD)

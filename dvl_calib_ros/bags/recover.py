@@ -1,4 +1,4 @@
-"""Damaged recordings into a new bag that every tool reads."""
+"""Recovery of damaged recordings into a new bag that every tool reads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ PROGRESS_EVERY = 1000
 
 
 class Recovered(NamedTuple):
-    """counts: messages of each topic. notes: in sentences, what was lost."""
+    """Result of a recovery. counts: messages of each topic. notes: sentences on the losses."""
 
     counts: dict[str, int]
     notes: tuple[str, ...]
@@ -28,7 +28,7 @@ def recover(
     compression: Compression = Compression.NONE,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> Recovered:
-    """Write every message of every topic that can be read into a new bag. Raises InputError."""
+    """Write every readable message of every topic into a new bag. Raises InputError."""
     counts: Counter[str] = Counter()
     with BagReader(bags) as reader:
         topics, total = reader.topics, max(sum(reader.message_counts.values()), 1)

@@ -1,4 +1,4 @@
-"""ROS 1 recordings: .bag files by their index, and messages of ROS 1 as ROS 2 lays them out (CDR)."""
+"""ROS 1 recordings: .bag files by their index, and conversion of ROS 1 messages to CDR."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag1 import Reader
 
 ROS1_MAGIC, ROS1_ENCODING = b"#ROSBAG", "ros1msg"
-# Built-in types of ROS 1 are messages of ROS 2, whose headers have no counter.
+# built-in types of ROS 1 are messages in ROS 2, whose headers have no counter
 _TIMES = "".join(
     f"{SEPARATOR}MSG: builtin_interfaces/{name}\nint32 sec\nuint32 nanosec\n" for name in ("Time", "Duration")
 )
@@ -43,16 +43,16 @@ def open_bag(path: Path, shown: Path) -> tuple[Counter[Channel], tuple[int, int]
 
 
 def bag_batches(path: Path, topics: Collection[str]) -> Iterator[Batch]:
-    """Yield the messages of topics of a .bag, as ROS 1 lays them out. Raises DamagedError after the last."""
+    """Yield the messages of topics of a .bag in ROS 1's layout. Raises DamagedError after the last."""
     with _reader(path) as (reader, channels):
         wanted = [each for each in reader.connections if each.topic in topics]
-        if wanted:  # rosbags takes none for all
+        if wanted:  # for rosbags an empty list means all
             yield from batched((at, channels[each.id], data) for each, at, data in reader.messages(wanted))
 
 
 @contextmanager
 def _reader(path: Path) -> Iterator[tuple[Reader, Mapping[int, Channel]]]:
-    """Open a .bag, with the channel of each connection. Raises DamagedError for what rosbags makes of damage."""
+    """Open a .bag, with the channel of each connection. Raises DamagedError for rosbags' errors on damage."""
     from rosbags.rosbag1 import Reader, ReaderError
 
     damage = (ReaderError, AssertionError, struct.error, ValueError, LookupError, RuntimeError, OverflowError)
@@ -70,17 +70,17 @@ def _reader(path: Path) -> Iterator[tuple[Reader, Mapping[int, Channel]]]:
 
 
 def as_ros2(channels: Collection[Channel]) -> dict[Channel, Channel]:
-    """Return what channels of ROS 1 are called and defined as in ROS 2; other channels as they are."""
+    """Map each channel to its name and definition in ROS 2; other channels to themselves."""
     return {channel: _ros2_types(channel)[0] if is_ros1(channel) else channel for channel in channels}
 
 
 def is_ros1(channel: Channel) -> bool:
-    """Whether messages of a channel are laid out as ROS 1 does."""
+    """Return whether messages of a channel have ROS 1's layout."""
     return channel.definition is not None and channel.definition.is_ros1
 
 
 def batch_as_ros2(batch: Batch) -> Batch:
-    """Return messages in CDR; one that does not fit its definition is empty, which is counted as undecodable."""
+    """Convert messages to CDR; one that does not fit its definition becomes empty, and counts as undecodable."""
     types = {id(channel): _ros2_types(channel) for channel in batch.channels.values() if is_ros1(channel)}
     if not types:
         return batch
@@ -99,7 +99,7 @@ def batch_as_ros2(batch: Batch) -> Batch:
 
 @lru_cache(maxsize=KEPT)
 def _ros2_types(channel: Channel) -> tuple[Channel, Typestore]:
-    """Return a channel of ROS 1 in ROS 2's terms, and the types that convert its messages."""
+    """Return a ROS 1 channel in ROS 2's terms, and the types that convert its messages."""
     msgtype = normalize_msgtype(channel.msgtype)
     parts = (channel.definition.text if channel.definition else "").split(SEPARATOR)
     parts = [part.replace(_COUNTER, "") if part.startswith(_HEADER) else part for part in parts]
@@ -107,5 +107,5 @@ def _ros2_types(channel: Channel) -> tuple[Channel, Typestore]:
         store = typestore(definition_of("ros2msg", SEPARATOR.join(parts).rstrip() + "\n" + _TIMES), msgtype)
         text, _ = store.generate_msgdef(msgtype, ros_version=2)
         return Channel(channel.topic, msgtype, definition_of("ros2msg", text)), store
-    except (DefinitionError, TypesysError):  # types that ROS brings are known all the same
+    except (DefinitionError, TypesysError):  # types of ROS itself are known anyway
         return Channel(channel.topic, msgtype), get_typestore(Stores.ROS2_JAZZY)

@@ -1,8 +1,7 @@
 """One recorded file: MCAP, SQLite or a .bag of ROS 1, whole or damaged.
 
-It is read by its index while that is sound, SQLite's or MCAP's, and after the first damage by the salvaging readers.
-What is caught here is what damaged bytes and bad disks cause, and no more: that a library of another version does not
-fit is no damage, and is not to be reported as such.
+It is read by its index, and after the first damage by the salvaging readers. Only exceptions due to damaged bytes and
+bad disks are caught; an incompatible library must not be reported as damage.
 """
 
 from __future__ import annotations
@@ -30,21 +29,20 @@ from .salvage.damage import LARGEST_RECORD, DamagedError, Salvaged
 from .salvage.mcap_file import MCAP_MAGIC, bytes_at_once, indexed_messages, read_summary, salvage_mcap
 from .salvage.sqlite_file import SQLITE_MAGIC, salvage_sqlite
 
-# Chunks that overlap in time, as of a recorder that caches by topic, are merged in memory up to so many bytes.
+# limit of memory for merging chunks that overlap in time, as written by a recorder that caches by topic
 MERGED_AT_ONCE = 64 << 20
 DAMAGE = (DamagedError, OSError, sqlite3.Error, struct.error)
 
 Batches = Callable[[Collection[str]], Iterator[Batch]]
-"""Topics -> their messages."""
+"""Topics -> batches of their messages."""
 Salvage = Callable[[Path], Iterator[Salvaged]]
 
 
 class Source:
     """One recorded file.
 
-    path: as the user knows it. counts: channel -> how many messages it announces. span_ns: first and last log time.
-    batches: messages of some topics, in order of log time; raises what is in `DAMAGE` after the last, unless
-    damage_noted.
+    path: as given by the user. counts: channel -> announced number of messages. span_ns: first and last log time.
+    batches: messages of some topics, in order of log time; raises `DAMAGE` after the last, unless damage_noted.
     """
 
     def __init__(
@@ -65,18 +63,18 @@ class Source:
             self._by_topic.setdefault(channel.topic, []).append(channel)
 
     def channels(self, topic: str) -> list[Channel]:
-        """The channels of a topic."""
+        """Return the channels of a topic."""
         return self._by_topic.get(topic, [])
 
 
 def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path | None = None) -> Source:
-    """Open a recorded file. Raises InputError, or OSError if it cannot be read at all.
+    """Open a recorded file. Raises InputError, or OSError if it cannot be read.
 
-    notes: where to say what the user should know. shown: how the user knows it, when it has been unpacked elsewhere.
+    notes: receives messages to the user. shown: the user's name of a file that was unpacked elsewhere.
     """
     shown = shown or path
     if not path.is_file():
-        path.stat()  # raises what is wrong with the path
+        path.stat()  # raises OSError for a bad path
         raise InputError(f"{shown}: not a file; remove it from the bag")
     if path.stat().st_size == 0:
         raise InputError(f"{shown}: the file is empty; nothing was recorded")
@@ -86,13 +84,13 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
         return open_source(decompressed(path, new_folder, notes), new_folder, notes, shown)
     if magic.startswith(ROS1_MAGIC):
         return _in_ros2(Source(shown, *open_bag(path, shown), partial(bag_batches, path)))
-    # of a file whose first bytes were never written, or are lost, the name has to do
+    # if the first bytes are lost or were never written, use the name
     kinds = {MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
     kind = next((kinds[each] for each in kinds if magic.startswith(each)), storage_suffix(shown))
     if kind == ".mcap":
-        return _opened(path, shown, _mcap, salvage_mcap, notes)
+        return _opened(path, shown, _open_mcap, salvage_mcap, notes)
     if kind == ".db3":
-        return _opened(with_journal(path, new_folder, notes), shown, _sqlite, salvage_sqlite, notes)
+        return _opened(with_journal(path, new_folder, notes), shown, _open_sqlite, salvage_sqlite, notes)
     raise InputError(f"{shown}: no bag; give a rosbag2 folder, or a .mcap, .db3 or .bag file")
 
 
@@ -107,11 +105,11 @@ def _opened(
         source, why = by_index(path, shown, notes), ""
     except DAMAGE as error:
         source, why = None, said(error)
-    return _in_ros2(source or _salvaged(path, shown, salvage, why, notes))
+    return _in_ros2(source or _open_salvaged(path, shown, salvage, why, notes))
 
 
 def _in_ros2(source: Source) -> Source:
-    """Return the source with messages of ROS 1 laid out as those of ROS 2."""
+    """Convert a source's ROS 1 messages to ROS 2's layout."""
     if not any(map(is_ros1, source.counts)):
         return source
     counts: Counter[Channel] = Counter()
@@ -124,8 +122,8 @@ def _in_ros2(source: Source) -> Source:
     return Source(source.path, counts, source.span_ns, batches, source.damage_noted)
 
 
-def _mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
-    """An MCAP file by its index; None if it has none."""
+def _open_mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
+    """Open an MCAP file by its index; None if it has none."""
     summary = read_summary(path)
     if summary is None or summary.statistics is None:
         return None
@@ -151,19 +149,19 @@ def _mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
         return found if in_order else batched(by_log_time(message for batch in found for message in batch.messages()))
 
     span_ns = (statistics.message_start_time, statistics.message_end_time)
-    return Source(shown, counts, span_ns, _until_damage(batches, path, salvage_mcap, counts))
+    return Source(shown, counts, span_ns, _salvaging_after_damage(batches, path, salvage_mcap, counts))
 
 
-def _sqlite(path: Path, shown: Path, notes: list[str]) -> Source:
+def _open_sqlite(path: Path, shown: Path, notes: list[str]) -> Source:
     database = Database(path)
     if database.astray:
         notes.append(f"{shown}: {database.astray} messages belong to topics that it does not list; they are left out")
-    found = _until_damage(database.batches, path, salvage_sqlite, database.counts)
+    found = _salvaging_after_damage(database.batches, path, salvage_sqlite, database.counts)
     return Source(shown, database.counts, database.span_ns, found)
 
 
-def _salvaged(path: Path, shown: Path, salvage: Salvage, why: str, notes: list[str]) -> Source:
-    """A recording that is read from beginning to end. why: its index cannot be used, '' if it has none."""
+def _open_salvaged(path: Path, shown: Path, salvage: Salvage, why: str, notes: list[str]) -> Source:
+    """Open a recording that is read from beginning to end. why: fault of its index, '' if it has none."""
     counts: Counter[Channel] = Counter()
     first_ns, last_ns = 2**63 - 1, 0
     damage, in_order = "", True
@@ -184,7 +182,7 @@ def _salvaged(path: Path, shown: Path, salvage: Salvage, why: str, notes: list[s
         notes.append(f"{shown}: has no usable index ({why}); read from beginning to end: {read}")
 
     def messages(topics: Collection[str]) -> Iterator[BagMessage]:
-        with suppress(*DAMAGE):  # it has been told of
+        with suppress(*DAMAGE):  # was already noted
             yield from (message for message in _with_channels(salvage(path)) if message[1].topic in topics)
 
     def batches(topics: Collection[str]) -> Iterator[Batch]:
@@ -204,8 +202,8 @@ def _with_channels(salvaged: Iterator[Salvaged]) -> Iterator[BagMessage]:
         yield log_ns, channel, data
 
 
-def _until_damage(batches: Batches, path: Path, salvage: Salvage, counts: Mapping[Channel, int]) -> Batches:
-    """Messages as an index leads to them, after damage those that salvaging finds. counts: what the index announces."""
+def _salvaging_after_damage(batches: Batches, path: Path, salvage: Salvage, counts: Mapping[Channel, int]) -> Batches:
+    """Read by the index and, after damage, the remaining messages by salvaging. counts: announced by the index."""
 
     def all_batches(topics: Collection[str]) -> Iterator[Batch]:
         read = 0
@@ -217,16 +215,16 @@ def _until_damage(batches: Batches, path: Path, salvage: Salvage, counts: Mappin
             if read < announced:
                 raise DamagedError(f"it announces {announced} messages, its index leads to {read}")
         except DAMAGE as error:
-            damage, found = yield from _rest(salvage(path), topics, _Given(batches(topics), read))
+            damage, found = yield from _unread_messages(salvage(path), topics, _AlreadyRead(batches(topics), read))
             raise DamagedError(damage or said(error), max(announced - read - found, 0)) from error
 
     return all_batches
 
 
-class _Given:
-    """The first messages of batches, which a reader has; each is recognised as often as it was given.
+class _AlreadyRead:
+    """Multiset of the first messages of batches, which the reader already has.
 
-    They are recognised by content: in a damaged recording neither a log time nor a place says which message came first.
+    They are recognised by content: in a damaged recording neither log time nor position identifies a message.
     """
 
     def __init__(self, batches: Iterator[Batch], count: int) -> None:
@@ -249,10 +247,10 @@ def _key(message: BagMessage) -> int:
     return hash((channel.topic, data))
 
 
-def _rest(
-    salvaged: Iterator[Salvaged], topics: Collection[str], given: _Given
+def _unread_messages(
+    salvaged: Iterator[Salvaged], topics: Collection[str], given: _AlreadyRead
 ) -> Generator[Batch, None, tuple[str, int]]:
-    """Yield the messages of a damaged recording that were not given before; return the damage and their number."""
+    """Yield the messages of a damaged recording that were not yielded before. Return the damage and their number."""
     damage, found = "", 0
 
     def others() -> Iterator[BagMessage]:
@@ -262,7 +260,8 @@ def _rest(
                 if message[1].topic in topics and message not in given:
                     found += 1
                     yield message
-        except DAMAGE as error:  # salvaging has not seen the messages of the index: its own count is too high
+        # salvaging does not see the index's messages, so its own count of lost ones is too high
+        except DAMAGE as error:
             damage = error.what if isinstance(error, DamagedError) else said(error)
 
     yield from batched(by_log_time(others()))
@@ -270,15 +269,15 @@ def _rest(
 
 
 def said(error: Exception) -> str:
-    """An error of `DAMAGE` in words."""
+    """Return an error of `DAMAGE` as text."""
     return str(error) if isinstance(error, DamagedError) else f"{type(error).__name__}: {error}"
 
 
 class Database:
-    """A recording in SQLite; raises sqlite3.Error or DamagedError where it cannot be read.
+    """A recording in SQLite. Raises sqlite3.Error or DamagedError if it cannot be read.
 
-    counts: channel -> number of its messages. span_ns: first and last log time. astray: messages of topics that it
-    does not name.
+    counts: channel -> number of its messages. span_ns: first and last log time. astray: number of messages of unlisted
+    topics.
     """
 
     def __init__(self, path: Path) -> None:
@@ -301,12 +300,12 @@ class Database:
         self.span_ns = (min((row[2] for row in known), default=0), max((row[3] for row in known), default=0))
 
     def batches(self, topics: Collection[str]) -> Iterator[Batch]:
-        """Messages of these topics in order of log time; those before what is raised come before it."""
+        """Yield messages of these topics in order of log time; those before an exception come first."""
         numbers = [number for number, channel in self._channels.items() if channel.topic in topics]
         own = f"FROM messages WHERE topic_id IN ({','.join('?' * len(numbers))}) AND length(data) <= {LARGEST_RECORD}"
         query = f"SELECT timestamp, topic_id, data {own} ORDER BY timestamp"
         with closing(self._connection()) as connection:
-            # grouped by topic, SQLite would sort the messages themselves
+            # with grouping by topic, SQLite would sort the messages themselves
             ((longest,),) = connection.execute(f"SELECT max(length(data)) {own}", numbers)
             at_once = max(1, min(MOST_MESSAGES, MOST_BYTES // max(longest or 1, 1)))
             cursor = connection.execute(query, numbers)
@@ -315,12 +314,12 @@ class Database:
                 rows: list[tuple[Any, Any, Any]] = []
                 try:
                     rows.extend(islice(cursor, at_once))
-                except sqlite3.Error as raised:  # what was read before it is in the list
+                except sqlite3.Error as raised:  # rows read before the error are in the list
                     error = raised
                 if not rows:
                     break
                 log_ns, number, data = zip(*rows, strict=True)
-                sound = _sound(log_ns, data)
+                sound = _count_valid(log_ns, data)
                 if sound:
                     yield self._batch(log_ns[:sound], number[:sound], data[:sound])
                 if sound < len(rows):
@@ -334,13 +333,13 @@ class Database:
         return Batch(times(log_ns), np.array(number, dtype=np.intp), start, end, b"".join(data), self._channels)
 
     def _connection(self) -> sqlite3.Connection:
-        # immutable: no journal and no lock is looked for, so that nothing is written beside a recording
+        # immutable: SQLite looks for no journal and no lock, so that it writes nothing next to a recording
         uri = f"file:{quote(str(self._path.absolute()), safe='/')}?immutable=1&mode=ro"
         return sqlite3.connect(uri, uri=True, check_same_thread=False)
 
 
-def _sound(log_ns: Sequence[Any], data: Sequence[Any]) -> int:
-    """How many rows, from the first on, are messages."""
+def _count_valid(log_ns: Sequence[Any], data: Sequence[Any]) -> int:
+    """Return the number of leading rows that are valid messages."""
     if set(map(type, log_ns)) == {int} and set(map(type, data)) == {bytes} and min(log_ns) >= 0:
         return len(log_ns)
     are = (type(at) is int and at >= 0 and type(content) is bytes for at, content in zip(log_ns, data, strict=True))
@@ -362,7 +361,7 @@ def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
         for msgtype, digest, encoding, text in _rows(connection, query, (str, str, str, str)):
             definition = definition_of(encoding, text)
             definitions.setdefault((msgtype, digest), definition)
-            definitions.setdefault((msgtype, ""), definition)  # for topics that do not say which of several
+            definitions.setdefault((msgtype, ""), definition)  # for topics without the hash of their definition
     return {
         number: Channel(name, msgtype, definitions.get((msgtype, digest)) or definitions.get((msgtype, "")))
         for number, name, msgtype, digest in topics
@@ -370,10 +369,10 @@ def _channels(connection: sqlite3.Connection) -> dict[int, Channel]:
 
 
 def _rows(connection: sqlite3.Connection, query: str, types: tuple[type, ...]) -> list[Any]:
-    """All rows of a query, whose columns are of these types; damaged pages can hold anything."""
+    """Return all rows of a query with columns of these types; damaged pages can have anything."""
     try:
         rows = connection.execute(query).fetchall()
-    except UnicodeDecodeError as error:  # what SQLite says of damaged names holds them
+    except UnicodeDecodeError as error:  # SQLite's message would contain the damaged names
         raise DamagedError("its tables are damaged") from error
     if any(type(value) is not expected for row in rows for value, expected in zip(row, types, strict=True)):
         raise DamagedError("a table holds what recordings do not")

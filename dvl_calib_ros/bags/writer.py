@@ -1,4 +1,4 @@
-"""New rosbag2 recordings, written by rosbags, with the attachments of MCAP."""
+"""Writing of new rosbag2 recordings by rosbags, with attachments for MCAP."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ UNKNOWN_HASH = f"RIHS01_{'0' * 64}"
 
 
 class _Sqlite3Writer(Sqlite3Writer):
-    """As rosbags', for any path: rosbags' takes what looks like an escape, a query or a fragment in it for such."""
+    """Writer for any path; rosbags' own misreads characters of URI escapes, queries or fragments."""
 
     def __init__(self, path: Path, compression: CompressionMode) -> None:
         self.path = path / f"{path.name}.db3"
@@ -68,12 +68,12 @@ class _Writer(Writer):
 
 
 class BagWriter:
-    """Writes messages to a new rosbag2 folder. A context manager. Raises InputError."""
+    """Context manager that writes messages to a new rosbag2 folder. Raises InputError."""
 
     def __init__(
         self, path: Path, storage: Storage = Storage.MCAP, compression: Compression = Compression.NONE
     ) -> None:
-        if os.path.lexists(path):  # a link that leads nowhere, too
+        if os.path.lexists(path):  # also true for a dangling link
             raise InputError(f"{path}: exists already; give another name, or remove it first")
         if storage is Storage.SQLITE3 and compression is Compression.CHUNK:
             raise InputError("compression chunk is MCAP's; with sqlite3 use message or file")
@@ -81,7 +81,7 @@ class BagWriter:
         self._path, self._storage, self._compression = path, storage, compression
         self._made_for_it = [folder for folder in path.parents if not folder.exists()]  # the deepest first
         self._attachments: list[tuple[str, str, bytes]] = []
-        # a file holds one definition of each type: rosbag2 and rosbags look it up by the type's name
+        # a file has one definition per type: rosbag2 and rosbags look it up by the type's name
         self._parts: list[_Part] = []
         self._part_of: dict[Channel, _Part] = {}
         self._channels: dict[tuple[str, str], Channel] = {}
@@ -95,9 +95,9 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         try:
             self._new_part()
-        except WriterError as error:  # made by another since it was looked at
+        except WriterError as error:  # created by another process since the check
             raise InputError(f"{self._path}: {error}; give another name") from error
-        except BaseException as error:  # an interrupt among them
+        except BaseException as error:  # including an interrupt
             self._remove()
             if isinstance(error, OSError | sqlite3.Error):
                 raise self._unwritable(error) from error
@@ -119,7 +119,7 @@ class BagWriter:
                 )  # fmt: skip
         except (OSError, sqlite3.Error) as failure:
             error = failure
-        if error is not None:  # half a bag would pass for a whole one
+        if error is not None:  # a partial bag could be mistaken for a whole one
             self._remove()
         if isinstance(error, OSError | sqlite3.Error):
             raise self._unwritable(error) from error
@@ -134,7 +134,7 @@ class BagWriter:
         self._write(channel, log_ns, bytes(self.typestore.serialize_cdr(message, msgtype)))
 
     def raw(self, channel: Channel, log_ns: int, data: bytes) -> None:
-        """Write a message as it was recorded, its definition with it."""
+        """Write a message unchanged, with its definition."""
         self._write(channel, log_ns, data)
 
     def _write(self, channel: Channel, log_ns: int, data: bytes) -> None:
@@ -165,7 +165,7 @@ class BagWriter:
         return self._parts[-1]
 
     def _join_parts(self) -> None:
-        """Make one bag of several files of what was written as bags of their own."""
+        """Join the parts, written as bags of their own, into one bag of several files."""
         first, *others = (part.writer.path for part in self._parts)
         if not others:
             return
@@ -187,16 +187,16 @@ class BagWriter:
 
     def _unwritable(self, error: OSError | sqlite3.Error) -> InputError:
         why = getattr(error, "strerror", None) or error
-        # SQLite tells of a full disk in words only, and of a file that may not grow as of any failure
+        # SQLite reports a full disk only as text, and a file that may not grow like any failure
         full = isinstance(error, sqlite3.Error) or error.errno in NO_SPACE
         remedy = "free some space, or name another place" if full else "name another place"
         return InputError(f"{self._path}: cannot be written ({why}); {remedy}")
 
     def _remove(self) -> None:
-        """Leave nothing behind, nor the folders that were made for it."""
+        """Remove the bag and the folders created for it."""
         shutil.rmtree(self._path, ignore_errors=True)
         for folder in self._made_for_it:
-            with suppress(OSError):  # another writes there, too
+            with suppress(OSError):  # another process also writes there
                 folder.rmdir()
 
 
@@ -208,7 +208,7 @@ class _Part:
         self.connections: dict[Channel, Any] = {}
 
     def fits(self, channel: Channel) -> bool:
-        """Whether the file says of the channel's topic and type nothing else than the channel does."""
+        """Return whether the file has no other definition of the channel's type."""
         same = [each for each in self.connections if each.msgtype == channel.msgtype]
         return all(each.definition == channel.definition for each in same)
 
@@ -222,12 +222,12 @@ class _Part:
 def _type_hash(definition: Definition | None, msgtype: str) -> str:
     try:
         return typestore(definition, msgtype).hash_rihs01(msgtype)
-    except (DefinitionError, LookupError):  # a damaged definition, or one without the type; its messages are whole
+    except (DefinitionError, LookupError):  # a damaged or incomplete definition; its messages are whole
         return UNKNOWN_HASH
 
 
 def attach(path: Path, name: str, media_type: str, data: bytes, compressed: bool) -> None:
-    """Add an attachment to an MCAP file, which is written anew beside itself and then replaced."""
+    """Add an attachment to an MCAP file, by writing a new file that replaces it."""
     new = path.with_name(f"{path.name}.tmp")
     with path.open("rb") as source, new.open("xb") as target:
         reader = make_reader(source)

@@ -1,1 +1,1 @@
-"""The command ``dvl-calib``: one module per command, arguments -> one library call -> print and save."""
+"""The command ``dvl-calib``, one module per command: parse arguments, make one library call, print and save."""

@@ -1,7 +1,7 @@
 """Write a saved calibration into URDF, parameters, static transform, robot_localization or the instrument itself.
 
-Without options, show it. Every file is replaced whole and the one before kept as .bak; the same line with --rollback
-brings that back. Nothing is sent to an instrument without --send.
+Without options, show it. Each file is replaced atomically and its previous version kept as .bak; the same command with
+--rollback restores it. Nothing is sent to an instrument without --send.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("result", nargs="?", type=Path, metavar="RESULT", help="result file of the node or of replay")
     parser.add_argument("--urdf", type=Path, metavar="FILE", help="turn, and move, the DVL's joint in this URDF")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint; default: the one above the DVL's frame")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the URDF here, leave --urdf as it is")
-    parser.add_argument("--keep-position", action="store_true", help="leave the DVL's xyz in the URDF as it is")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the URDF here, do not change --urdf")
+    parser.add_argument("--keep-position", action="store_true", help="do not change the DVL's xyz in the URDF")
     parser.add_argument(
         "--params",
         type=Path,
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="what the instrument was set to when the data were recorded; repeatable",
+        help="a setting of the instrument when the data were recorded; repeatable",
     )
     parser.add_argument("--settings", type=Path, metavar="FILE", help="write the instrument's settings to this file")
     parser.add_argument("--send", metavar="HOST", help="send them to the instrument (waterlinked), and read them back")
@@ -58,7 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Check everything, then write everything; or roll back."""
+    """Check all files and then write them, or roll back."""
     from ..errors import InputError
     from ..files.apply import Targets, roll_back, write_calibration
 
@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
         )
     if arguments.rollback:
         for path, kept in roll_back(targets).items():
-            show(f"{path}: as before; what it was is now {kept.name}")
+            show(f"{path}: restored; the replaced version is now {kept.name}")
         return
     if arguments.result is None:
         raise InputError("name a result file, as ~/save and dvl-calib replay --save write them")
@@ -83,13 +83,13 @@ def run(arguments: argparse.Namespace) -> None:
 
     calibrated = load_calibrated_mounting(arguments.result)
     if arguments.instrument is not None:
-        _set(calibrated, arguments)
+        _apply_to_instrument(calibrated, arguments)
         return
     applied = write_calibration(calibrated, targets, arguments.force, arguments.dry_run)
     show(*(f"note: {note}" for note in applied.notes))
     is_refused = calibrated.objections and not arguments.force
     refused = ["nothing to apply; --force shows and writes it anyway"]
-    _show(calibrated, refused if is_refused else _mounting_lines(calibrated))
+    _print_lines(calibrated, refused if is_refused else _mounting_lines(calibrated))
     if arguments.dry_run:
         show(*(applied.changes.splitlines() or ["nothing would change"]))
         return
@@ -98,22 +98,22 @@ def run(arguments: argparse.Namespace) -> None:
         show(f"{path}: written{before}" if path in applied.written else f"{path}: is so already")
 
 
-def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
-    """Show an instrument's settings; write, and send them, where that is wanted."""
+def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
+    """Print an instrument's settings; with the options, also write and send them."""
     from ..disk.atomic import save_bytes
     from ..errors import InputError
     from ..instruments.settings import AS_RECORDED, instrument_settings
     from ..instruments.water_linked import configure
 
-    now = _told_settings(arguments.now)
+    now = _parse_now(arguments.now)
     chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)
     untold = [each.name for each in chosen.settings if each.name not in now and each.now_by != AS_RECORDED]
     if arguments.send and (arguments.instrument != "waterlinked" or untold):
         raise InputError(
-            "--send is for waterlinked, and needs to know what it was set to when the data were recorded: "
+            "--send is for waterlinked, and needs its settings when the data were recorded: "
             + " ".join(f"--now {name}=..." for name in untold or ("mounting_rotation_offset",))
         )
-    _show(calibrated, _settings_lines(chosen))
+    _print_lines(calibrated, _settings_lines(chosen))
     if arguments.settings and not arguments.dry_run:
         save_bytes(arguments.settings, chosen.text.encode())
         show(f"{arguments.settings}: written")
@@ -123,8 +123,8 @@ def _set(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
         show(f"{arguments.send}: {'is so already' if is_so else done}")
 
 
-def _told_settings(words: Sequence[str]) -> dict[str, float]:
-    """Settings as --now gives them, NAME=VALUE. Raises InputError."""
+def _parse_now(words: Sequence[str]) -> dict[str, float]:
+    """Parse --now NAME=VALUE. Raises InputError."""
     from ..errors import InputError
 
     told = {}
@@ -183,7 +183,7 @@ def _metres(values: Sequence[float]) -> str:
     return " ".join(f"{value:+.2f}" for value in values) + " m"
 
 
-def _show(calibrated: CalibratedMounting, lines: Sequence[str]) -> None:
-    """Lines as they are, after what is to be known of the calibration."""
+def _print_lines(calibrated: CalibratedMounting, lines: Sequence[str]) -> None:
+    """Print lines after the warnings about the calibration."""
     common.print_warnings([f"{calibrated.path}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
     show(*lines)

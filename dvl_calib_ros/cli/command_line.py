@@ -1,4 +1,4 @@
-"""The command line of ``dvl-calib``: its parser, errors, signals, closed streams and changed files."""
+"""Command line of ``dvl-calib``: parser, errors, signals, closed streams, and recordings that change meanwhile."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .commands import COMMANDS
 
 
 class _Formatter(argparse.RawDescriptionHelpFormatter):
-    """Folds the paragraphs of a description to the terminal's width; a command to copy stays in one line."""
+    """Help formatter that wraps paragraphs to the terminal's width and keeps a command to copy on one line."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         import textwrap
@@ -32,14 +32,14 @@ class _Formatter(argparse.RawDescriptionHelpFormatter):
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """Say in one line what is wrong with the usage."""
+        """Print the usage error in one line and exit with 2."""
         from ..errors import printable
 
         self.exit(2, f"{self.prog}: {printable(message)}; see {self.prog} --help\n")
 
 
 def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser with all commands; only the one that is called is imported and gets its arguments."""
+    """Build the parser with all commands; import only the called command and add its arguments."""
     parser = _Parser(
         prog="dvl-calib",
         description="Calibrate a Doppler velocity log (DVL): live on ROS 2, or over recorded bags.",
@@ -60,20 +60,20 @@ def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
 
 
 def run(argv: Sequence[str]) -> int:
-    """As `main.main`, but for an interrupt, which is raised."""
+    """Run a command as `main.main`, but raise an interrupt instead of handling it."""
     if "_ARGCOMPLETE" in os.environ:
         _complete()
     open_streams()
-    # our matrices are small: more threads of BLAS only wait for each other (2.5 times the CPU in a diagnosis). Before
-    # numpy is imported, which commands do when they are called
+    # Our matrices are small: more BLAS threads only wait for each other (2.5 times the CPU time in a diagnosis). This
+    # must come before numpy is imported, which a command does when called.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show φ must not end the run
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without φ must not end the run
             stream.reconfigure(errors="replace")
     try:
         with _terminated_as_interrupted():
             return _run(argv)
-    except ModuleNotFoundError as error:  # where the package was built by colcon, which installs no other
+    except ModuleNotFoundError as error:  # the package was built by colcon, which installs no dependencies
         name = (error.name or "").partition(".")[0]
         if name in ("", __name__.partition(".")[0]):
             raise
@@ -83,7 +83,7 @@ def run(argv: Sequence[str]) -> int:
 
 @contextmanager
 def _terminated_as_interrupted() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end a command as Ctrl-C does: what is half written goes."""
+    """Let SIGTERM and SIGHUP end a command like Ctrl-C, so that temporary files are removed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -92,7 +92,7 @@ def _terminated_as_interrupted() -> Iterator[None]:
         yield
     finally:
         for number, handler in before.items():
-            if signal.getsignal(number) is signal.default_int_handler:  # not if the node, which ends, ignores it now
+            if signal.getsignal(number) is signal.default_int_handler:  # not if the ending node ignores it now
                 signal.signal(number, handler)
 
 
@@ -108,7 +108,7 @@ def _run(argv: Sequence[str]) -> int:
             from .profile import with_profile
 
             arguments = parser.parse_args(with_profile(argv, arguments))
-        if "" in argv and any(str(path) == "." for path in paths_in(arguments)):  # pathlib takes one for the other
+        if "" in argv and any(str(path) == "." for path in paths_in(arguments)):  # pathlib turns an empty name into "."
             raise InputError("the name of a file or folder is empty; is a variable of the shell not set?")
         code = int(arguments.run(arguments) or 0)
         sys.stdout.flush()
@@ -121,22 +121,22 @@ def _run(argv: Sequence[str]) -> int:
         give_up(sys.stdout)
         return 0
     except OSError as error:
-        give_up(sys.stdout)  # if that is what cannot be written
+        give_up(sys.stdout)  # in case standard output is the file that cannot be written
         name = "" if error.filename is None else f"{error.filename}: "
         return _fail(arguments.command, f"{name}{error.strerror or error}; check names, permissions and space")
 
 
 def _complete() -> NoReturn:
-    """Answer the shell, which asks what the line that is being typed may go on with, and end."""
+    """Answer the shell's request for completions, and exit."""
     import argcomplete
 
     argcomplete.autocomplete(build_parser(os.environ.get("COMP_LINE", "").split()))
-    sys.exit(1)  # not reached: it ends the process itself
+    sys.exit(1)  # not reached: autocomplete ends the process
 
 
 def _fail(command: str, message: str) -> int:
     try:
-        sys.stdout.flush()  # what was printed before, which the interpreter could only complain of
+        sys.stdout.flush()  # otherwise the interpreter complains about it at exit
     except OSError:
         give_up(sys.stdout)
     try:
@@ -148,16 +148,16 @@ def _fail(command: str, message: str) -> int:
 
 
 State = tuple[int, int, int]
-"""Of a file: which it is, its size, and when it was last written."""
-# Of recordings, and of what their recorder keeps beside
+"""Inode, size in bytes and modification time in ns of a file."""
+# recordings, and the journals of their recorders
 _SUFFIXES = (".mcap", ".db3", ".bag", ".db3-wal", ".db3-journal", ".zstd")
 
 
 def recordings_now(arguments: argparse.Namespace) -> dict[Path, State]:
-    """Files of recordings that a command's arguments lead to, as they are now."""
+    """Return the current state of all recording files in a command's arguments."""
     files: dict[Path, State] = {}
     for path in paths_in(arguments):
-        with suppress(OSError, ValueError):  # what cannot be read is for the command to say
+        with suppress(OSError, ValueError):  # the command itself reports unreadable files
             for file in _files(path):
                 status = file.stat()
                 files[file] = (status.st_ino, status.st_size, status.st_mtime_ns)
@@ -165,7 +165,7 @@ def recordings_now(arguments: argparse.Namespace) -> dict[Path, State]:
 
 
 def changed(before: Mapping[Path, State], after: Mapping[Path, State]) -> list[str]:
-    """Sentences on recordings that are not what they were."""
+    """Return a warning for every recording that changed or vanished."""
     return [
         f"{path}: changed while it was read, so the answer may be of a part of it, or of two recordings; run this "
         "again when nothing writes to it any more"
@@ -175,7 +175,7 @@ def changed(before: Mapping[Path, State], after: Mapping[Path, State]) -> list[s
 
 
 def paths_in(arguments: argparse.Namespace) -> Iterator[Path]:
-    """Every path that a command's arguments name."""
+    """Yield every path in a command's arguments."""
     for value in vars(arguments).values():
         for each in value if isinstance(value, list) else [value]:
             if isinstance(each, Path):
@@ -183,7 +183,7 @@ def paths_in(arguments: argparse.Namespace) -> Iterator[Path]:
 
 
 def _files(path: Path) -> list[Path]:
-    """A folder's recordings, or a recording with the journal that may lie beside it."""
+    """Return a folder's recordings, or a recording and its journals."""
     if path.is_dir():
         return [path / name for name in sorted(os.listdir(path)) if name.endswith(_SUFFIXES)]
     beside = [path, *(path.with_name(path.name + journal) for journal in ("-wal", "-journal"))]

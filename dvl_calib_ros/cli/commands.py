@@ -1,7 +1,7 @@
-"""Every command of ``dvl-calib``, in the order of its help, without importing any.
+"""List of all commands of ``dvl-calib``, in the order of the help, without importing any.
 
-A command is a module of this package with `add_arguments` and `run`, whose documentation is its description; it is
-imported when it is called, so what it imports at its top costs the others nothing.
+A command is a module of this package with `add_arguments` and `run`; its docstring is the command's description. It is
+imported only when called, so its imports do not slow down other commands.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Command(NamedTuple):
-    """One command: its name, what it does in one line, a line to copy, and the module here that holds it."""
+    """One command: its name, its help in one line, an example, and its module."""
 
     name: str
     help: str
@@ -22,7 +22,7 @@ class Command(NamedTuple):
     module: str = ""
 
     def load(self) -> ModuleType:
-        """Import its module."""
+        """Import the command's module."""
         return import_module(f".{self.module or self.name}", __package__)
 
 
@@ -49,7 +49,7 @@ COMMANDS = (
     ),
     Command(
         "doctor",
-        "say what is in a bag, what is wrong with it, and whether it can calibrate",
+        "examine a bag: its topics, its faults, and whether it can calibrate",
         "dvl-calib doctor my_bag",
     ),
     Command("replay", "calibrate with recorded bags", "dvl-calib replay my_bag --save calibration.yaml"),

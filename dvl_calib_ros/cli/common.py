@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def add_parameter_options(parser: argparse.ArgumentParser) -> None:
-    """--params and -p, as ROS 2 users know them, and --profile, which stores them."""
+    """Add --params and -p, as in ROS 2, and --profile, which stores them."""
     profile.add_option(parser)
     parser.add_argument("--params", type=Path, metavar="FILE", help="ROS 2 parameter file (YAML), as for the node")
     override = parser.add_argument(
@@ -42,26 +42,26 @@ def _parameter_completions(**_: Any) -> list[str]:
 
 
 def add_topic_options(parser: argparse._ActionsContainer) -> None:
-    """--dvl-topic, --gnss-topic, --imu-topic, of the node."""
+    """Add --dvl-topic, --gnss-topic and --imu-topic of the node."""
     for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
         parser.add_argument(f"--{role}-topic", default=default, metavar="TOPIC", help=f"default: {default}")
 
 
 def add_discovery_options(parser: argparse.ArgumentParser) -> None:
-    """--dvl-topic, --gnss-topic, --imu-topic of recordings, where they are looked for by type and content."""
+    """Add --dvl-topic, --gnss-topic and --imu-topic of recordings, whose defaults are found by type and content."""
     for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
         none = "" if role == "dvl" else "; none: do without"
         help_ = f"default: {default}, else found by type and content{none}"
         parser.add_argument(f"--{role}-topic", metavar="TOPIC", help=help_)
     add = parser.add_argument
     add("--dvl-fields", dest="overrides", action="append", type="dvl_fields:={}".format, metavar="MAP",
-        help="how a DVL's type that is not listed is read: velocity=vel.x,vel.y,vel.z,valid=lock")  # fmt: skip
+        help="how to read an unlisted DVL message type: velocity=vel.x,vel.y,vel.z,valid=lock")  # fmt: skip
     add("--restamp", dest="overrides", action="append", type="restamp:={}".format, metavar="log|TOPICS",
-        help="times of recording instead of stamps, of all messages or of topics (A,B)")  # fmt: skip
+        help="use recording times instead of stamps, for all messages or for topics (A,B)")  # fmt: skip
 
 
 def opened(bags: Sequence[Path], parameters: Parameters) -> Recording:
-    """Recordings, read once. Raises InputError."""
+    """Open recordings. Raises InputError."""
     from ..recordings.recording import open_recording
 
     with progress("reading") as on_progress:
@@ -69,9 +69,9 @@ def opened(bags: Sequence[Path], parameters: Parameters) -> Recording:
 
 
 def discovered(arguments: argparse.Namespace, recording: Recording, parameters: Parameters) -> Discovery:
-    """What a recording says of topics, mounting and frames, under what options give. Raises InputError.
+    """Find topics, mounting and frames in a recording; options take precedence. Raises InputError.
 
-    parameters: as `load` made them of the same options.
+    parameters: as loaded by `load` from the same options.
     """
     from ..discovery.discover import discover
 
@@ -79,7 +79,7 @@ def discovered(arguments: argparse.Namespace, recording: Recording, parameters: 
 
 
 def given(arguments: argparse.Namespace) -> Given:
-    """What the options of a command name, which is not looked for. Raises InputError."""
+    """Return the topics and parameters that the options name. Raises InputError."""
     from ..discovery.discovery import Given
     from ..files.parameter_files import given_parameters
 
@@ -88,7 +88,7 @@ def given(arguments: argparse.Namespace) -> Given:
 
 
 def options_given(arguments: argparse.Namespace) -> list[str]:
-    """Return the options that name parameters and topics, for the command to type next."""
+    """Return the options that name parameters and topics, for the command that is suggested next."""
     from ..present.numbers import options
 
     topics = [(role, getattr(arguments, f"{role}_topic")) for role in ("dvl", "gnss", "imu")]
@@ -96,7 +96,7 @@ def options_given(arguments: argparse.Namespace) -> list[str]:
 
 
 def print_found(discovery: Discovery, bags: Sequence[Path], first_only: bool = False) -> None:
-    """Print what was found in recordings, and where, dim. first_only: the topics alone."""
+    """Print the discovered values with their sources, dim. first_only: only the topics."""
     from rich.markup import escape
 
     out = console()
@@ -106,7 +106,7 @@ def print_found(discovery: Discovery, bags: Sequence[Path], first_only: bool = F
 
 
 def add_storage_options(parser: argparse.ArgumentParser) -> None:
-    """--storage and --compression of a bag to write."""
+    """Add --storage and --compression of a bag to write."""
     from ..bags.writer import Compression, Storage
 
     storages, compressions = [each.value for each in Storage], [each.value for each in Compression]
@@ -117,14 +117,14 @@ def add_storage_options(parser: argparse.ArgumentParser) -> None:
 
 
 def load(arguments: argparse.Namespace, defaults: Mapping[str, Any] | None = None) -> Parameters:
-    """Parameters from --params and -p; defaults: values, other than the schema's own, of what neither sets."""
+    """Load parameters from --params and -p. defaults: values instead of the schema's defaults."""
     from ..files.parameter_files import load_parameters
 
     return load_parameters(arguments.params, arguments.overrides, defaults)
 
 
 def chosen(option: str, text: str, names: Sequence[str]) -> list[str]:
-    """What an option such as ``M3,M7`` or ``all`` names, each once. Raises InputError for what is not in names."""
+    """Return the unique names in an option such as ``M3,M7`` or ``all``. Raises InputError for unknown names."""
     from ..errors import InputError
 
     if text == "all":
@@ -145,10 +145,10 @@ def check_outputs(
     also_read: Sequence[Path] = (),
     also_written: Mapping[str, Path] | None = None,
 ) -> None:
-    """Raise InputError if what options name could not be written, or is read by the same command, before work is done.
+    """Raise InputError before work is done if an output cannot be written or is also an input.
 
-    files, folders: options that name what is written. Every other path in the arguments, and what the parameters name,
-    is read. also_read: what is read beside. also_written: files that are made beside, by how an error calls them.
+    files, folders: options that name outputs. All other paths in the arguments and the parameters are inputs.
+    also_read: further inputs. also_written: further outputs, by their names in errors.
     """
     from ..disk.atomic import check_folder_writable, check_writable
     from ..errors import InputError
@@ -175,7 +175,7 @@ def check_outputs(
 
 
 def console(stderr: bool = False) -> Console:
-    """A rich console; plain text where the output is no terminal. What it prints as a string is one line."""
+    """Return a rich console, without styles if the output is no terminal. Each printed string becomes one line."""
     from rich.console import Console as RichConsole
 
     from ..errors import printable
@@ -185,18 +185,18 @@ def console(stderr: bool = False) -> Console:
             super().print(*(printable(each) if isinstance(each, str) else each for each in objects), **options)
 
         def on_broken_pipe(self) -> None:
-            raise BrokenPipeError  # main knows what to do; rich would exit with 1
+            raise BrokenPipeError  # main handles it; rich would exit with 1
 
     return Console(stderr=stderr, width=_width(sys.stderr if stderr else sys.stdout), highlight=False, emoji=False)
 
 
 def _width(stream: TextIO) -> int | None:
-    """None for a terminal, which knows its own; elsewhere a table has all the room that it needs."""
+    """Return None for a terminal, else 160 columns, enough for every table."""
     return None if stream.isatty() else 160
 
 
 def print_warnings(notes: Sequence[str]) -> None:
-    """What the user should know, on standard error."""
+    """Print warnings on standard error."""
     from rich.markup import escape
 
     errors = console(stderr=True)
@@ -204,11 +204,11 @@ def print_warnings(notes: Sequence[str]) -> None:
         for note in notes:
             errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
     except OSError:
-        give_up(sys.stderr)  # who does not read warnings gets the result all the same
+        give_up(sys.stderr)  # the result is still printed if standard error is closed
 
 
 def print_document(document: Document) -> None:
-    """A result as it is said, its warnings on standard error."""
+    """Print a result, with its warnings on standard error."""
     from rich.text import Text
 
     from ..present.terminal import shown
@@ -221,7 +221,7 @@ def print_document(document: Document) -> None:
 
 @contextmanager
 def progress(what: str) -> Iterator[Callable[[float], None]]:
-    """A progress bar for a share of 0..1, on standard error and only if that is a terminal."""
+    """Show a progress bar on standard error, if that is a terminal; yields the function that sets the share 0..1."""
     if not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -236,16 +236,16 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write JSON, whole or not at all."""
+    """Write JSON atomically."""
     from ..disk.text_files import write_json as write
 
     write(path, document)
 
 
 def deliver(answer: Callable[[], None], *writes: tuple[Path | None, Callable[[Path], object]]) -> None:
-    """Write what was found, and print it, each also where another fails.
+    """Write the results and print the answer, each even if another fails.
 
-    writes: where to, None for nowhere, and how. Raises InputError of what could not be written, in the end.
+    writes: path (None: not wanted) and the function that writes it. Raises InputError at the end for failed writes.
     """
     from ..errors import InputError
 
@@ -269,7 +269,10 @@ def deliver(answer: Callable[[], None], *writes: tuple[Path | None, Callable[[Pa
 
 @contextmanager
 def ros_node(what: str, name: str) -> Iterator[tuple[AnsweringNode, Ending]]:
-    """A node of this process, and what asks the process to end. what: the command or option. Raises InputError."""
+    """Start a node in this process. what: the command or option, for errors. Raises InputError.
+
+    Yields the node and the watch for signals that end the process.
+    """
     from ..errors import needing_ros
     from ..node.shutdown import Ending
 
@@ -289,7 +292,7 @@ def ros_node(what: str, name: str) -> Iterator[tuple[AnsweringNode, Ending]]:
 
 
 def share_folder() -> Path:
-    """Where bags/ and config/ are: in the source tree, or installed under share/dvl_calib_ros. Raises InputError."""
+    """Return the folder of bags/ and config/: the source tree or share/dvl_calib_ros. Raises InputError."""
     from ..errors import InputError
 
     candidates = [
@@ -300,7 +303,7 @@ def share_folder() -> Path:
         from ament_index_python.packages import get_package_share_directory
 
         candidates.append(Path(get_package_share_directory("dvl_calib_ros")))
-    except Exception:  # not installed through ament, or no ROS at all
+    except Exception:  # not installed through ament, or no ROS
         pass
     for folder in candidates:
         if (folder / "bags").is_dir():
@@ -309,14 +312,14 @@ def share_folder() -> Path:
 
 
 def add_report_option(parser: argparse.ArgumentParser) -> None:
-    """--report FILE."""
+    """Add --report FILE."""
     parser.add_argument("--report", type=Path, metavar="FILE", help="write a report to look at (HTML, one file)")
 
 
 def report_writer(arguments: argparse.Namespace, name: str = "write_report") -> Callable[..., None]:
-    """A function of present/page.py, which nobody is to call if no report is asked for.
+    """Return a function of present/page.py, which must not be called without --report.
 
-    Raises InputError, before any work is done, if a library is missing that reports are made with.
+    Raises InputError, before any work is done, if a library for reports is missing.
     """
     if arguments.report is None:
         return _no_report
@@ -331,4 +334,4 @@ def report_writer(arguments: argparse.Namespace, name: str = "write_report") -> 
 
 
 def _no_report(*_: object) -> None:
-    raise AssertionError("no report was asked for")
+    raise AssertionError("--report was not given")

@@ -1,11 +1,11 @@
-"""Compare calibrations of one DVL: did the mounting move, by how much, between which of them?
+"""Compare calibrations of one DVL: did the mounting move, by how much, and between which calibrations?
 
-Each RESULT is a result file of the node or of replay --save, or a bag, which is calibrated first. What is compared is
-the whole corrected mounting, with lever arm, scale and delay, by the σ that each states; also of different models and
-configured mountings.
+Each RESULT is a result file of the node or of replay --save, or a bag, which is calibrated first. The whole corrected
+mounting with lever arm, scale and delay is compared, weighted by the stated σ; models and configured mountings may
+differ.
 
-Exit code 0: the same mounting within 2 σ. 1: it has moved, by more than 4 σ. 2: bad usage or input. 3: suspicious,
-between the two.
+Exit code 0: the same mounting within 2 σ. 1: moved, by more than 4 σ. 2: bad usage or input. 3: suspicious, between the
+two.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("results", nargs="+", type=Path, metavar="RESULT", help="result file (YAML), or a bag")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
     add_report_option(parser)
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Load or calibrate, compare, save, print."""
+    """Load or calibrate, compare, save, print. Return the exit code."""
     from ..calibration.comparison.mounting_change import check_distinct, compare
     from ..calibration.comparison.mounting_change_reasons import comparison_document
     from ..errors import InputError
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     common.check_outputs(arguments, "json", "report")
     write_report = report_writer(arguments)
     names = _names(paths)
-    calibrations = [_loaded(arguments, path, name) for path, name in zip(paths, names, strict=True)]
+    calibrations = [_load_or_calibrate(arguments, path, name) for path, name in zip(paths, names, strict=True)]
     check_distinct(calibrations)
     comparison = compare(calibrations)
     try:
@@ -58,19 +58,19 @@ def run(arguments: argparse.Namespace) -> int:
             (arguments.json, lambda path: common.write_json(path, comparison_document(comparison))),
             (arguments.report, lambda path: write_report(path, comparison)),
         )
-    except BrokenPipeError:  # | head: the answer is the exit code all the same
+    except BrokenPipeError:  # the exit code is still valid after | head
         give_up(sys.stdout)
     return comparison.answer.exit_code
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
-    """Short names, as long as they tell the paths apart."""
+    """Return the file names if they are unique, else the full paths."""
     short = [path.name or str(path) for path in paths]
     return short if len(set(short)) == len(short) else list(map(str, paths))
 
 
-def _loaded(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
-    """Of a result file; a bag is calibrated for it."""
+def _load_or_calibrate(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
+    """Load a result file, or calibrate with a bag."""
     from ..bags.files import is_bag
     from ..files.mounting import load_extrinsics
 

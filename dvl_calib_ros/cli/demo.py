@@ -1,9 +1,8 @@
-"""The whole thing at once on a shipped bag.
+"""Demonstrate the package on a shipped bag.
 
-Starts the real node in a process of its own, plays a bag with a GNSS outage to it over DDS (on this machine only, on
-a ROS domain of its own), shows the estimates converge, switches a model by the parameter service, then replays the
-same bag offline and prints both results beside the truth; last, it asks whether anything is left that a simulator
-would lack.
+Starts the real node in its own process and plays a bag with a GNSS outage to it over DDS (on this machine only, on its
+own ROS domain). Shows the estimates converge and switches a model by the parameter service. Then replays the same bag
+offline and prints both results next to the truth. Last, it diagnoses errors that a simulator would lack.
 """
 
 from __future__ import annotations
@@ -27,19 +26,19 @@ if TYPE_CHECKING:
     from ..calibration.results.results import Result
 
 BAG = "harbour_box"
-# What the bag was simulated with, see bags/README.md
+# simulated errors of the bag, see bags/README.md
 MISALIGNMENT_DEG = (1.0, -1.5, 3.0)
 SCALE_PERCENT = 0.5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("--speed", type=float, default=20.0, help="times real time; default: %(default)g")
     add_report_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Play, watch, compare."""
+    """Play, watch, compare. Return the exit code."""
     from ..calibration.models import MODELS
     from ..errors import InputError, needing_ros
 
@@ -65,10 +64,10 @@ def run(arguments: argparse.Namespace) -> int:
                 _show_live(out, bag, arguments.speed)
             finally:
                 rclpy.try_shutdown()
-                process.communicate(timeout=30)  # closes its standard input, so that it ends
+                process.communicate(timeout=30)  # the node ends when its standard input is closed
         if not saved.exists():
             log.seek(0)
-            raise InputError(f"the node did not save a result; it said: {log.read()[-2000:]}")
+            raise InputError(f"the node did not save a result; its log: {log.read()[-2000:]}")
         offline = _offline(bag, latency, with_history=arguments.report is not None)
         agree = _compare(out, saved, offline.result)
     _show_diagnosis(out, bag)
@@ -79,9 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _latency(speed: float) -> str:
-    """max_latency for a bag that is played so many times faster than recorded: a second on the clock, in stamps.
+    """Return max_latency for a bag played at `speed` times real time: one second of real time, in stamps.
 
-    Slower, up to three: a busy machine stalls for so long, and 20 s of stamps still show the outage while it lasts.
+    Up to three seconds at low speed, because a busy machine stalls that long; at most 20 s, to show the outage while it
+    lasts.
     """
     return f"max_latency:={max(min(speed, 600.0), min(3.0 * speed, 20.0), 1.0):.1f}"
 
@@ -102,7 +102,7 @@ def _show_live(out: Any, bag: Path, speed: float) -> None:
 
 
 def _truth() -> dict[str, float]:
-    """What the calibration should find in the bag: φ in degrees, δk in per cent (see bags/README.md)."""
+    """Return the true errors of the bag: φ in degrees, δk in per cent (see bags/README.md)."""
     import math
 
     from ..simulation.sensors import DvlErrors, equivalent_error_terms
@@ -135,7 +135,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     _, live = load_result(saved)
     found = estimate_table(offline, list(offline.estimates))
     truth = ("truth", *(f"{value:+.2f}" for value in _truth().values()))
-    of_these = [row[: len(truth)] for row in found.rows]  # what there is a truth of
+    of_these = [row[: len(truth)] for row in found.rows]  # only the columns that have a truth
     out.print(rich_table(Table(found.head[: len(truth)], [truth, *of_these])))
     worst = max(
         float(np.abs(here - there).max())
@@ -156,30 +156,30 @@ def _show_diagnosis(out: Any, bag: Path) -> None:
     from ..diagnosis.diagnose import diagnose
 
     out.print()
-    out.print("[bold]3. Diagnosis[/]: what a simulator would lack beside this bag, `dvl-calib diagnose`")
+    out.print("[bold]3. Diagnosis[/]: errors in this bag that a simulator would lack, `dvl-calib diagnose`")
     out.print()
     diagnosis = diagnose([bag], Parameters(min_speed=0.0))
     out.print(f"[bold]{diagnosis.verdict.value}[/]: {diagnosis.sentence}", soft_wrap=True)
 
 
-# Of RTPS (DDS Interoperability Wire Protocol 2.5, section 9.6.2): port of the first participant's discovery traffic
+# DDS Interoperability Wire Protocol 2.5 (RTPS), section 9.6.2: port of the first participant's discovery traffic
 PORT_BASE, DOMAIN_GAIN, FIRST_PARTICIPANT = 7400, 250, 10
-# Above, ports are those that systems give to outgoing connections.
+# higher domains use the ports that systems give to outgoing connections
 DOMAINS = range(1, 101)
-# By domain, what keeps others from taking it until a participant is there: a name that only one socket of this host can
-# have, and that is free again when its process ends, however it ends.
+# Domain -> socket that reserves it: only one socket of this host can have its name, and the name is free again when the
+# process ends.
 _taken: dict[int, socket.socket] = {}
 
 
 def private_domain() -> dict[str, str]:
-    """Environment variables of processes that are on a free domain and heard on this host only."""
+    """Return environment variables for processes on a free domain that is heard on this host only."""
     return {"ROS_DOMAIN_ID": str(take_domain()), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
 def take_domain() -> int:
-    """Take a domain, at random, that nobody took and on which this host has no participant.
+    """Reserve a random free ROS domain without a participant on this host.
 
-    It stays taken until `give_back` or the end of this process. Raises InputError if there is none.
+    It stays reserved until `give_back` or the end of this process. Raises InputError if there is none.
     """
     for domain in random.sample(DOMAINS, len(DOMAINS)):
         if _take(domain):
@@ -192,7 +192,7 @@ def take_domain() -> int:
 
 
 def give_back(domain: int) -> None:
-    """Let others take a domain that this process took."""
+    """Release a domain that this process reserved."""
     _taken.pop(domain).close()
 
 

@@ -1,9 +1,9 @@
-"""Diagnose recorded bags: where the DVL differs from what calibration leads to expect, and which effect causes it.
+"""Diagnose recorded bags: where the DVL differs from the calibration's prediction, and which effect causes it.
 
-With --simulator: what a simulator's DVL lacks beside the vehicle's. One sentence with the answer comes first. Several
-bags must be of one vehicle; whole bags are then held out.
+With --simulator: what the simulator's DVL lacks compared with the vehicle's. The answer comes first, in one sentence.
+Several bags must be of one vehicle; whole bags are then held out.
 
-Exit code 0: the data answer. 1: their answer is unknown, or they cannot tell. 2: bad usage or input.
+Exit code 0: the data answer. 1: the answer is unknown, or not observable. 2: bad usage or input.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
     from ..discovery.discovery import Discovery
     from ..unpaired.both_sides import RecordedSide
 
-# At rest a bias shows that looks like scale at speed
+# at rest a bias is observable that looks like scale at speed
 DEFAULTS = {"min_speed": 0.0}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the diagnosis as JSON")
     parser.add_argument(
         "--apply", type=Path, metavar="FILE",
-        help="write a parameter file for node and replay that compensates what was found, over --params and -p",
+        help="write a parameter file for node and replay that compensates the effects found, added to --params and -p",
     )  # fmt: skip
     parser.add_argument(
         "--twin", type=Path, metavar="FOLDER",
-        help="write bags with a simulated DVL on the recorded motion: NAME_without and NAME_with what was found",
+        help="write bags with a simulated DVL on the recorded motion: NAME_without and NAME_with the effects found",
     )  # fmt: skip
     parser.add_argument("-v", "--verbose", action="store_true", help="print all tables as well")
     add_report_option(parser)
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Diagnose, print, save; 1 if the data show no cause."""
+    """Diagnose, print, save. Return 1 if the data show no cause."""
     if arguments.simulator:
         return run_against_simulator(arguments, DEFAULTS)
     check_without(arguments)
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
-    of_each = _applied_to_each(arguments.apply, names)
+    of_each = _apply_paths(arguments.apply, names)
     common.check_outputs(
         arguments,
         "json",
@@ -115,20 +115,20 @@ def run(arguments: argparse.Namespace) -> int:
     return int(diagnosis.reasons[0].severity is Severity.REJECT)
 
 
-def _applied_to_each(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
-    """Parameter files of the day, by recording, of several; beside the one that is named. Raises InputError."""
+def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
+    """Return parameter files per recording, next to --apply, if there are several. Raises InputError."""
     from ..disk.atomic import own_stream
     from ..errors import InputError
 
     if path is None or len(names) < 2:
         return {}
     if own_stream(path) is not None:
-        raise InputError(f"--apply {path}: of several bags a file for each is written beside it; name a file")
+        raise InputError(f"--apply {path}: with several bags, one file per bag is written next to it; name a file")
     return {name: path.with_name(f"{path.stem}.{name}{path.suffix}") for name in names}
 
 
 def _check_twins(folder: Path | None, names: Sequence[str]) -> None:
-    """Raise InputError if a twin is there already, before work is done."""
+    """Raise InputError if a twin exists already, before work is done."""
     from ..diagnosis.answer.simulated_twin import twin_paths
     from ..errors import InputError
 
@@ -144,13 +144,13 @@ NEEDS_SIMULATOR = ("simulator_params", "rounds", "keep")
 
 
 def add_simulator_arguments(parser: argparse.ArgumentParser) -> None:
-    """--simulator and what belongs to it."""
+    """Add --simulator and its further options."""
     parser.add_argument(
         "--simulator", nargs="+", type=Path, metavar="SIM",
         help="bags of a simulator, from any motion, with its true velocity: what does its DVL lack?",
     )  # fmt: skip
     parser.add_argument(
-        "--simulator-params", type=Path, metavar="FILE", help="parameter file of the simulator, where it needs another"
+        "--simulator-params", type=Path, metavar="FILE", help="parameter file of the simulator, if it differs"
     )
     parser.add_argument(
         "--rounds", type=int, metavar="N",
@@ -159,12 +159,12 @@ def add_simulator_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--keep", type=Path, metavar="FOLDER",
-        help="keep of every round its DVL (round_1.json, for export and simulate --diagnosis) and its bag (round_1)",
+        help="keep the DVL (round_1.json, for export and simulate --diagnosis) and bag (round_1) of every round",
     )  # fmt: skip
 
 
 def check_without(arguments: argparse.Namespace) -> None:
-    """Raise InputError for options that mean nothing without --simulator."""
+    """Raise InputError for options that need --simulator."""
     from ..errors import InputError
 
     for option in NEEDS_SIMULATOR:
@@ -173,7 +173,7 @@ def check_without(arguments: argparse.Namespace) -> None:
 
 
 def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> int:
-    """Compare, print, save; 1 if the recordings cannot tell."""
+    """Compare, print, save. Return 1 if the recordings cannot answer."""
     from ..errors import InputError
     from ..present.result_documents import DOCUMENTS
     from ..unpaired.results import SimulatorVerdict, unpaired_document
@@ -185,8 +185,8 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
     check_rounds(arguments.rounds, arguments.keep)
     common.check_outputs(arguments, "json", "report", folders=["keep"])
     write_report = report_writer(arguments)
-    real = _source(arguments, arguments.bags, arguments.params, defaults)
-    made = _source(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
+    real = _open_side(arguments, arguments.bags, arguments.params, defaults)
+    made = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
     with common.progress("comparing") as on_progress:
         found = against(
             real[0], made[0], arguments.rounds, arguments.keep, on_progress, with_series=arguments.report is not None
@@ -206,10 +206,10 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
     return int(found.verdict is SimulatorVerdict.CANNOT_TELL)
 
 
-def _source(
+def _open_side(
     arguments: argparse.Namespace, bags: Sequence[Path], params: Path | None, defaults: Mapping[str, float]
 ) -> tuple[RecordedSide, Discovery]:
-    """One side's bags and what they say of themselves."""
+    """Open one side's bags and discover their topics and frames."""
     from ..unpaired.both_sides import RecordedSide
 
     own = argparse.Namespace(**{**vars(arguments), "params": params})

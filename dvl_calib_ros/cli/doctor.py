@@ -1,9 +1,9 @@
-"""Look at a recording before it is calibrated: what is in it, what is wrong with it, whether it can calibrate.
+"""Examine a recording before calibration: its topics, its faults, and whether it can calibrate.
 
-One page: topics and rates, where the DVL sits, every fault with its remedy, what the motion shows, what to type next.
-With --live the same of a running system: of its topics so many seconds are recorded, and looked at.
+One page: topics and rates, position of the DVL, every fault with its remedy, what the motion makes observable, and the
+next command. With --live, record the topics of a running system for some seconds and examine them.
 
-Exit code 0: the recording can calibrate, or a part. 1: it cannot. 2: bad usage or input.
+Exit code 0: the recording, or a part of it, can calibrate. 1: it cannot. 2: bad usage or input.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from . import common
 from .common import add_report_option, report_writer
 
 LIVE_S = 20.0
-# New topics are looked for so often, s.
+# interval of the search for new topics, s
 LOOK_S = 0.2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("bags", nargs="*", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
     parser.add_argument(
         "--live", nargs="?", type=float, const=LIVE_S, metavar="S",
-        help="instead of a bag, the topics there are on ROS 2, for so many seconds; without a number: %(const)g",
+        help="instead of a bag, the current ROS 2 topics, for S seconds; without a number: %(const)g",
     )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
     add_report_option(parser)
@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Examine, print, save; 1 for a recording that cannot calibrate."""
+    """Examine, print, save. Return 1 for a recording that cannot calibrate."""
     from ..examination.examine import examine
     from ..present import examination as present
 
@@ -70,7 +70,7 @@ def _check(arguments: argparse.Namespace) -> None:
 
 @contextmanager
 def _recordings(arguments: argparse.Namespace) -> Iterator[list[Path]]:
-    """The recordings to look at, of which a live one is gone afterwards. Raises InputError."""
+    """Yield the recordings to examine; a live one is deleted afterwards. Raises InputError."""
     if arguments.live is None:
         yield arguments.bags
         return

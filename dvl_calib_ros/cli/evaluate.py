@@ -1,11 +1,11 @@
-"""The published validation procedure: calibrate on one run, correct all others, and compare with the published table.
+"""Run the published validation procedure: calibrate on one run, correct all others, compare with the published table.
 
-FOLDER holds trajectories T01_dvl.csv .. T15_dvl.csv (time s; surge, sway, heave m/s, forward-right-down), and where
-there is attitude T01_attitude.csv .. (time s, the same stamps; roll, pitch, yaw rad in north-east-down). They are
-public: T01-T13 in github.com/ansfl/A-KIT, T14 and T15 in github.com/ansfl/BeamsNet. Without a folder the procedure
-runs on simulated trajectories of the same lengths.
+FOLDER holds trajectories T01_dvl.csv .. T15_dvl.csv (time s; surge, sway, heave m/s, forward-right-down) and,
+optionally, T01_attitude.csv .. (time s, the same stamps; roll, pitch, yaw rad in north-east-down). They are public:
+T01-T13 in github.com/ansfl/A-KIT, T14 and T15 in github.com/ansfl/BeamsNet. Without a folder the procedure runs on
+simulated trajectories of the same lengths.
 
-With several recorded bags instead, each is calibrated on, and every other one that has GNSS is corrected with it.
+With several recorded bags instead, calibrate on each and correct every other bag that has GNSS.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MAX_SEEDS = 10_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("paths", nargs="*", type=Path, metavar="FOLDER | BAG", help="trajectories, or two bags or more")
     parser.add_argument(
         "--seeds", type=int, default=1, metavar="N", help="noise seeds 0 .. N - 1; default: %(default)s"
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _are_bags(paths: list[Path]) -> bool:
-    """Whether bags were named, not a folder of trajectories."""
+    """Return whether the paths are bags rather than a folder of trajectories."""
     from ..errors import InputError
 
     if not paths:
@@ -102,9 +102,6 @@ def _are_bags(paths: list[Path]) -> bool:
     if len(paths) == 1:
         raise InputError(f"{paths[0]}: one bag cannot be checked against another; name two at least, or use replay")
     return True
-
-
-# ------------------------------------------------------------------ bags
 
 
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:

@@ -1,8 +1,8 @@
-"""Write what was found of a DVL as the settings of another simulator, and what that simulator cannot represent.
+"""Write a diagnosed DVL as the settings of another simulator, and list what that simulator cannot represent.
 
-Mounting with misalignment, lever arm, noise and rate are from the diagnosis; everything else is at the simulator's
-defaults, and named so. What cannot be represented is printed, each with the error in m/s that stays, and written
-beside it as FILE.missing.json.
+Mounting with misalignment, lever arm, noise and rate are from the diagnosis; all other settings are the simulator's
+defaults, and marked as such. Each effect that cannot be represented is printed with the remaining error in m/s, and
+written to FILE.missing.json.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     from ..simulator_export.registry import SIMULATORS
 
     parser.add_argument("simulator", choices=tuple(SIMULATORS), metavar="SIMULATOR", help=", ".join(SIMULATORS))
@@ -33,7 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..simulator_export.registry import missing_beside, write_settings
 
     missing = missing_beside(arguments.output)
-    beside = {} if missing is None else {"--output, for what is missing,": missing}
+    beside = {} if missing is None else {"--output, for missing effects,": missing}
     common.check_outputs(arguments, "output", also_written=beside)
     exported = write_settings(arguments.simulator, arguments.source, arguments.output)
     if missing is not None:

@@ -1,8 +1,8 @@
 """Calibrate every recording below folders or object stores, and keep the results as one catalogue.
 
-The catalogue has a row a recording and parameter (FOLDER/rows/*.parquet, for DuckDB, pandas, Polars) and a page
-(FOLDER/index.html). What is done and unchanged is not done again, so a run that was ended is gone on with. A recording
-that cannot be calibrated is a row with its error.
+The catalogue has one row per recording and parameter (FOLDER/rows/*.parquet, for DuckDB, pandas, Polars) and a page
+(FOLDER/index.html). Unchanged recordings are skipped, so an interrupted run continues. A recording that cannot be
+calibrated is a row with its error.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from . import common
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("places", nargs="+", metavar="PLACE", help="folder, file, or URL such as s3://bucket/dives")
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="the catalogue, made or gone on with")
     parser.add_argument(
@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Calibrate what is to be done, write the page, print."""
+    """Calibrate new and changed recordings, write the page, print."""
     from ..errors import InputError
     from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers

@@ -1,19 +1,21 @@
 """Turn trajectories in CSV or NPY, and logs of DVLs and autopilots, into bags.
 
-A file holds rows of time and three values; a folder holds recordings NAME_dvl.csv, each with NAME_gnss.csv and
-NAME_attitude.csv where there are such, and becomes one bag per recording. Units are SI and radians; velocities are
-forward-right-down (frd) unless said otherwise and become ROS's forward-left-up; attitude is roll, pitch, yaw of the
-forward-right-down body in north-east-down. Files whose header names speed and course (over ground, from true north), or
-heading (of a compass, with pitch and roll or without), are read by their columns; units are in the names (_deg, knots).
-Latitude and longitude beside or instead of the speed become NavSatFix on gnss/fix.
+A file holds rows of time and three values. A folder holds recordings NAME_dvl.csv, each optionally with NAME_gnss.csv
+and NAME_attitude.csv, and becomes one bag per recording. Units are SI and radians. Velocities are forward-right-down
+(frd) by default and become ROS's forward-left-up. Attitude is roll, pitch, yaw of the forward-right-down body in
+north-east-down.
 
-Of a table of another layout --columns names the DVL's columns, by header or number; time is in seconds, in ISO 8601, or
-a date and a time of day (time=Date+Time).
+If the header names speed and course (over ground, from true north), or a compass heading (optionally with pitch and
+roll), the file is read by its column names, which include the units (_deg, knots). Latitude and longitude, with or
+without the speed, become NavSatFix on gnss/fix.
 
-A log of Water Linked's JSON reports, of text (Teledyne's PD6, Nortek's PNORBT, Cerulean's DVPDL), of RDI's PD0
-ensembles (with the DVL's own heading, pitch and roll, and the NMEA that WinRiver II put into them), of Nortek's DVLs or
-of ArduPilot (.BIN, .tlog: DVL, GNSS and attitude in one) is known by its content; so are a receiver's RMC sentences.
-They have their own times: give --start 0 with a GNSS or attitude file whose times are seconds since 1970 as well.
+For a table of another layout, --columns names the DVL's columns by header or number. Time is in seconds, in ISO 8601,
+or a date and a time of day (time=Date+Time).
+
+Logs are recognised by their content: JSON reports of Water Linked, text (Teledyne's PD6, Nortek's PNORBT, Cerulean's
+DVPDL), PD0 ensembles of RDI, logs of Nortek DVLs, logs of ArduPilot (.BIN, .tlog: DVL, GNSS and attitude in one), and
+RMC sentences of a receiver. PD0 includes the DVL's own heading, pitch and roll, and NMEA added by WinRiver II. Logs
+have their own times: give --start 0 if the times of a GNSS or attitude file are also seconds since 1970.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from . import common
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument(
         "dvl",
         type=Path,
@@ -54,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Import one recording, or a folder of them."""
+    """Import one recording, or a folder of recordings."""
     from ..bags.writer import Compression, Storage
     from ..logs.trajectories import ImportOptions, import_files
 

@@ -1,16 +1,16 @@
-"""Entry point of ``dvl-calib``. What takes long to import is imported below, where an interrupt is looked after."""
+"""Entry point of ``dvl-calib``. Slow imports are inside `main`, where an interrupt is handled."""
 
 from __future__ import annotations
 
 import sys
 
-TYPE_CHECKING = False  # as in typing, which takes longer than all else here
+TYPE_CHECKING = False  # as in typing, whose import takes longer than the rest of this module
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; 0 on success, 1 for an answer against the data, 2 for bad usage or input (one line)."""
+    """Run a command. Return 0 for success, 1 for a negative answer, 2 for bad usage or input (one line)."""
     argv = sys.argv[1:] if argv is None else argv
     try:
         from .command_line import run

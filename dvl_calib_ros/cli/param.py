@@ -11,12 +11,12 @@ from typing import Any
 from ..standard_streams import show
 from . import common
 
-# Time to find the node, and for each answer, s. The middleware may lose an answer, so a request is repeated.
+# Time limits, s, to find the node and for each answer. The middleware may lose an answer, so a request is repeated.
 FOUND_WITHIN_S, ANSWERED_WITHIN_S, TRIES = 10.0, 3.0, 5
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("what", choices=["list", "get", "set"])
     parser.add_argument("name", nargs="?", metavar="NAME")
     parser.add_argument("value", nargs="?", metavar="VALUE")
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Ask the node, and print. Raises InputError for what it refuses, and where there is no node."""
+    """Send a request to the node and print the answer. Raises InputError if it refuses or there is no node."""
     from ..calibration.models.parameters import SCHEMA
     from ..errors import InputError
     from ..files.parameter_files import NODE_NAME, as_yaml, load_parameters

@@ -7,23 +7,23 @@ from pathlib import Path
 
 from ..standard_streams import show
 
-# Tables of what is said, by their names in `verdict.reasons`.
+# tables of messages by their names in `verdict.reasons`
 _TABLES = {
     "findings": "every warning with its meaning and remedy",
     "doctor": "everything that the doctor can find wrong with a bag",
     "verdicts": "every reason for which a calibration is or is not to be used",
     "comparisons": "everything that compare can say",
-    "configurations": "what the data can fit instead of what was configured",
+    "configurations": "alternatives to the configuration that fit the data",
     "selections": "why a model is selected",
     "diagnoses": "everything that diagnose can conclude",
     "unpaired": "everything that diagnose --simulator can conclude",
     "manoeuvres": "everything that the live view can say is to be driven next",
-    "discoveries": "what is passed over or guessed in a recording",
+    "discoveries": "what discovery skips or guesses in a recording",
 }
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--yaml", action="store_true", help="a ROS 2 parameter file with every default")
     what.add_argument("--models", action="store_true", help="what each model assumes and when it is wrong")
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Print."""
+    """Print the requested table."""
     if arguments.joint is not None and arguments.urdf is None:
         from ..errors import InputError
 
@@ -59,9 +59,9 @@ def run(arguments: argparse.Namespace) -> None:
         show(*command_table().splitlines())
         return
     if asked := next((name for name in _TABLES if getattr(arguments, name)), None):
-        from ..verdict.reasons import TABLES, table
+        from ..verdict.reasons import TABLES, lookup
 
-        show(*table(TABLES[asked]).splitlines())
+        show(*lookup(TABLES[asked]).splitlines())
         return
     if arguments.urdf is not None:
         from ..files.mounting import urdf_parameters
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def command_table() -> str:
-    """Every command with an example, in Markdown."""
+    """Return a table of all commands with examples, in Markdown."""
     from .commands import COMMANDS
 
     lines = ["| command | does | example |", "|---|---|---|"]

@@ -1,8 +1,8 @@
-"""Play recorded bags over ROS 2, as `ros2 bag play` does, also where that is not installed, and damaged ones as well.
+"""Play recorded bags over ROS 2 like `ros2 bag play`, also where that is not installed, and also damaged bags.
 
-All topics whose message packages are installed are published, with the bytes that were recorded. Stamps stay as they
-are. Without tf2_msgs, which pip does not have, /tf_static is published as joints of /robot_description, where the
-calibration node takes its mounting from as well. Needs ROS 2 Jazzy (or pip install 'dvl_calib_ros[ros]').
+All topics whose message packages are installed are published, with the recorded bytes and unchanged stamps. pip has no
+tf2_msgs; without it, /tf_static is published as joints of /robot_description, which the calibration node also reads.
+Needs ROS 2 Jazzy (or pip install 'dvl_calib_ros[ros]').
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..bags.reader import BagReader
     from ..demo.player import BagPlayer
 
-# Two processes that are both there find each other sooner.
+# time without subscribers before a message names their topics, s; discovery takes less
 SAID_AFTER_S = 2.0
 RATES = (0.01, 1000.0)
 DESCRIPTION = "/robot_description"
@@ -30,18 +30,16 @@ CLOCKS_HZ = (0.1, 1000.0)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag file")
     parser.add_argument("-r", "--rate", type=float, default=1.0, help="times as fast as recorded; default: %(default)g")
     parser.add_argument("-l", "--loop", action="store_true", help="again and again, until Ctrl-C")
     parser.add_argument(
         "-d", "--delay", type=float, default=0.0, metavar="S", help="wait so long before the first message"
     )
+    parser.add_argument("--start-offset", type=float, default=0.0, metavar="S", help="begin S seconds into the bag")
     parser.add_argument(
-        "--start-offset", type=float, default=0.0, metavar="S", help="begin so many seconds into the bag"
-    )
-    parser.add_argument(
-        "--playback-duration", type=float, default=float("inf"), metavar="S", help="play so many seconds of the bag"
+        "--playback-duration", type=float, default=float("inf"), metavar="S", help="play S seconds of the bag"
     )
     parser.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these")
     parser.add_argument(
@@ -49,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--clock", nargs="?", type=float, const=40.0, default=0.0, metavar="HZ",
-        help="publish /clock, so often in a second of the bag; without a number: 40",
+        help="publish /clock at this rate in time of the bag; without a number: 40",
     )  # fmt: skip
     parser.add_argument("--wait", action="store_true", help="begin when every topic has a subscriber")
 
@@ -74,7 +72,7 @@ def run(arguments: argparse.Namespace) -> None:
         def has_ended() -> bool:
             return ending.requested
 
-        # the recorded one would replace it
+        # the recorded description would replace the extended one
         recorded = [name for name in targets if description and name.strip("/") == DESCRIPTION.strip("/")]
         topic = next(map(targets.pop, recorded), DESCRIPTION)
         player = BagPlayer(node, arguments.bags, targets, clock_hz=arguments.clock)
@@ -137,7 +135,7 @@ def _description(bag: BagReader, static: Sequence[str], played: Mapping[str, str
 
 
 def _targets(bag: BagReader, topics: Sequence[str] | None, remap: Sequence[str]) -> tuple[dict[str, str], list[str]]:
-    """Topic of the bags -> what to publish it as; and the topics of static transforms that cannot be published.
+    """Map topics of the bags to published names, and list the static transforms that cannot be published.
 
     Raises InputError.
     """

@@ -16,7 +16,7 @@ OPTIONS = ("dvl-topic", "gnss-topic", "imu-topic", "params")
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:
-    """--profile."""
+    """Add --profile."""
     parser.add_argument(
         "--profile", metavar="NAME",
         help=f"stored topics and parameters: NAME.yaml in ~/.config/dvl-calib, or a file; default: {IN_FOLDER} of this "
@@ -71,7 +71,7 @@ def _words(path: Path) -> list[str]:
     for name, value in content.items():
         if not isinstance(value, str):
             raise InputError(f"{path}: {name} is no text")
-    if "params" in content:  # as seen from the profile
+    if "params" in content:  # the path is relative to the profile
         content["params"] = path.parent / content["params"]
     words = [f"--{name}={value}" for name, value in content.items()]
     return words + [word for name, value in parameters.items() for word in ("-p", f"{name}:={as_yaml(value)}")]

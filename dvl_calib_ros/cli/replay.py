@@ -1,7 +1,7 @@
-"""Calibrate with recorded bags: the same estimator as the node's, over rosbag2 folders or files, several as one.
+"""Calibrate with recorded bags: the estimator of the node on rosbag2 folders or files, several as one.
 
-Topics, mounting, lever arm and frames are found in the bag where no option says otherwise. The answer comes first: a
-verdict, the corrected mounting and what to type next. -p takes angles in degrees: -p mounting_rpy:="[0, 0, 45deg]".
+Topics, mounting, lever arm and frames are found in the bag unless an option names them. The answer comes first: a
+verdict, the corrected mounting and the next command. -p takes angles in degrees: -p mounting_rpy:="[0, 0, 45deg]".
 
 Exit code 0: the calibration is usable. 1: it is rejected. 2: bad usage or input.
 """
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
-    parser.add_argument("--models", metavar="NAMES", help="show these models beside the answer, such as M3,M7 or all")
+    parser.add_argument("--models", metavar="NAMES", help="also show these models, such as M3,M7 or all")
     parser.add_argument("--merge", action="store_true", help="calibrate bags together even if the mounting moved")
     parser.add_argument("-v", "--verbose", action="store_true", help="show counts, selection and all models as well")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Look into the bags, replay them, save, print; 1 for a rejected calibration."""
+    """Examine the bags, replay them, save, print. Return 1 for a rejected calibration."""
     from ..bag_replay.checked_replay import checked_replay
     from ..bag_replay.replay import replay_document
     from ..calibration.models import MODELS
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     result = replayed.result
     if asked and not any(name in result.estimates for name in asked):
         raise InputError(
-            f"--models: {', '.join(asked)} goes by positions, and the reference holds velocities; name another model, "
+            f"--models: {', '.join(asked)} needs positions, and the reference has velocities; name another model, "
             "or a topic of positions with --gnss-topic"
         )
     discovery = discovery.with_mounting(result.parameters["mounting_rpy"])
@@ -102,7 +102,7 @@ def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discove
 
 
 def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Reason]:
-    """Findings worth a warning: none of models that were not asked for, none that discovery has settled."""
+    """Return the findings to print: only of requested models, and none that discovery has settled."""
     other = [f"{name}: " for name in replayed.result.estimates if name not in models]
     settled = {"BAG_NO_GNSS", "BAG_NO_IMU"} | ({"IMU_FRAME"} if discovery.knows_imu else set())
     return [

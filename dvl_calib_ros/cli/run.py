@@ -12,7 +12,7 @@ from . import common
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     common.add_parameter_options(parser)
     common.add_topic_options(parser)
     parser.add_argument("--watch", action="store_true", help="show estimates, convergence and missing manoeuvres, live")
@@ -20,11 +20,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Translate the options for ROS 2 and run the node."""
+    """Convert the options for ROS 2 and run the node. Return its exit code."""
     from ..node.shutdown import Ending
 
-    with Ending() as ending:  # before anything that takes long
-        common.load(arguments)  # a bad file or value is said here, in one line, before ROS starts
+    with Ending() as ending:  # before anything slow
+        common.load(arguments)  # report a bad file or value in one line before ROS starts
         if arguments.watch:
             from .watch import run_and_watch
 
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def ros_arguments(arguments: argparse.Namespace) -> list[str]:
-    """The options as ROS 2 arguments."""
+    """Return the options as ROS 2 arguments."""
     from ..files.parameter_files import ros_override
 
     ros = ["--ros-args"]

@@ -1,4 +1,4 @@
-"""Recover damaged recordings, all topics, into a new bag that every tool reads, and say how much was recovered."""
+"""Recover all topics of damaged recordings into a new bag that every tool reads, and report the losses."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from . import common
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("bags", nargs="+", type=Path, metavar="BAG", help="rosbag2 folder, .mcap, .db3 or .bag")
     parser.add_argument("-o", "--output", type=Path, required=True, help="bag to write")
     common.add_storage_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Read everything, write it, say what was lost."""
+    """Read everything, write it, report the losses."""
     from ..bags.recover import recover
     from ..bags.writer import Compression, Storage
 

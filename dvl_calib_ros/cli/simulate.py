@@ -1,6 +1,6 @@
 """Write a bag from a motion, an error model and any effects. The same options and seed give the same bag.
 
-With --live, publish the same on ROS 2 instead, or what the sensors measure on a vehicle whose odometry is followed.
+With --live, publish the same on ROS 2 instead, or follow a vehicle's odometry and publish its simulated sensors.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GNSS_FRAMES = ("from_frame_id", "body", "enu", "ned")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     from ..simulation.injection import FORM
     from ..simulation.trajectories import TRAJECTORIES
 
@@ -47,14 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--waves", nargs=2, type=float, metavar=("HEIGHT", "PERIOD"),
         help="surface waves: significant height (m), period of the peak (s)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, help="of all that is by chance; default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0, help="of all random numbers; default: %(default)s")
     parser.add_argument(
         "--effect", action="append", default=[], metavar=FORM,
         help="add an effect, such as lever_arm:x_m=0.3; repeatable (dvl-calib parameters --effects lists them)",
     )  # fmt: skip
     parser.add_argument(
         "--diagnosis", type=Path, metavar="FILE",
-        help="the DVL that was found: what diagnose --json wrote, or a result or parameter file",
+        help="simulate a diagnosed DVL: a file of diagnose --json, or a result or parameter file",
     )  # fmt: skip
     parser.add_argument(
         "--truth", action="store_true", help="attach all that was simulated to the bag, as truth.json (MCAP only)"
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     none = (0.0, 0.0, 0.0)
     parser.add_argument(
         "--misalignment", nargs=3, type=float, default=none, metavar=angles,
-        help="degrees by which the DVL is turned against its nominal mounting",
+        help="rotation of the DVL from its nominal mounting, degrees",
     )  # fmt: skip
     parser.add_argument("--scale", nargs="+", type=float, default=[0.0], metavar="PERCENT", help="one, or one per axis")
     parser.add_argument(
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Simulate and write."""
+    """Simulate, and write or publish."""
     import math
 
     from ..bags.writer import Compression, Storage
@@ -149,7 +149,7 @@ def run(arguments: argparse.Namespace) -> None:
     show(f"wrote {arguments.output}")
 
 
-# Options that say of the DVL what a diagnosis says
+# options that describe the DVL, as a diagnosis does
 OF_THE_DVL = ("misalignment", "scale", "mounting_rpy", "beam_std", "beam_bias", "dvl_rate")
 
 
@@ -196,7 +196,7 @@ LIMITS = {
     "gyro_bias": (-100.0, 100.0),
     "motion_smoothing": (0.0, 60.0),
 }
-MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # no such sensor
+MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # zero means no such sensor
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -216,20 +216,20 @@ def _check(arguments: argparse.Namespace) -> None:
             raise InputError(f"--gnss-outage: {start:g} is not before {end:g}; give the beginning, then the end")
 
 
-# Options of simulate that make a motion, which an odometry topic gives instead
+# options for a motion, which --follow takes from an odometry topic instead
 MOTION_OPTIONS = ("trajectory", "motion_of", "duration", "waves")
 SPEEDS = (0.01, 1000.0)
 
 
 def add_live_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments, in a group of their own."""
+    """Add --live and its further options in their own group."""
     from ..messages.drivers import TWIST_TYPE
 
     live = parser.add_argument_group("live", "publish DVL, GNSS and IMU on ROS 2 instead of writing a bag")
-    live.add_argument("--live", action="store_true", help="publish; stamps begin now, or are those of the odometry")
+    live.add_argument("--live", action="store_true", help="publish; stamps begin now, or are taken from the odometry")
     live.add_argument(
         "--follow", metavar="TOPIC",
-        help="nav_msgs/Odometry of a vehicle that is driven elsewhere, such as by another simulator; until Ctrl-C",
+        help="nav_msgs/Odometry of a vehicle driven elsewhere, such as in another simulator; until Ctrl-C",
     )  # fmt: skip
     live.add_argument(
         "--speed", type=float, default=1.0, help="times real time, without --follow; default: %(default)g"
@@ -243,7 +243,7 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
-    """Raise InputError for options that do not go together. defaults: of all options."""
+    """Raise InputError for options that exclude each other. defaults: of all options."""
     from ..errors import InputError
 
     if not arguments.live:
@@ -261,7 +261,7 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
     if arguments.follow is not None:
         for name in (*MOTION_OPTIONS, "speed"):
             if getattr(arguments, name) != getattr(defaults, name):
-                raise InputError(f"--{name.replace('_', '-')}: the motion is that of {arguments.follow}; leave it out")
+                raise InputError(f"--{name.replace('_', '-')}: the motion comes from {arguments.follow}; leave it out")
 
 
 def run_live(arguments: argparse.Namespace, scenario: Scenario) -> None:

@@ -1,7 +1,7 @@
-"""Watch a calibration node that runs somewhere on the ROS domain: mounting, what it is worth, what to drive next.
+"""Watch a calibration node on the ROS domain: mounting, predicted drift, next manoeuvre.
 
-Ctrl-C or q ends the view, not the node; s saves, r twice forgets all, w shows all warnings. ``dvl-calib run --watch``
-starts a node and watches it; there they end both.
+Ctrl-C or q ends the view, not the node; s saves, r twice resets the calibration, w shows all warnings. After
+``dvl-calib run --watch``, which starts a node and watches it, they end both.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
     from ..node.shutdown import Ending
     from ..node.status import Status
 
-# How long a node may take to save, s.
+# time limit for the node to save, s
 PATIENCE_S = 60.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Arguments of the command."""
+    """Add the arguments of the command."""
     parser.add_argument("--node", metavar="NAME", help="full name of the node, if it was given another")
 
 
@@ -61,10 +61,10 @@ def _listener(node: str) -> Listener:
 
 
 def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
-    """Start the node in a process of its own and watch it; its exit code.
+    """Start the node in its own process and watch it. Return its exit code.
 
-    Ctrl-C, SIGTERM and SIGHUP end the node as they would without the view: it saves. It is in a session of its own, so
-    that they reach it through here only, by the pipe that closes with this process, however that ends.
+    Ctrl-C, SIGTERM and SIGHUP end the node as without the view: it saves. The node has its own session, so these
+    signals reach only this process; the node ends when the pipe from this process closes.
     """
 
     with _listener(_node_name(ros_arguments)) as listener:
@@ -77,7 +77,7 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
             assert process.stdout is not None  # a pipe
             log = _Log(process.stdout)
             show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log.lines, True)
-            said = len(log.lines) if process.poll() is None else 0  # lines that are on the screen already
+            said = len(log.lines) if process.poll() is None else 0  # number of lines already on the screen
         finally:
             code = _ended(process)
         for text in log.finished()[said:]:
@@ -86,7 +86,7 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
 
 
 def _node_name(ros_arguments: Sequence[str]) -> str:
-    """Full name of the node that is started with these: __ns and __node remap it."""
+    """Return the full name of the node started with these arguments, which may remap it by __ns and __node."""
     from ..files.parameter_files import NODE_NAME
 
     rules = dict(word.split(":=", 1) for word in ros_arguments if ":=" in word)
@@ -94,7 +94,7 @@ def _node_name(ros_arguments: Sequence[str]) -> str:
 
 
 def node_command(ros_arguments: Sequence[str]) -> list[str]:
-    """What runs a node that ends with this process, or when its standard input is closed before."""
+    """Return the command of a node that ends when its standard input closes."""
     return [sys.executable, "-m", "dvl_calib_ros.node.main", ENDS_WITH_STDIN, *ros_arguments]
 
 
@@ -110,7 +110,7 @@ def _ended(process: subprocess.Popen[bytes]) -> int:
 
 
 class _Log:
-    """Collects what the node writes, so that it neither garbles the view nor is lost."""
+    """Collector of the node's log, so that it neither garbles the view nor is lost."""
 
     def __init__(self, pipe: IO[bytes]) -> None:
         self.lines: list[str] = []
@@ -123,17 +123,17 @@ class _Log:
             self.lines.append(raw.decode(errors="replace").rstrip())
 
     def finished(self) -> list[str]:
-        """All lines of a node that has ended."""
+        """Return all lines of a node that has ended."""
         self._thread.join()
         return self.lines
 
 
-# /diagnostics comes at 1 Hz; without it for so long, the node or the network is gone, s.
+# Age of the last /diagnostics, published at 1 Hz, after which the node or the network counts as gone, s.
 SILENCE_S = 5.0
-# How often the view is drawn on a terminal, s, and a line written where there is none.
+# interval of redrawing on a terminal, and of a line elsewhere, s
 REDRAW_S = 0.5
 LINE_S = 10.0
-# A second r within this forgets all that was learnt, s.
+# time for the second r, which resets the calibration, s
 SURE_S = 3.0
 COLOURS = {0: "green", 1: "yellow", 2: "red"}
 LOG_LINES = 3
@@ -149,12 +149,12 @@ HEIGHTS = " ▁▂▃▄▅▆▇█"
 GOALS = (("worth", "drift"), ("side", " yaw"), ("ahead", " scale"))
 WORSE = "[RESULT_WORSE]"
 KEYS = "s save  r r forget  w warnings  q quit"
-# Width in columns from which a row has three quantities of the mounting, and the next manoeuvre needs one line.
+# width in columns from which a row has three quantities of the mounting and the next manoeuvre fits on one line
 WIDE = 76
 
 
 class Row(NamedTuple):
-    """A row of the view, folded to the terminal's width. most, least: number of its lines."""
+    """Row of the view, wrapped to the terminal's width. most, least: limits of its number of lines."""
 
     text: str
     style: str = ""
@@ -162,7 +162,7 @@ class Row(NamedTuple):
     least: int = 1
 
     def lines(self, console: Console, width: int) -> list[Text]:
-        """Return its lines; what does not fit ends in an ellipsis."""
+        """Return its lines; longer text ends in an ellipsis."""
         from rich.text import Text
 
         lines = list(Text(printable(self.text), self.style).wrap(console, width, overflow="fold"))
@@ -175,7 +175,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class View:
-    """The live view, fitted to the terminal: first the rows with fixed places, last those that may be left out.
+    """Live view, fitted to the terminal: rows with fixed places first, optional rows last.
 
     now_s: monotonic time. log: lines of the node's log. event: the last answer or log line. page: presses of w.
     """
@@ -187,7 +187,7 @@ class View:
     page: int = 0
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield its lines, no more than the terminal has."""
+        """Yield lines, at most the terminal's height."""
         width, height = options.max_width, options.size.height
         tail = [Row(line, "dim", most=1) for line in self.log[-LOG_LINES:]]
         fixed, body, warnings = (
@@ -269,7 +269,7 @@ def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
 
 
 def _duration(text: str, rough: bool = False) -> str:
-    """Return seconds of another process as people tell them. rough: without seconds from two minutes on."""
+    """Format seconds of another process. rough: without seconds from two minutes on."""
     try:
         seconds = float(text)
     except ValueError:
@@ -282,7 +282,7 @@ def _duration(text: str, rough: bool = False) -> str:
 
 
 def _number(text: str) -> float:
-    """A number of another process; 0 where it is none."""
+    """Parse a number of another process; 0 if invalid."""
     try:
         number = float(text)
     except ValueError:
@@ -318,7 +318,7 @@ def _rose(status: Status) -> str:
 
 
 def line(status: Status) -> str:
-    """The view in one line, for a log."""
+    """Return the view in one line, for a log."""
     found = ", ".join(" ".join(_quantity(status, *each).split()) for each in MOUNTING[0])
     fault = f"; {status.message}" if status.level else ""
     worth = f"{status.get('worth')} m per km; next: {status.get('next')}"
@@ -326,7 +326,7 @@ def line(status: Status) -> str:
 
 
 class Keys:
-    """Single keys that ask a node for something; `said` is the answer. page: presses of w.
+    """Keyboard commands to a node. `said` is the last answer, `page` the number of presses of w.
 
     ends_node: whether the node ends with the view. Then q saves first, and asks before a better result is replaced.
     """
@@ -341,11 +341,11 @@ class Keys:
 
     @property
     def said(self) -> str:
-        """The last answer."""
+        """Last answer."""
         return self._own or self._listener.answer
 
     def press(self, key: str, now_s: float) -> bool:
-        """Do what it asks for; False to leave the view."""
+        """Execute a key. Return False to leave the view."""
         is_sure = key == "r" and now_s - self._asked_s < SURE_S
         self._asked_s = now_s if key == "r" and not is_sure else -SURE_S
         self.page += key == "w"
@@ -363,7 +363,7 @@ class Keys:
         return key != "q" or self._ends_node
 
     def has_left(self) -> bool:
-        """Return whether q was pressed and its save is answered, with no question left."""
+        """Return whether q was pressed, its save was answered, and no question is open."""
         if not self._is_leaving or self._listener.is_waiting or self._own:
             return False
         if WORSE not in self._listener.answer:
@@ -374,7 +374,7 @@ class Keys:
 
 @contextmanager
 def _single_keys() -> Iterator[Callable[[], str]]:
-    """Read keys of the terminal as they are pressed: a function that gives the next one, '' for none."""
+    """Yield a function that returns the next key of the terminal without waiting, '' for none."""
     if not sys.stdin.isatty():
         yield lambda: ""
         return
@@ -397,11 +397,10 @@ def show(
     log: Sequence[str] = (),
     ends_node: bool = False,
 ) -> None:
-    """Draw while it is running, or until q. listener: whose latest status is drawn, and who is told of keys.
+    """Draw the view while `is_running`, or until q.
 
-    ends_node: whether the node ends with the view.
-
-    On a terminal the view is drawn in place; elsewhere a line is written when something has changed, or now and then.
+    listener: source of the latest status, and receiver of keys. ends_node: whether the node ends with the view. On a
+    terminal the view is drawn in place; elsewhere a line is written after a change, or periodically.
     """
     if not console.is_terminal or console.is_dumb_terminal:
         for text in _lines(listener.latest, is_running):

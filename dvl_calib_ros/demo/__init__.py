@@ -1,1 +1,1 @@
-"""Bags over DDS, to and from: what the demo plays and shows, and what is recorded of a running system."""
+"""Playing bags over DDS, and showing the node's answers, for the demo."""

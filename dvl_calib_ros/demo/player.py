@@ -1,4 +1,4 @@
-"""Plays a bag over DDS, bytes as recorded: to a running node, or to whoever listens."""
+"""Player of bags over DDS, with the bytes as recorded."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from ..node.message_types import message_class
 from ..recordings.topics import Topics
 
 PATIENCE = Duration(seconds=30)
-# What is said once, and kept for those who come later, as robot_state_publisher and static broadcasters do
+# topics sent once and kept for late subscribers, as robot_state_publisher and static broadcasters do
 LATCHED = ("/tf_static", "/robot_description")
-# A request to end is heard within this, s.
+# longest delay of a request to end, s
 BREATH_S = 0.05
 
 
 def sensors_of(bag: BagReader) -> dict[str, str]:
-    """DVL, GNSS and IMU topic of a bag, with the calibration node's own name for each."""
+    """Return DVL, GNSS and IMU topic of a bag -> the calibration node's own name for it."""
     defaults = Topics()
     found = defaults.found_in(bag.topics)
     named = {found.dvl: defaults.dvl, found.gnss: defaults.gnss, found.imu: defaults.imu}
@@ -34,16 +34,16 @@ def sensors_of(bag: BagReader) -> dict[str, str]:
 
 
 def wait_until(time_s: float, has_ended: Callable[[], bool]) -> None:
-    """Wait until a time of `time.monotonic`, or the end."""
+    """Wait until a time of `time.monotonic`, or until `has_ended`."""
     while (left := time_s - time.monotonic()) > 0.0 and not has_ended():
         time.sleep(min(left, BREATH_S))
 
 
 class BagPlayer:
-    """Publishes topics of bags, reliably.
+    """Reliable publisher of a bag's topics.
 
-    targets: topic of the bags -> what to publish it as; by default DVL, GNSS and IMU, as the calibration node calls
-    them. clock_hz: how often /clock is published, in seconds of the bag, 0 for never. Raises InputError.
+    targets: topic of the bags -> published name; by default DVL, GNSS and IMU -> the calibration node's names.
+    clock_hz: rate of /clock in time of the bag, 0 for never. Raises InputError.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class BagPlayer:
         with BagReader(paths) as bag:
             for name, target in (sensors_of(bag) if targets is None else targets).items():
                 kind = message_class(f"{name} of the bag holds", bag.topics[name])
-                # room for every message: none is overwritten before it is acknowledged, however fast we play
+                # room for every message: none is overwritten before it is acknowledged, at any speed
                 profile = QoSProfile(
                     history=HistoryPolicy.KEEP_LAST,
                     depth=max(bag.message_counts[name], 1),
@@ -74,19 +74,19 @@ class BagPlayer:
         self._tick_s = 1.0 / clock_hz if clock_hz else float("inf")
 
     def describe(self, text: str, topic: str) -> None:
-        """Publish a description of the robot (URDF) once, for those who come later as well. Raises InputError."""
+        """Publish a robot description (URDF) once, also for late subscribers. Raises InputError."""
         profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._description.append(self._node.create_publisher(String, topic, profile))
         self._description[-1].publish(String(data=text))
 
     @property
     def unheard(self) -> list[str]:
-        """Topics, as they are published, that nobody subscribes to."""
+        """Published topics without a subscriber."""
         publishers = (*self._publishers.values(), *self._description)
         return [each.topic_name for each in publishers if each.get_subscription_count() < 1]
 
     def wait_for_subscribers(self, timeout_s: float = 30.0) -> None:
-        """Wait until every publisher has a subscriber. Raises InputError if one has none in time."""
+        """Wait until every publisher has a subscriber. Raises InputError after `timeout_s`."""
         deadline = time.monotonic() + timeout_s
         while unheard := self.unheard:
             if time.monotonic() > deadline:
@@ -101,11 +101,11 @@ class BagPlayer:
         duration_s: float = float("inf"),
         has_ended: Callable[[], bool] = lambda: False,
     ) -> dict[str, int]:
-        """Publish all messages, at most `speed` times as fast as recorded; topic -> number sent.
+        """Publish all messages, at most `speed` times as fast as recorded. Return topic -> number sent.
 
         on_time is called before every message with its time in s since the bag's first and the numbers sent so far;
-        as long as it takes, so long the bag stands still. start_s, duration_s: of the bag; of what lies before only
-        what is latched is published. has_ended: whether to stop.
+        playback waits for it. start_s, duration_s: part of the bag; before it only latched topics are published.
+        has_ended: whether to stop.
         """
         sent = dict.fromkeys(self._publishers, 0)
         with BagReader(self._paths) as bag:
@@ -140,7 +140,7 @@ class BagPlayer:
             self._clock.publish(message)
 
     def wait_until_received(self) -> None:
-        """Wait until the middleware of those who listen has all messages (of a reliable player)."""
+        """Wait until the subscribers' middleware has all messages (of a reliable player)."""
         if self._reliable:
             for publisher in self._publishers.values():
                 publisher.wait_for_all_acked(PATIENCE)

@@ -1,4 +1,4 @@
-"""Watches the node from outside while a bag is played to it, as the demo shows it."""
+"""Observer of the node for the demo, while a bag is played to it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from ..node.services import AnsweringNode
 from ..recordings.topics import Topics
 from .player import BagPlayer
 
-# place in ~/estimate's covariance diagonal, factor to what people read
+# place in the covariance diagonal of ~/estimate, factor to the displayed unit
 SHOWN = {
     "phi_x": ("φx °", 3, math.degrees(1.0)),
     "phi_y": ("φy °", 4, math.degrees(1.0)),
@@ -34,15 +34,15 @@ SHOWN = {
     "delta_k": ("δk %", 0, 100.0),
 }
 
-# Under which name the node says how many messages of a topic it has taken.
+# keys of the node's counts of messages received
 RECEIVED = {Topics.dvl: "dvl received", Topics.gnss: "reference received", Topics.imu: "imu received"}
-# A busy machine falls behind a bag that is played faster than recorded. So many messages of a topic may wait, half of
-# what a node's queue holds; and who is silent for so long, s, is not waited for.
+# A busy machine falls behind a bag played fast. At most this number of messages of a topic may wait, half of the node's
+# queue. A node silent for PATIENCE_S is not waited for.
 WAITING, PATIENCE_S = QUEUE // 2, 30.0
 
 
 class Watcher:
-    """Plays bags to the node and keeps what it says, for `render` to show. truth: in degrees and per cent."""
+    """Player of bags to the node, with the node's answers for `render`. truth: in degrees and per cent."""
 
     def __init__(self, paths: Sequence[Path], truth: Mapping[str, float]) -> None:
         self._truth = truth
@@ -61,12 +61,12 @@ class Watcher:
         self._shown_why = ""
 
     def run(self, speed: float, switch_at_s: float, switch_to: str, back_at_s: float) -> None:
-        """Play everything; set parameter model to switch_to at one time and back to auto at another (s)."""
+        """Play everything. Set parameter model to switch_to at switch_at_s, and back to auto at back_at_s."""
         executor = SingleThreadedExecutor()
         executor.add_node(self._node)
 
         def spin() -> None:
-            with suppress(ExternalShutdownException):  # Ctrl-C ends the demo, not with a traceback
+            with suppress(ExternalShutdownException):  # Ctrl-C ends the demo without a traceback
                 executor.spin()
 
         spinning = threading.Thread(target=spin, daemon=True)
@@ -88,7 +88,7 @@ class Watcher:
             self._node.destroy_node()
 
     def _wait_until_at_most(self, waiting: int, sent: Mapping[str, int]) -> None:
-        """Until no more than so many messages of a topic wait in the node, by what it says of itself."""
+        """Wait until at most `waiting` messages of a topic wait in the node, by its own counts."""
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             received = (int(self._diagnostics.get(key, 0)) for key in RECEIVED.values())
@@ -111,7 +111,7 @@ class Watcher:
             self._events.append(f"{self._time:6.1f} s  {why}")
 
     def render(self) -> Any:
-        """What is known now, for a rich display."""
+        """Return the current state for a rich display."""
         table = Table(title=f"{self._time:6.1f} s", title_justify="left")
         for column in ("", "truth", "estimate", "± 1σ"):
             table.add_column(column, justify="right", no_wrap=True, min_width=9)

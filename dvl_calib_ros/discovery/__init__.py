@@ -1,1 +1,1 @@
-"""What is in a bag: which topics the calibration needs, where the sensors sit, and in which frames they measure."""
+"""Discovery of topics, mounting and frames in a bag."""

@@ -1,7 +1,7 @@
-"""Which clocks of a recording are off, by how much, and what a calibration has to take off for it.
+"""Clock offsets of a recording, and the corrections for a calibration.
 
-Frames are found by comparing velocities of one time, and clocks by turning velocities with the right frames. So clocks
-are registered with the frames found; where these leave much, with the others that there may be.
+Finding frames needs velocities of the same time, and finding clock offsets needs the right frames. So clocks are
+registered with the discovered frames and, if the residual is large, with the other possible ones.
 """
 
 from __future__ import annotations
@@ -28,22 +28,23 @@ from ..recordings.topic_preview import Look, Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason
 
-# A registration that leaves less than this share of the speed is one (17 degrees of misalignment); another reading of
-# the frames is taken for it if it leaves less than this share of what the first one leaves.
+# A registration is valid below this residual, as a share of the speed (17 degrees of misalignment). Another reading of
+# the frames replaces the first one if its residual is below this share of the first's.
 REGISTERED, CLEARLY = 0.3, 0.5
-# Of a stream one sample in so long is registered, ns.
+# sampling interval of the registered streams, ns
 EVERY_NS = {Stream.DVL: 100_000_000, Stream.REFERENCE: 100_000_000, Stream.IMU: 50_000_000}
-# What a clock of the DVL's that drifts or leaps is told by.
+# parameters for a drift or step of the DVL's clock
 MOVING = frozenset({"dvl_clock_drift", "dvl_time_jump", "dvl_time_jump_at"})
-# Samples of the DVL that are compared to find frames: no more tell more.
+# number of DVL samples compared to find frames; more do not improve the result
 COMPARED = 1500
 
 
 @dataclass(frozen=True)
 class FoundClocks:
-    """registration: of the streams. offsets: by parameter, what is to be taken off, s, beside what it says already.
+    """Clock offsets of the streams.
 
-    far: clocks too far apart to be registered. parameters: the frames that it holds with.
+    offsets: by parameter, value to subtract, s, in addition to the configured one. far: clocks with offsets too large
+    to be registered. parameters: the frames used.
     """
 
     registration: Registration
@@ -53,7 +54,7 @@ class FoundClocks:
 
     @property
     def doubt(self) -> Reason | None:
-        """What no calibration can be done with."""
+        """Reason why no calibration is possible with these clocks."""
         if self.far is not None:
             return self.far.reason
         moves = self.registration.unsteady
@@ -61,40 +62,40 @@ class FoundClocks:
         return moves.reason if moves is not None and is_left else self.registration.not_told_apart
 
     def says(self) -> Iterator[str]:
-        """Of each clock that is off how late it is, and what comes of it; one sentence each."""
+        """Yield one sentence per clock with an offset: its delay, and the treatment."""
         r = self.registration
         if r.unsteady is not None and not self.doubt:
             taken = ", ".join(f"{name} {self.offsets[name]:.13g}" for name in sorted(MOVING & self.offsets.keys()))
-            yield f"{r.unsteady.reason.says}: taken off ({taken})"
+            yield f"{r.unsteady.reason.says}: subtracted ({taken})"
         for name, late in r.offsets.items():
             if name in self.offsets:
-                done = f"taken off ({name} {late:.2f})"
+                done = f"subtracted ({name} {late:.2f})"
             elif name == "dvl_time_offset" and abs(late) < LEFT_TO_CALIBRATION_S:
-                done = "left to the calibration, which finds it"
+                done = "left to the calibration, which estimates it"
             else:
                 done = "not taken off"
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
             yield f"{r.told(name).says}{which}: {done}"
         if r.apart.is_shown and not (r.offsets or self.doubt):
             yield (
-                f"stamps of DVL and reference are {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s apart; the data do "
-                f"not show whose clock is off: drive turns at two speeds"
+                f"stamps of DVL and reference differ by {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s; the data do "
+                f"not show whose clock is wrong: drive turns at two speeds"
             )
 
 
 def find_clocks(
     recording: Recording, topics: Topics, parameters: Parameters, *, knows_mounting: bool, given: frozenset[str]
 ) -> FoundClocks | None:
-    """How the clocks stand; None where the recording does not show it, or they differ from one recording to another.
+    """Find the clock offsets; None if they are not observable, or differ between recordings.
 
-    knows_mounting: whether mounting_rpy is more than a guess. given: parameters that the user named, which stand.
+    knows_mounting: whether mounting_rpy is more than a guess. given: parameters that the user set, which are kept.
     """
     if topics.gnss not in recording.columns or topics.dvl not in recording.columns:
         return None
-    each = [_found(one, topics, parameters, knows_mounting, given) for one in recording.each]
+    each = [_find_in_recording(one, topics, parameters, knows_mounting, given) for one in recording.each]
     first = each[0]
     if len(each) > 1 and any(one is not None and one.offsets.keys() & MOVING for one in each):
-        return None  # of each recording another
+        return None  # drift or step differ between recordings
     if first is None or any(one is None for one in each):
         return None
     for one in each[1:]:
@@ -105,13 +106,13 @@ def find_clocks(
     return first
 
 
-def _found(
+def _find_in_recording(
     recording: Recording, topics: Topics, parameters: Parameters, knows_mounting: bool, given: frozenset[str]
 ) -> FoundClocks | None:
     best: tuple[Registration, Parameters] | None = None
     epoch_ns, left = 0, math.inf
     for hypothesis in _hypotheses(parameters, given):
-        motion = _motion(recording, topics, hypothesis)
+        motion = _streams_to_register(recording, topics, hypothesis)
         if motion is None:
             continue
         rotation = hypothesis.rotation_dvl_from_body
@@ -122,8 +123,8 @@ def _found(
         mounting = rotation.T if knows_mounting or is_first else None
         found = register(motion, mounting, np.array(hypothesis.lever_arm))
         if found is not None and (best is None or found.left < CLEARLY * best[0].left):
-            best, epoch_ns, left = (found, hypothesis), motion.epoch_ns, _beside_noise(found, motion)
-        if is_first and found is not None and _beside_noise(found, motion) < REGISTERED:
+            best, epoch_ns, left = (found, hypothesis), motion.epoch_ns, _residual_without_noise(found, motion)
+        if is_first and found is not None and _residual_without_noise(found, motion) < REGISTERED:
             recording.register_as(found, topics, parameters)
             break
     if best is None or left >= REGISTERED:
@@ -135,14 +136,14 @@ def _found(
     return FoundClocks(registration, offsets, hypothesis)
 
 
-def _beside_noise(found: Registration, motion: MotionStreams) -> float:
-    """What a registration leaves beside the reference's own noise, as a share of the speed."""
+def _residual_without_noise(found: Registration, motion: MotionStreams) -> float:
+    """Return the residual of a registration without the reference's noise, as a share of the speed."""
     noise = 3.0 * white_noise(motion.reference) / max(found.speed, 1e-9) ** 2
     return math.sqrt(max(found.left**2 - noise, 0.0))
 
 
 def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Parameters]:
-    """The frames found, then the others that nobody named."""
+    """Yield the discovered frames, then the alternatives to those that the user did not set."""
     yield parameters
     frames = (parameters.gnss_frame,) if "gnss_frame" in given else ("enu", "ned", "body")
     imus = [(parameters.imu_rpy, parameters.imu_frame)]
@@ -152,12 +153,12 @@ def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Param
         yield parameters.replace(gnss_frame=frame, imu_rpy=rpy, imu_frame=world)
 
 
-def _motion(recording: Recording, topics: Topics, parameters: Parameters) -> MotionStreams | None:
-    """What is registered: of fast streams so much that memory does not grow with their rates."""
+def _streams_to_register(recording: Recording, topics: Topics, parameters: Parameters) -> MotionStreams | None:
+    """Return the streams to register, thinned so that memory does not grow with their rates."""
     own = recording.of_types(topics, parameters)
     named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
     parts = [
-        Streams(*(_some(block) for block in stretch.streams))
+        Streams(*(_one_per_interval(block) for block in stretch.streams))
         for stretch in recording.stretches(named, MessageDecoder(own))
     ]
     if not parts:
@@ -165,19 +166,19 @@ def _motion(recording: Recording, topics: Topics, parameters: Parameters) -> Mot
     return motion_of(Streams(*(one.joined(*others) for one, *others in zip(*parts, strict=True))), own)
 
 
-def _some(block: SampleBlock) -> SampleBlock:
-    """The first sample of every so long."""
+def _one_per_interval(block: SampleBlock) -> SampleBlock:
+    """Return one sample per interval of `EVERY_NS`."""
     bins = block.stamps_ns // EVERY_NS[block.stream]
     return block.part(np.flatnonzero(np.diff(bins, prepend=-1)))
 
 
 def in_time(recording: Recording, topics: Topics, found: Registration) -> Survey:
-    """The three streams as they would be stamped by the IMU's clock."""
+    """Return the three streams with stamps of the IMU's clock."""
     seen = recording.whole(topics)
     late = {topics.dvl: found.dvl.late, topics.gnss: found.reference.late}
     if not found.is_turned:
         late = {topics.dvl: found.apart.late}
-    # what the log says of their clocks does not count any more
+    # the clock offset by arrival times no longer applies
     looks = {
         name: replace(look, stamps_s=look.stamps_s - late.get(name, 0.0), ahead_s=0.0)
         for name, look in seen.looks.items()
@@ -194,7 +195,7 @@ def _thinned(look: Look) -> Look:
 
 
 def difference_of(dvl: Look, reference: Look) -> float | None:
-    """What no rotation explains of the difference of two velocities, both taken as in the body."""
+    """Return the residual of two velocities after the best rotation, both taken in the body frame."""
     motion = compared_motion(dvl, reference, None)
     if motion is None:
         return None
@@ -203,7 +204,7 @@ def difference_of(dvl: Look, reference: Look) -> float | None:
 
 
 def compared_motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStreams | None:
-    """What was looked at, as messages have it; None where there is too little."""
+    """Return the previewed samples as motion streams, in the messages' own axes; None if there are too few."""
     columns = ImuColumns(np.zeros(0), np.zeros((0, 4)), np.zeros((0, 3)))
     if imu is not None and imu.has_orientation:
         columns = imu_columns_of(imu)

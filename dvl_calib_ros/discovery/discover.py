@@ -1,6 +1,6 @@
-"""What a recording says of itself: topics, mounting, lever arm and frames, so that a calibration needs no options.
+"""Discovery of topics, mounting, lever arm and frames in a recording, so that a calibration needs no options.
 
-What the user gives always stands. What is found is said, with its source; nothing is changed silently.
+Values set by the user are always kept. Discovered values are reported with their source.
 """
 
 from __future__ import annotations
@@ -50,26 +50,27 @@ from .frame_choice import FrameChoice, FrameChooser, declared_reference
 from .gravity import Gravity, believed_heading
 from .transforms import FrameTree, Placed
 
-# A rotation found in the data below this is a misalignment, to be calibrated; above, the mounting is another one.
+# a smaller rotation in the data is a misalignment to calibrate; a larger one is another mounting
 OTHER_MOUNTING = math.radians(12.0)
-# Of a vehicle that goes ahead, the mean velocity has at least this share of the speed.
+# smallest ratio of mean velocity to speed for a vehicle that drives ahead
 STRAIGHT_SHARE = 0.7
-# Root mean square of the better nine tenths of normal errors in three axes, as a share of that of all.
+# rms of the smaller nine tenths of normal errors on three axes, as a share of the full rms
 TRIMMED = 0.85
-# A noise (m/s) that no reference is below, and how many times too much one may claim, or too little: by its own
-# differences from sample to sample, which at a lower rate (Hz) are the waves'.
+# Smallest noise (m/s) of any reference, and the factors by which a reference may claim too much or too little, judged
+# by its differences between samples; below the rate (Hz) these contain waves.
 QUIETEST, CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE, WHITE_FROM_HZ = 0.01, 3.0, 2.0, 3.0
-# ... and one that sends velocities: so much that it would be rejected for agreeing too well (verification.IMPLAUSIBLE).
-# A filter of the DVL does as well, and is no noisier from sample to sample; a reference so many times noisier is none.
+# Factor for a reference of velocities: beyond it the agreement would be rejected as implausible
+# (verification.IMPLAUSIBLE). A filter that uses the DVL also agrees that well, but its noise between samples is no
+# larger; a reference noisier by the second factor is independent.
 CLAIMS_FAR_TOO_MUCH, NOISIER = 4.0, 1.5
-# Standard deviation from which on a DVL's claim says nothing, m/s
+# a DVL's claimed standard deviation from here on is no information, m/s
 SAYS_NOTHING = math.sqrt(NOT_MEASURED_VARIANCE)
-# Of two readings of the DVL's axes that both fit, the other is taken if it leaves less than this share.
+# of two fitting readings of the DVL's axes, the other is used if its residual is below this share
 BETTER = 0.8
 
 
 def discover(recording: Recording | Sequence[Path], parameters: Parameters, given: Given | None = None) -> Discovery:
-    """Look into a recording for what is not given. Raises InputError for named topics that are not there."""
+    """Discover everything that is not given. Raises InputError for named topics that do not exist."""
     if not isinstance(recording, Recording):
         recording = open_recording(recording, parameters=parameters)
     if not recording.types:
@@ -80,7 +81,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
     if clocks is None:
         return found
     if clocks.registration.offsets:
-        # frames are told by velocities of one time
+        # finding frames needs velocities of the same time
         seen = in_time(recording, found.topics, clocks.registration)
         seen = replace(seen, topics=recording.survey.topics, counts=recording.survey.counts)
         topics = found.topics
@@ -102,7 +103,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
 
 
 class _Search:
-    """One search; what it finds is collected on the way."""
+    """One search; the findings are collected in attributes."""
 
     def __init__(self, seen: Survey, parameters: Parameters, given: Given, where: str) -> None:
         self._seen, self._parameters, self._given, self._where = seen, parameters, given, where
@@ -114,7 +115,7 @@ class _Search:
         self._contradictions: list[Reason] = []
         self._mounting_because = ""
         self._chosen: Agreement | None = None
-        self._readings: Readings  # of DVL and reference, once these are compared
+        self._readings: Readings  # of DVL and reference, set when they are compared
 
     def run(self) -> Discovery:
         topics = self._topics()
@@ -135,8 +136,6 @@ class _Search:
             self._knows_imu(imu),
             mounting_because=self._mounting_because,
         )
-
-    # ------------------------------------------------------------------ topics
 
     def _topics(self) -> Topics:
         given, default = self._given, Topics()
@@ -191,23 +190,21 @@ class _Search:
             parts.append(f"{role} {name} ({kind.split('/')[-1]}{frame}{rate})")
         return "; ".join(parts)
 
-    # ------------------------------------------------------------------ frames
-
-    def _gives(self, name: str) -> bool:
+    def _is_given(self, name: str) -> bool:
         return name in self._given.parameters
 
     def _frames(self, dvl: Look, reference: Look | None, imu: Look | None) -> None:
         placed = self._place_dvl(dvl)
-        known = self._parameters.rotation_dvl_from_body.T if self._gives("mounting_rpy") else None
+        known = self._parameters.rotation_dvl_from_body.T if self._is_given("mounting_rpy") else None
         if known is None and placed is not None:
             known = placed.rotation
         imu_placed = None if imu is None else self._tree.placed(imu.frame_id, self._parameters.base_frame)
         if placed is None and imu_placed is not None:
-            self._take_base(imu_placed.base)
+            self._use_base(imu_placed.base)
         base = self._values.get("base_frame", self._parameters.base_frame)
         frames = FrameChooser(self._parameters, self._given.parameters, base, dvl, placed, imu, imu_placed)
         chosen = None
-        if dvl.claimed_std >= SAYS_NOTHING and not self._gives("use_message_covariance"):
+        if dvl.claimed_std >= SAYS_NOTHING and not self._is_given("use_message_covariance"):
             self._values["use_message_covariance"] = False
             self._found.append(
                 f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which says nothing and is not used "
@@ -216,18 +213,18 @@ class _Search:
         if reference is not None:
             chosen = self._fit(frames, dvl, reference, imu, known, placed)
         taken = frames.imu if chosen is None else chosen.imu
-        self._take_base_axes(taken is not None and taken.z_down)
+        self._use_base_axes(taken is not None and taken.z_down)
         turned = frames.dvl_is_turned(self._is_z_down)
         if chosen is not None and reference is not None:
             agreement = self._chosen = chosen.agreement
             turned = agreement.reading.turned
             self._contradictions += chosen.says
-            self._take(agreement, known, reference, imu)
+            self._use_reading(agreement, known, reference, imu)
             self._measure_noise(agreement, known, dvl, reference)
         elif reference is None:
             self._mounting_from_motion(dvl, turned, known)
         if taken is not None:
-            self._take_imu(taken.frame)
+            self._use_imu(taken.frame)
         parameters = self._parameters.replace(base_axes=FRD if self._is_z_down else FLU)
         if parameters.dvl_axes == FROM_MESSAGE and turned != turns_dvl(
             VELOCITY_TYPES[dvl.msgtype], dvl.frame_id, parameters
@@ -235,36 +232,36 @@ class _Search:
             axes = self._values["dvl_axes"] = FRD if turned != self._is_z_down else FLU
             which = "forward-right-down" if axes == FRD else "forward-left-up"
             self._found.append(f"the DVL's data are taken {which} (dvl_axes {axes})")
-        if known is not None and not self._gives("mounting_rpy"):
+        if known is not None and not self._is_given("mounting_rpy"):
             self._values["mounting_rpy"] = tuple(rpy_from_rotation(known).tolist())
         if placed is not None and placed.source:
             self._place_lever_arm(placed, reference)
-        if reference is not None and not (_is_located(placed) or self._gives("lever_arm")):
+        if reference is not None and not (_is_located(placed) or self._is_given("lever_arm")):
             self._found.append(
-                f"lever arm {in_metres(self._parameters.lever_arm)} m: no transform of {dvl.frame_id!r} says where the "
-                "DVL sits; half a metre turns the yaw by tenths of a degree (-p lever_arm:=[x,y,z])"
+                f"lever arm {in_metres(self._parameters.lever_arm)} m: no transform of {dvl.frame_id!r} has the "
+                "position of the DVL; half a metre changes the yaw by tenths of a degree (-p lever_arm:=[x,y,z])"
             )
-        self._know_position(placed, reference)
+        self._set_position(placed, reference)
         if imu is not None:
-            self._know_heading(imu)
-            self._look_at_gravity(imu)
+            self._use_claimed_heading(imu)
+            self._check_gravity(imu)
 
     @property
     def _is_z_down(self) -> bool:
         return str(self._values.get("base_axes", self._parameters.base_axes)) == FRD
 
-    def _take_base_axes(self, z_down: bool) -> None:
-        """Say it where base_frame is forward-right-down, and nobody set that."""
+    def _use_base_axes(self, z_down: bool) -> None:
+        """Set base_axes if base_frame is forward-right-down and the user did not set them."""
         if z_down and not self._parameters.is_z_down:
             self._values["base_axes"] = FRD
             base = self._values.get("base_frame", self._parameters.base_frame)
             self._found.append(
-                f"{base} is taken forward-right-down, as the IMU's attitude and its transform have it: mounting and "
+                f"{base} is forward-right-down by the IMU's attitude and its transform: mounting and "
                 "lever arm are in these axes (base_axes frd)"
             )
 
-    def _look_at_gravity(self, imu: Look) -> None:
-        """Say where acceleration and orientation contradict what the IMU's data are taken for."""
+    def _check_gravity(self, imu: Look) -> None:
+        """Report contradictions of acceleration and orientation with the assumed convention of the IMU."""
         gravity, taken = Gravity.of(imu.values[:, :4], imu.values[:, 7:]), self._parameters.replace(**self._values)
         if gravity is not None and (
             found := gravity.contradiction(
@@ -273,10 +270,10 @@ class _Search:
         ):
             self._contradictions.append(found)
 
-    def _know_heading(self, imu: Look) -> None:
-        """How far the heading is to be believed, where the IMU says it."""
+    def _use_claimed_heading(self, imu: Look) -> None:
+        """Set the heading accuracy that the IMU claims."""
         std = believed_heading(imu.claimed_std)
-        if self._gives("heading_deviation_std") or std is None:
+        if self._is_given("heading_deviation_std") or std is None:
             return
         self._values["heading_deviation_std"] = std
         self._found.append(
@@ -284,23 +281,23 @@ class _Search:
             f"(-p heading_deviation_std:={std:.2g})"
         )
 
-    def _know_position(self, placed: Placed | None, reference: Look | None) -> None:
-        """Say what is known of the DVL's position in the body, which the lever arm alone is not."""
-        if self._gives("dvl_position"):
+    def _set_position(self, placed: Placed | None, reference: Look | None) -> None:
+        """Set the knowledge about the DVL's position in the body, which needs more than the lever arm."""
+        if self._is_given("dvl_position"):
             return
-        told = _is_located(placed) and not self._gives("lever_arm")
+        told = _is_located(placed) and not self._is_given("lever_arm")
         at = None if reference is None else self._known_reference_position(reference)
-        if self._gives("reference_position"):
+        if self._is_given("reference_position"):
             at = np.array(self._parameters.reference_position)
         if at is not None and reference is not None:
             self._values["dvl_position"] = FROM_REFERENCE
-            if at.any() and not self._gives("reference_position"):
+            if at.any() and not self._is_given("reference_position"):
                 self._values["reference_position"] = tuple((at + 0.0).tolist())
         elif told:
             self._values["dvl_position"] = TOLD
 
     def _known_reference_position(self, reference: Look) -> Array | None:
-        """Where in the body the reference point is; None if nothing says."""
+        """Return the position of the reference point in the body; None if unknown."""
         placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
         if placed is not None and _is_located(placed):
             return placed.position
@@ -323,11 +320,11 @@ class _Search:
             if placed is not None:
                 self._notes.append(finding("FRAME_NOT_IN_TREE", frame=frame, other=placed.frame))
         if placed is not None:
-            self._take_base(placed.base)
+            self._use_base(placed.base)
         return placed
 
-    def _take_base(self, base: str) -> None:
-        if base != self._parameters.base_frame.strip("/") and not self._gives("base_frame"):
+    def _use_base(self, base: str) -> None:
+        if base != self._parameters.base_frame.strip("/") and not self._is_given("base_frame"):
             self._values["base_frame"] = base
 
     def _is_body_or_earth(self, frame_id: str) -> bool:
@@ -339,7 +336,7 @@ class _Search:
         return declared_reference(reference, self._parameters, base)
 
     def _reference_frame(self, reference: Look | None) -> VelocityFrame | None:
-        """The frame that the reference is taken in; None without one, or if nothing tells."""
+        """Return the assumed frame of the reference; None without one, or if unknown."""
         if reference is None:
             return None
         taken = self._values.get("gnss_frame")
@@ -347,13 +344,13 @@ class _Search:
         return None if said is None else said.frame
 
     def _knows_imu(self, imu: Look | None) -> bool:
-        """Whether it is known how the IMU sits: a transform says so, or DVL and reference agree."""
+        """Return whether the IMU's orientation in the body is known: by a transform, or DVL and reference agree."""
         if imu is None:
             return False
         placed = self._tree.placed(imu.frame_id, self._parameters.base_frame)
         if placed is not None and placed.source:
             return True
-        fit = self._chosen  # a reference in the body agrees whatever the IMU says
+        fit = self._chosen  # a reference in the body frame agrees regardless of the IMU
         return fit is not None and not fit.reading.in_body and fit.best_left < FITS
 
     def _fit(
@@ -373,20 +370,21 @@ class _Search:
         is_known = _is_located(placed) and self._known_reference_position(reference) is not None
         return frames.choose(self._readings, reference, None if known is None else known.T, is_known)
 
-    def _take(
+    def _use_reading(
         self,
         chosen: Agreement,
         known: Array | None,
         reference: Look,
         imu: Look | None,
     ) -> None:
-        """Write what a reading says into the parameters."""
+        """Write the frames and mounting of a reading into the parameters."""
         reading, parameters = chosen.reading, self._parameters
         declared = self._declared_reference(reference)
         if declared is not None and self._is_z_down and declared.points_down:
             declared = DeclaredFrame(VelocityFrame.BODY)
         taken = DECLARED_FRAMES[reading.reference]
-        if imu is None and declared is None and chosen.best_left >= FITS:  # no frame could be tried but the body's
+        # without an attitude only the body frame could be tried
+        if imu is None and declared is None and chosen.best_left >= FITS:
             self._notes.append(finding("REFERENCE_FRAME_NOT_TOLD", topic=reference.topic))
         elif taken != declared:
             name = self._values["gnss_frame"] = taken.name
@@ -407,14 +405,14 @@ class _Search:
                 agree = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)
-                # a roll that a level vehicle hardly shows is none, unless the data need it
+                # a roll that is hardly observable on a level vehicle is set to zero, unless the data need it
                 level = (0.0, *rpy[1:])
                 level_left, *_ = self._readings.registered(reading, rotation_from_rpy(level).T)
                 self._mounting_found(level if BETTER * level_left <= turned_left else rpy, agree)
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
-        """The noise of a reference that claims none, or far too little, or one that its velocities do not have."""
-        if self._gives("gnss_aided_std") or self._gives("use_message_covariance"):
+        """Set the noise of a reference that claims none, far too little, or more than its velocities show."""
+        if self._is_given("gnss_aided_std") or self._is_given("use_message_covariance"):
             return
         says_nothing = "use_message_covariance" in self._values
         if self._readings.beside_noise(chosen.best_left) > FITS:
@@ -422,11 +420,11 @@ class _Search:
         is_position = VELOCITY_TYPES[reference.msgtype].position is not None
         own = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
         too_little = not is_position and own > CLAIMS_TOO_LITTLE * reference.claimed_std
-        # of a lever arm and a delay that are yet to be found a part stays in
+        # part of it is due to lever arm and delay, which are estimated later
         least = 0.5 * chosen.best_left
         per_axis = dvl.speed / (math.sqrt(3.0) * TRIMMED)
         claims = [reference.claimed_std] if is_position else [reference.claimed_std, dvl.claimed_std]
-        claimed = math.hypot(*np.nan_to_num(claims))  # both are in what is predicted
+        claimed = math.hypot(*np.nan_to_num(claims))  # both are part of the predicted residual
         most = claimed / (CLAIMS_TOO_MUCH if is_position else CLAIMS_FAR_TOO_MUCH)
         may_claim_less = is_position or says_nothing or own > NOISIER * math.sqrt(white_noise(dvl.values))
         claims_none = math.isnan(reference.claimed_std)
@@ -449,8 +447,8 @@ class _Search:
             f"(-p gnss_aided_std:={shown:.2g})"
         )
 
-    def _take_imu(self, frame: ImuFrame) -> None:
-        if self._gives("imu_rpy") or self._gives("imu_frame"):
+    def _use_imu(self, frame: ImuFrame) -> None:
+        if self._is_given("imu_rpy") or self._is_given("imu_frame"):
             return
         rpy = tuple((rpy_from_rotation(frame.rotation_body_from_imu) + 0.0).tolist())
         if np.allclose(rpy, 0.0, atol=1e-9) and frame.world == "enu":
@@ -466,9 +464,9 @@ class _Search:
         self._notes.append(mounting_guessed(rpy, why))
 
     def _mounting_from_motion(self, dvl: Look, turned: bool, known: Array | None) -> None:
-        """Without a reference: a vehicle goes ahead, which is what the models without GNSS go by as well.
+        """Guess the mounting without a reference, assuming a vehicle that drives ahead, as the models without GNSS do.
 
-        known: rotation_body_from_dvl (3, 3), None if nothing says it.
+        known: rotation_body_from_dvl (3, 3), None if unknown.
         """
         velocity = dvl.values @ FLU_FROM_FRD if turned else dvl.values
         if not len(velocity):
@@ -481,7 +479,7 @@ class _Search:
         yaw = math.atan2(rotation_dvl_from_body[0, 1], rotation_dvl_from_body[0, 0])
         if known is not None:
             ahead_in_body = known @ mean
-            if abs(ahead_in_body[1]) > abs(ahead_in_body[0]) and not self._gives("mounting_rpy"):
+            if abs(ahead_in_body[1]) > abs(ahead_in_body[0]) and not self._is_given("mounting_rpy"):
                 given, fits = in_degrees(rpy_from_rotation(known)), nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
                 said = {"given": given, "found": in_degrees(fits), "option": as_option(fits)}
                 self._contradictions.append(finding("TRAVELS_SIDEWAYS", **said))
@@ -489,18 +487,18 @@ class _Search:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "where the vehicle goes ahead")
 
     def _reference_position(self, reference: Look) -> Array:
-        """Where in the body the point is whose velocity the reference is."""
+        """Return the position in the body of the point whose velocity the reference measures."""
         placed = self._tree.placed(reference.frame_id, self._parameters.base_frame)
         return np.zeros(3) if placed is None else placed.position
 
     def _place_lever_arm(self, placed: Placed, reference: Look | None) -> None:
-        given_mounting = self._gives("mounting_rpy")
+        given_mounting = self._is_given("mounting_rpy")
         said = [] if given_mounting else [f"mounting {in_degrees(rpy_from_rotation(placed.rotation))}"]
-        if placed.is_located and not self._gives("lever_arm"):
+        if placed.is_located and not self._is_given("lever_arm"):
             position = placed.position
             if reference is not None:
                 position = position - self._reference_position(reference)
-            if np.abs(position).max() <= 100.0:  # the parameter's range; more is a transform in another unit
+            if np.abs(position).max() <= 100.0:  # the parameter's range; a larger value is a transform in another unit
                 self._values["lever_arm"] = tuple((position + 0.0).tolist())
                 said.append(f"lever arm {in_metres(position)} m")
         if said:
@@ -508,5 +506,5 @@ class _Search:
 
 
 def _is_located(placed: Placed | None) -> bool:
-    """Return whether transforms say where a frame sits in the body."""
+    """Return whether transforms define the position of a frame in the body."""
     return placed is not None and bool(placed.source) and placed.is_located

@@ -1,4 +1,4 @@
-"""What discovery gives: topics, parameters and frames to calibrate with, and what was passed over."""
+"""Result of discovery: topics, parameters and frames for the calibration, and skipped alternatives."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .clock_offsets import FoundClocks, find_clocks
 
 @dataclass(frozen=True)
 class Given:
-    """What the user named, which is not looked for: topics (None: not named) and names of parameters."""
+    """Topics (None: not named) and names of parameters that the user set, which are not discovered."""
 
     dvl_topic: str | None = None
     gnss_topic: str | None = None
@@ -30,14 +30,13 @@ class Given:
 
 @dataclass(frozen=True)
 class Discovery:
-    """What to calibrate with.
+    """Discovered configuration.
 
-    found: what was found and where, in sentences; notes: what was passed over; contradictions: where the recording's
-    data do not bear out what it declares. values: the parameters that were found, which are in `parameters`. agreement:
-    how well DVL and reference agree, None if that could not be tried. reference_frame: that the reference is taken in.
-    knows_imu: whether it is known in which axes the IMU measures. mounting_because: why the mounting is what it is,
-    where it is guessed from the data; else ''. clocks_given: the parameters of clocks of which more is taken off in
-    `parameters`, as they were before.
+    found: findings with their sources, in sentences. notes: skipped alternatives. contradictions: contradictions
+    between the recording's data and its declarations. values: discovered parameters, which are included in
+    `parameters`. agreement: of DVL and reference, None if it could not be computed. reference_frame: assumed frame of
+    the reference. knows_imu: whether the IMU's axes are known. mounting_because: reason for a mounting guessed from the
+    data; else ''. clocks_given: clock parameters before the offsets in `parameters` were added.
     """
 
     topics: Topics
@@ -55,11 +54,11 @@ class Discovery:
 
     @property
     def diagnosed(self) -> Parameters:
-        """The parameters with clocks as they were given: what a calibration takes off them a diagnosis names."""
+        """The parameters with the original clocks: a diagnosis names the offsets that a calibration subtracts."""
         return self.parameters.replace(**self.clocks_given)
 
     def with_mounting(self, rpy: Sequence[float]) -> Discovery:
-        """The same where a calibration has found a better mounting (rad) than the one that was guessed."""
+        """Replace a guessed mounting by the better one (rad) that a calibration found."""
         before, roll_pitch_yaw = self.parameters.mounting_rpy, tuple(map(float, rpy))
         if not self.mounting_because or roll_pitch_yaw == before:
             return self
@@ -73,11 +72,11 @@ class Discovery:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What the user should not overlook."""
+        """Warnings for the user."""
         return tuple(each.sentence for each in (*self.contradictions, *self.notes))
 
     def document(self) -> dict[str, Any]:
-        """Plain data, for JSON: topics, what was found, doubts."""
+        """Return plain data for JSON: topics, findings, warnings."""
         topics = {"dvl": self.topics.dvl, "gnss": self.topics.gnss, "imu": self.topics.imu}
         return {
             "topics": topics,
@@ -89,8 +88,8 @@ class Discovery:
 
 
 def mounting_guessed(rpy: Sequence[float], why: str) -> Reason:
-    """Return the reason that says that a mounting (rad) is guessed from the data."""
-    # of a level vehicle, a heading that counts from elsewhere looks the same
+    """Return the reason for a mounting (rad) guessed from the data."""
+    # on a level vehicle, a heading with another zero looks the same
     also = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
     return finding("MOUNTING_GUESSED", mounting=in_degrees(rpy), why=why, option=as_option(rpy), also=also)
 
@@ -117,9 +116,9 @@ def clocks_of_recording(recording: Recording, found: Discovery, given: Given) ->
 
 
 def in_time_of(dvl: Look, other: Look | None, parameters: Parameters) -> Look | None:
-    """By stamps as the DVL's clock would have them, where clocks differ by more than any delay that is looked for.
+    """Shift stamps to the DVL's clock if the offset exceeds any delay that is estimated.
 
-    Velocities of different times agree in any frame but the right one; what it says of the clocks the replay says.
+    Velocities of different times agree only in wrong frames. The replay reports the clock offset.
     """
     ahead_s = 0.0 if other is None else other.ahead_s - dvl.ahead_s
     if other is None or abs(ahead_s) <= limit_s(parameters):

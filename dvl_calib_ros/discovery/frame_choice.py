@@ -1,8 +1,8 @@
-"""The frames that a recording's data are in: prior odds by what it declares, likelihood by what its data fit.
+"""Choice of the frames of a recording's data by posterior odds: prior from declarations, likelihood from the fit.
 
 A hypothesis is a `Reading`: axes of base_frame, of the IMU and its world, of the reference, of the DVL. Its prior is
-the product of the odds of each contradiction of what names, transforms, message types, gravity and an odometry's own
-pose say. Its likelihood is that of the residual of DVL and reference, see `frame_hypotheses`.
+the product of the odds of each contradiction to names, transforms, message types, gravity and an odometry's own pose.
+Its likelihood is that of the residual of DVL and reference, see `frame_hypotheses`.
 """
 
 from __future__ import annotations
@@ -46,47 +46,47 @@ from .discovery import as_option, in_degrees
 from .gravity import Gravity
 from .transforms import Placed
 
-# Prior odds of what contradicts a declaration, as their logarithm. A transform of the IMU that its driver does not
-# keep to is the commonest of these errors, a whole vehicle that is z down without saying so the rarest.
+# Log prior odds of contradictions to declarations. The most common error is an IMU whose driver does not follow its
+# transform; the rarest is a whole vehicle that is z down without declaring it.
 IMU_IN_NED, IMU_IN_OTHER_WORLD, IMU_OTHERWISE = math.log(1 / 10), math.log(1 / 20), math.log(1 / 50)
 DVL_AXES_OTHER = math.log(1 / 20)
-# Where no transform says anything, marine axes are nearly as common as REP-103's.
+# without transforms, marine axes are nearly as common as REP-103's
 UNPLACED_IN_NED = math.log(1 / 4)
-# A transform or parameter of the mounting that is wrong; a mounting nobody says that is not as the body; one upside
-# down, which is the same as other axes.
+# a wrong transform or parameter of the mounting; an undeclared mounting that differs from the body's axes; one upside
+# down, which is equivalent to other axes
 MOUNTING_OTHER, MOUNTING_TURNED, UPSIDE_DOWN = math.log(1 / 50), math.log(1 / 3), math.log(1 / 100)
 BASE_Z_DOWN, UNPLACED_BASE_Z_DOWN = math.log(1 / 50), math.log(1 / 500)
 REFERENCE_FRAME_OTHER = math.log(1 / 200)
 REFERENCE_AXES_OTHER = math.log(1 / 50)
-# Of a reference that declares no frame: ENU, the body, NED; other worlds.
+# a reference without a declared frame: ENU, the body, NED; other worlds
 UNDECLARED = {"enu": 0.0, "body": math.log(1 / 2), FRD: math.log(1 / 2), "ned": math.log(1 / 3)}
 OTHER_WORLD = math.log(1 / 50)
-# Axes of a twist that its own turn rates or its pose's world contradict; its own pose, which shows them.
+# axes of a twist that contradict its own turn rates or its pose's world; that contradict the motion of its pose
 TWIST_RATES_OTHER, TWIST_POSE_OTHER = math.log(1 / 20), math.log(1 / 1000)
-# A vehicle travels ahead or astern, seldom sideways.
+# a vehicle travels ahead or astern, seldom sideways
 SIDEWAYS = math.log(1 / 50)
-# An accelerometer of which the sign is wrong; gravity that points down in the body or in the world alone.
+# an accelerometer with the wrong sign; gravity that points down in the body or in the world alone
 GRAVITY_INVERTED, GRAVITY_CONTRADICTS = math.log(1 / 100), math.log(1 / 1000)
-# Readings whose odds at a first look are this much worse (log) than the best are not registered; at most so many are.
+# readings whose log odds at first are this much worse than the best are not registered; limit of their number
 FAR_WORSE, MOST_REGISTERED = 8.0, 6
-# Two readings within these odds fit as well, rad and log.
+# two readings within these odds (log) are equally likely; mountings within this angle (rad) are equal
 AS_LIKELY, SAME_ANSWER = math.log(2.0), math.radians(1.0)
-# Lever arms of transforms are good to this (1 σ, m); an arm that is wrong costs no more (chi-square).
+# accuracy of lever arms in transforms (1 σ, m); largest penalty for a wrong arm (chi-square)
 ARM_STD_M, MOST_OF_ARM = 0.1, 12.0
-# A mounting whose z is down by this (cosine) is upside down; between, its roll is not shown.
+# a mounting whose z points down by this (cosine) is upside down; in between, its roll is not observable
 OVER = -0.9
-# A mounting is not as the body from here on, rad.
+# smallest rotation (rad) of a mounting that differs from the body's axes
 TURNED_FROM = math.radians(12.0)
-# Over this time (s) a twist is held against the way of its own pose.
+# interval (s) over which a twist is compared with the motion of its own pose
 POSE_STEP_S, POSE_LONGEST_S = 0.5, 1.5
 
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """The reading that is taken.
+    """The chosen reading.
 
-    agreement: how well it fits. imu: its hypothesis of the IMU. says: what is doubtful of it, as another reading that
-    fits as well and gives another mounting.
+    agreement: its fit. imu: its hypothesis of the IMU. says: doubts, such as another reading that fits equally well
+    with another mounting.
     """
 
     agreement: Agreement
@@ -95,7 +95,7 @@ class FrameChoice:
 
 
 class ImuHypothesis(NamedTuple):
-    """A hypothesis of the IMU. z_down: of the body under it; prior: log odds."""
+    """A hypothesis of the IMU. z_down: whether the body is z down under it. prior: log odds."""
 
     frame: ImuFrame
     z_down: bool
@@ -104,7 +104,7 @@ class ImuHypothesis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Tried:
-    """A reading with a mounting: rotation_dvl_from_body (3, 3), None for the one that fits. prior: log odds."""
+    """A reading with a mounting: rotation_dvl_from_body (3, 3), None for the best-fitting one. prior: log odds."""
 
     agreement: Agreement
     mounting: Array | None
@@ -112,18 +112,18 @@ class _Tried:
 
     @property
     def reading(self) -> Reading:
-        """Its reading."""
+        """The reading."""
         return self.agreement.reading
 
     @property
     def left(self) -> float:
-        """What it leaves, as a share of the speed, but for a misalignment."""
+        """Residual as a share of the speed, without the part that a misalignment explains."""
         of_best, known = self.agreement.rotation_dvl_from_body, self.mounting
         is_misaligned = known is not None and angle_between(of_best, known) < TURNED_FROM
         return self.agreement.best_left if is_misaligned else self.agreement.left
 
     def odds(self, found: Array) -> float:
-        """Return the prior with that of the mounting (3, 3) that fits, where none is known, and of the travel."""
+        """Return the log prior including travel direction and, if no mounting is known, the fitted mounting (3, 3)."""
         prior = self.prior + (0.0 if self.agreement.is_ahead else SIDEWAYS)
         if self.mounting is None and angle_between(found, np.eye(3)) > TURNED_FROM:
             prior += UPSIDE_DOWN if found[2, 2] < OVER else MOUNTING_TURNED
@@ -131,7 +131,7 @@ class _Tried:
 
 
 class FrameChooser:
-    """Frames of one recording's streams."""
+    """Chooser of the frames of one recording's streams."""
 
     def __init__(
         self,
@@ -143,7 +143,7 @@ class FrameChooser:
         imu: Look | None,
         imu_placed: Placed | None,
     ) -> None:
-        """given: names of parameters that the user set."""
+        """Set up. given: names of parameters that the user set."""
         self._parameters, self._given, self._base_frame = parameters, given, base_frame
         self._dvl, self._dvl_placed = dvl, dvl_placed
         self._imu, self._imu_placed = imu, imu_placed
@@ -152,10 +152,8 @@ class FrameChooser:
 
     @property
     def imu(self) -> ImuHypothesis | None:
-        """The likeliest hypothesis of the IMU by its own data alone."""
+        """Most likely hypothesis of the IMU by its own data alone."""
         return max(self.imus, key=lambda each: each.prior, default=None)
-
-    # ------------------------------------------------------------------ priors
 
     @property
     def _says_z_down(self) -> bool:
@@ -191,7 +189,7 @@ class FrameChooser:
             if "base_axes" in self._given and z_down != self._parameters.is_z_down:
                 continue
             if z_down and frame.world == IMU_NED and frame.rotation_body_from_imu is at:
-                prior = 0.0  # the world of a vehicle that is z down
+                prior = 0.0  # world of a vehicle that is z down
             elif z_down:
                 prior += IMU_IN_OTHER_WORLD
             if z_down != self._says_z_down:
@@ -204,7 +202,7 @@ class FrameChooser:
         return found
 
     def _body_is_z_down(self, frame: ImuFrame) -> bool:
-        """Whether z of the body points down under a hypothesis of the IMU, by its attitude."""
+        """Return whether the body's z points down under a hypothesis of the IMU, by its attitude."""
         assert self._imu is not None
         quaternion = unit_quaternions(self._imu.values[:, :4])
         known = np.isfinite(quaternion).all(axis=1)
@@ -214,13 +212,13 @@ class FrameChooser:
         return bool(up @ frame.rotation_body_from_imu.T[:, 2] < 0.0)
 
     def dvl_is_turned(self, z_down: bool) -> bool:
-        """Whether the DVL's data are to be turned to the axes of base_frame, as frame, transform and type declare."""
+        """Return whether frame, transform and type declare DVL axes that must be converted to those of base_frame."""
         p, frame_id = self._parameters, self._dvl.frame_id.lower()
         if p.dvl_axes != FROM_MESSAGE:
             return (p.dvl_axes == FRD) != z_down
         if frame_id.endswith(("_frd", "_flu")):
             return frame_id.endswith("_frd") != z_down
-        # a frame whose z points down, as the sensor's own does, is that of the driver's axes and not REP-103's
+        # a transform with z down describes the driver's own axes instead of REP-103's
         placed = self._dvl_placed
         driver_axes = placed is not None and placed.rotation[2, 2] < 0.0 and "mounting_rpy" not in self._given
         return VELOCITY_TYPES[self._dvl.msgtype].is_turned(self._dvl.frame_id) and not driver_axes and not z_down
@@ -230,7 +228,7 @@ class FrameChooser:
         return self._parameters.dvl_axes != FROM_MESSAGE or self._dvl.frame_id.lower().endswith(("_frd", "_flu"))
 
     def _reference_priors(self, reference: Look, imu: ImuHypothesis | None) -> dict[str, float]:
-        """Log odds of the frames that a reference may be in, by name."""
+        """Return the log odds of the frames that a reference may be in, by name."""
         z_down = self._says_z_down if imu is None else imu.z_down
         declared = declared_reference(reference, self._parameters, self._base_frame)
         if self._parameters.gnss_frame != FROM_FRAME_ID and declared is not None:
@@ -256,23 +254,20 @@ class FrameChooser:
         return priors
 
     def _points_down(self, reference: Look, imu: ImuHypothesis | None) -> bool:
-        """Whether a twist is forward-right-down, by how it says that it turns, else by its pose's world."""
+        """Return whether a twist is forward-right-down, by its turn rates or else by its pose's world."""
         if self._imu is not None and imu is not None and reference.rates is not None:
             turns = turns_right(reference.stamps_s, reference.rates, imu_columns_of(self._imu), imu.frame)
             if turns is not None:
                 return turns
-        world = frame_named(reference.world, ())  # of the pose: a body in NED is forward-right-down by custom
+        world = frame_named(reference.world, ())  # of the pose: by custom a body in NED is forward-right-down
         return reference.world != reference.frame_id and world is not None and world.frame is VelocityFrame.NED
-
-    # ------------------------------------------------------------------ posterior
 
     def choose(
         self, readings: Readings, reference: Look, mounting: Array | None, arm_is_known: bool
     ) -> FrameChoice | None:
-        """Return the likeliest reading; None if none can be tried.
+        """Return the most likely reading; None if none can be evaluated.
 
-        mounting: rotation_dvl_from_body (3, 3), None if it is not known. arm_is_known: whether transforms say the
-        lever arm.
+        mounting: rotation_dvl_from_body (3, 3), None if unknown. arm_is_known: whether transforms define the lever arm.
         """
         priors: dict[Reading, float] = {}
         as_declared: dict[Reading, bool] = {}
@@ -292,9 +287,9 @@ class FrameChooser:
         declared_frame = declared_reference(reference, self._parameters, self._base_frame)
         in_earth = declared_frame is not None and declared_frame.frame is not VelocityFrame.BODY
         if not found or (in_earth and all(each.reading.in_body for each in found)):
-            return None  # what is declared cannot be tried without an attitude, and stands
+            return None  # without an attitude the declaration cannot be tested and is kept
         tried = [_Tried(each, mounting, priors[each.reading]) for each in found]
-        if mounting is not None:  # or it is wrong, and the DVL's axes are as declared
+        if mounting is not None:  # or the mounting is wrong, and the DVL's axes are as declared
             free = readings.agreements([each for each in priors if each.turned == as_declared[each]], None)
             tried += [
                 _Tried(each, None, priors[each.reading] + MOUNTING_OTHER)
@@ -330,7 +325,8 @@ class FrameChooser:
         for rival in alike:
             one, other = (self._options(each.reading, imus[each.reading]) for each in (best, rival))
             other_axes = any(one[name] != other[name] for name in ("dvl_axes", "base_axes"))
-            in_body = best.reading.in_body and rival.reading.in_body  # where the IMU's frame turns the lever arm alone
+            # in which the IMU's frame affects only the lever arm
+            in_body = best.reading.in_body and rival.reading.in_body
             if other_axes or (
                 not in_body
                 and angle_between(fits[best].rotation_dvl_from_body, fits[rival].rotation_dvl_from_body) > SAME_ANSWER
@@ -348,7 +344,7 @@ class FrameChooser:
         return FrameChoice(best.agreement, imus[best.reading], says)
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
-        """A reading as values of parameters."""
+        """Return a reading as values of parameters."""
         z_down = self._says_z_down if imu is None else imu.z_down
         return {
             "base_axes": FRD if z_down else FLU,
@@ -359,13 +355,13 @@ class FrameChooser:
 
 
 def _arm_odds(fit: Registered) -> float:
-    """Return the log odds of the lever arm of a fit, where transforms give another."""
+    """Return the log odds of a fit's lever arm, if transforms define another."""
     variance = ARM_STD_M**2 + fit.arm_std**2
     return -0.5 * min(float((fit.arm**2 / variance).sum()), MOST_OF_ARM)
 
 
 def declared_reference(reference: Look, parameters: Parameters, base_frame: str) -> DeclaredFrame | None:
-    """Return the frame that a reference declares; None if it says nothing."""
+    """Return the frame that a reference declares; None if none."""
     if parameters.gnss_frame != FROM_FRAME_ID:
         return DECLARED_FRAMES[parameters.gnss_frame]
     of_type = VELOCITY_TYPES[reference.msgtype].reference_frame
@@ -375,7 +371,7 @@ def declared_reference(reference: Look, parameters: Parameters, base_frame: str)
 
 
 def twist_axes(look: Look) -> str | None:
-    """Return the frame of an odometry's twist by the way of its own pose, as gnss_frame; None if that does not show.
+    """Return the frame of an odometry's twist by the motion of its pose, as gnss_frame; None if not observable.
 
     Its pose p, R moves by the twist v: dp = R v dt if v is in the axes of the pose's body.
     """

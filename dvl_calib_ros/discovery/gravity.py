@@ -1,7 +1,7 @@
-"""Gravity against an IMU's orientation, and the uncertainty that its messages claim of the heading.
+"""Check of gravity against an IMU's orientation, and the heading accuracy that its messages claim.
 
-At rest an accelerometer shows what holds against gravity: upwards, and so it stays on a vehicle whose own accelerations
-average out. Turned by the orientation it must point up in the world that the orientation is of.
+At rest an accelerometer measures the reaction to gravity, which points up; on a vehicle its own accelerations average
+out. Rotated by the orientation, the mean must point up in the orientation's world.
 """
 
 from __future__ import annotations
@@ -15,20 +15,23 @@ from ..calibration.numerics.frames import Array, rotation_from_quaternion
 from ..calibration.streams.screening import unit_quaternions
 from ..verdict.reasons import Reason, finding
 
-# Fewer samples, and an acceleration below this (m/s²), tell nothing.
+# fewer samples, or a smaller acceleration (m/s²), are no information
 ENOUGH, LEAST = 20, 0.2
-# Gravity in its two units, and how far a mean may be from it, as a share.
+# gravity in its two units, and the relative tolerance of a mean
 STANDARD, NEAR = 9.81, 0.15
-# Up is up, and down is down, from this share of gravity on.
+# smallest share of gravity for a clear direction
 CLEARLY = 0.5
-# A quaternion is taken for inverted where that leaves less than half, of a tilt (rad, rms) of this and more; so large
-# an angle from up in the mean is no vehicle's.
+# A quaternion counts as inverted if inversion halves a tilt (rad, rms) of at least the first value. A mean angle from
+# up above the second (rad) is impossible for a vehicle.
 TILTED, LEANS = math.radians(1.0), math.radians(8.0)
 
 
 class Gravity(NamedTuple):
-    """Means: size (m/s²); body (3,) in the IMU's axes and world (3,) in those of its orientation's world, as shares of
-    it. across, inverted: rms of what is across the vertical, as a share, as given and with quaternions inverted."""
+    """Mean acceleration of an IMU, compared with gravity.
+
+    size: m/s². body (3,) in the IMU's axes and world (3,) in its orientation's world, relative to size. across,
+    inverted: rms of the component across the vertical, relative, with given and with inverted quaternions.
+    """
 
     size: float
     body: Array
@@ -38,8 +41,7 @@ class Gravity(NamedTuple):
 
     @staticmethod
     def of(orientation: Array, acceleration: Array) -> Gravity | None:
-        """Of an IMU's quaternions (N, 4) x, y, z, w and accelerations (N, 3) m/s²; None where it gives one of them to
-        no message, or to too few."""
+        """Compute from quaternions (N, 4) x, y, z, w and accelerations (N, 3) m/s²; None if too few have both."""
         quaternion = unit_quaternions(orientation)
         use = np.isfinite(quaternion).all(axis=1) & np.isfinite(acceleration).all(axis=1)
         size = float(np.linalg.norm(acceleration[use].mean(axis=0))) if np.count_nonzero(use) >= ENOUGH else 0.0
@@ -51,7 +53,7 @@ class Gravity(NamedTuple):
         return Gravity(size, a.mean(axis=0), world.mean(axis=0), *across)
 
     def contradicts(self, rotation_body_from_imu: Array, world: str, z_down: bool) -> int:
-        """How many of the two, the body's up and the world's, are down if an IMU's data are meant so.
+        """Return how many of the body's and the world's up direction point down under a convention (0, 1 or 2).
 
         z_down: whether the body is forward-right-down.
         """
@@ -60,7 +62,7 @@ class Gravity(NamedTuple):
     def contradiction(
         self, topic: str, rotation_body_from_imu: Array, world: str, z_down: bool = False
     ) -> Reason | None:
-        """What is wrong with how the data of an IMU's topic are taken."""
+        """Return the contradiction between gravity and an assumed convention of the IMU's data."""
         body_up, up = self._up_in_body(rotation_body_from_imu, z_down), self._up(world)
         if body_up < -CLEARLY and up < -CLEARLY:
             return finding("GRAVITY_SIGN", topic=topic)
@@ -85,11 +87,11 @@ class Gravity(NamedTuple):
         return float(self.world[2]) * (-1.0 if world == "ned" else 1.0)
 
 
-# What an IMU claims of its heading (rad) is believed between these: few are as good as the first, and one that claims
-# more than the second says that it does not know.
+# Limits of a believed heading σ (rad): few IMUs are better than the first, and one that claims more than the second
+# does not know its heading.
 BEST_HEADING, WORST_HEADING = math.radians(0.1), math.radians(10.0)
 
 
 def believed_heading(claimed_std: float) -> float | None:
-    """`heading_deviation_std` (rad) by a claimed σ of the heading (rad, nan for none); None where that says nothing."""
+    """Return `heading_deviation_std` (rad) for a claimed σ of the heading (rad or nan); None if not informative."""
     return float(f"{max(claimed_std, BEST_HEADING):.2g}") if claimed_std <= WORST_HEADING else None

@@ -1,4 +1,4 @@
-"""Which topic is the DVL's, the reference's and the IMU's: by type, by name, and by what is on it."""
+"""Choice of the DVL's, the reference's and the IMU's topic, by type, name and content."""
 
 from __future__ import annotations
 
@@ -17,54 +17,54 @@ if TYPE_CHECKING:
 
 NONE = "none"
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
-# Satellites first, then what knows its motion otherwise. A simulator's truth is as good as either.
+# Satellites first, then other navigation systems. A simulator's truth is equivalent to either.
 GNSS_WORDS = ("gnss", "gps", "navsat", "rtk", "ublox", "septentrio", "novatel", "fix", "nmea")
 TRUTH_WORDS = (
     "truth", "pose_gt", "p3d", "mocap", "motion_capture", "qualisys", "optitrack", "vicon", "vrpn", "natnet"
 )  # fmt: skip
 INS_WORDS = ("ins", "spatial", "sbg", "phins", "xsens", "mti", "vectornav", "microstrain", "navigation", "rovins")
-# What is made from the DVL proves nothing about it; what is commanded is not measured.
-# Poses are sent by all that navigates, with the DVL in it: only those of these are measured.
+# Velocities derived from the DVL prove nothing about it, and commands are not measured. Navigation systems that use the
+# DVL also send poses; only poses with these names are measured.
 ACOUSTIC_WORDS = ("usbl", "ssbl", "sbl", "lbl", "acoustic", "hipap", "ugps", "underwater_gps")
 DERIVED_WORDS = (
     "filtered", "ekf", "ukf", "fused", "dead_reckoning", "deadreckoning", "calibrated", "dvl_calibration",
     "local_position", "estimate",
 )  # fmt: skip
 COMMAND_WORDS = ("cmd", "command", "setpoint", "desired", "target", "goal", "joy", "teleop", "thrust", "current")
-# A vehicle that nowhere reaches this speed does not move; m/s.
+# a vehicle that never reaches this speed does not move, m/s
 MOVES_FROM = 0.02
-# Two velocities that differ by less than this share of the speed were made from each other.
+# two velocities that differ by less than this share of the speed were derived from each other
 SAME_SHARE = 1e-4
 
 Difference = Callable[["Look", "Look"], "float | None"]
-"""DVL and reference -> what no rotation can explain of their difference, as a share of the speed; None: unknown."""
+"""DVL and reference -> residual of their difference after the best rotation, as a share of the speed; None: unknown."""
 
 
 def _has(look: Look, words: Iterable[str]) -> bool:
-    """Whether its name or frame holds one of these words; short ones only as a part of their own."""
-    return _names(f"{look.topic} {look.frame_id}", words)
+    """Return whether a topic's name or frame has one of these words; short words only as a separate part."""
+    return _contains_word(f"{look.topic} {look.frame_id}", words)
 
 
-def _names(text: str, words: Iterable[str]) -> bool:
+def _contains_word(text: str, words: Iterable[str]) -> bool:
     text = text.lower()
     parts = set(re.split(r"[^a-z0-9]+", text))
     return any(word in parts or (len(word) > 3 and word in text) for word in words)
 
 
 def may_be_dvl(topic: str, msgtype: str) -> bool:
-    """Whether a topic is of a type that only DVLs send, or named as a DVL's that nobody has computed."""
-    if _names(topic, (*DERIVED_WORDS, *COMMAND_WORDS)):
+    """Return whether a topic's type or name is a DVL's, and its name suggests no derived data."""
+    if _contains_word(topic, (*DERIVED_WORDS, *COMMAND_WORDS)):
         return False
-    return msgtype in DVL_TYPES and (msgtype not in REFERENCE_TYPES or _names(topic, DVL_WORDS))
+    return msgtype in DVL_TYPES and (msgtype not in REFERENCE_TYPES or _contains_word(topic, DVL_WORDS))
 
 
 def is_derived(look: Look) -> bool:
-    """Whether a velocity looks as if the DVL's were in it, or as if nobody had measured it."""
+    """Return whether a velocity seems to be derived from the DVL, or commanded."""
     return _has(look, (*DERIVED_WORDS, *COMMAND_WORDS))
 
 
 def checked_topic(option: str, name: str, kinds: Sequence[str], survey: Survey, where: str) -> str:
-    """A topic that was named, as the recording spells it. Raises InputError if it is not there or of another type."""
+    """Return a named topic as spelled in the recording. Raises InputError if it is missing or of another type."""
     present = survey.topics
     there = spelled(name, present)
     wanted = set(kinds)
@@ -84,7 +84,7 @@ def checked_topic(option: str, name: str, kinds: Sequence[str], survey: Survey, 
 
 
 def choose_dvl(survey: Survey, default: str, where: str) -> str:
-    """The DVL's topic. Raises InputError if nothing in the recording is one."""
+    """Return the DVL's topic. Raises InputError if there is none."""
     present = survey.topics
     standard = spelled(default, present)
     if standard is not None and present[standard] in DVL_TYPES:
@@ -97,18 +97,18 @@ def choose_dvl(survey: Survey, default: str, where: str) -> str:
         velocities = [look for look in looks if not _has(look, (*GNSS_WORDS, *TRUTH_WORDS)) and not is_derived(look)]
         if len(velocities) == 1 and len(looks) > 1:
             return velocities[0].topic
-        unlisted = [name for name in survey.field_maps if not _names(name, (*DERIVED_WORDS, *COMMAND_WORDS))]
-        unlisted.sort(key=lambda name: not _names(f"{name} {present[name]}", DVL_WORDS))
+        unlisted = [name for name in survey.field_maps if not _contains_word(name, (*DERIVED_WORDS, *COMMAND_WORDS))]
+        unlisted.sort(key=lambda name: not _contains_word(f"{name} {present[name]}", DVL_WORDS))
         fields = "".join(f", or read {name} with --dvl-fields {survey.field_maps[name]}" for name in unlisted[:1])
         raise InputError(f"{where}: no topic looks like a DVL's; name it with --dvl-topic{fields}. {_listing(survey)}")
     order = list(DVL_TYPES)
-    # a driver that sends several forms sends the plain one, the raw type, in full
+    # of several forms of one velocity, prefer the plain type, then the raw one
     order.sort(key=lambda name: (name in REFERENCE_TYPES, name != TWIST_TYPE))
     return min(found, key=lambda look: (order.index(look.msgtype), not look.speed, -look.count, look.topic)).topic
 
 
 def is_another_dvl(look: Look, dvl: Look) -> bool:
-    """Whether a topic is that of a second DVL, by its type or name, and by its frame."""
+    """Return whether a topic is a second DVL's, by its type or name, and by its frame."""
     own_frame = any(word in look.frame_id.lower() for word in DVL_WORDS)
     is_one = look.msgtype in DVL_TYPES and (look.msgtype not in REFERENCE_TYPES or own_frame)
     moves = look.speed >= MOVES_FROM and not is_derived(look)
@@ -116,7 +116,7 @@ def is_another_dvl(look: Look, dvl: Look) -> bool:
 
 
 def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[Reason]:
-    """What to say of DVLs beside the one that is calibrated."""
+    """Return the notes on DVLs that are not calibrated here."""
     look = survey.looks.get(dvl)
     if look is None:
         return []
@@ -129,7 +129,7 @@ def other_dvls(survey: Survey, dvl: str, difference: Difference) -> list[Reason]
 
 
 def choose_reference(survey: Survey, default: str, dvl: str, difference: Difference) -> tuple[str | None, list[Reason]]:
-    """The reference's topic, or None; and what was passed over."""
+    """Return the reference's topic, or None; and notes on rejected topics."""
     standard = spelled(default, survey.topics)
     if standard is not None and survey.topics[standard] in REFERENCE_TYPES:
         return standard, []
@@ -166,14 +166,14 @@ def choose_reference(survey: Survey, default: str, dvl: str, difference: Differe
 
 
 def _rank(look: Look) -> float:
-    """Of two forms of one velocity the one with a covariance goes first, and positions last."""
+    """Return the sort key of forms of one velocity: with a covariance first, positions last."""
     if REFERENCE_TYPES[look.msgtype].position is not None:
         return 2.0
     return 0.0 if look.msgtype == TWIST_TYPE else 1.0
 
 
 def choose_imu(survey: Survey, default: str, reference: str = "") -> str | None:
-    """The IMU's topic, or None. reference: that topic, whose poses may hold orientations."""
+    """Return the IMU's topic, or None. reference: its topic, whose poses may have orientations."""
     standard = spelled(default, survey.topics)
     of_poses = reference + ORIENTATION
     if standard is not None and survey.topics[standard] == IMU_TYPE and of_poses not in survey.topics:
@@ -197,5 +197,5 @@ def _listing(survey: Survey) -> str:
 
 
 def wanted_types(role: str) -> Sequence[str]:
-    """Message types that a role's topic may have."""
+    """Return the message types that a role's topic may have."""
     return {"dvl": list(DVL_TYPES), "gnss": list(REFERENCE_TYPES), "imu": [IMU_TYPE]}[role]

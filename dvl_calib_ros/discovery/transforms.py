@@ -16,16 +16,16 @@ from ..errors import InputError
 from ..files.urdf import parse_urdf
 from ..verdict.reasons import Reason, finding
 
-# Frames above the vehicle, which are no place to mount a sensor on.
+# frames above the vehicle, on which no sensor is mounted
 EARTH_NAMES = ("map", "odom", "world", "earth", "enu", "ned", "utm")
-# A chain of more transforms than this is a circle.
+# a longer chain of transforms is a circle
 LONGEST_CHAIN = 100
 
 
 class Placed(NamedTuple):
-    """A frame in another. rotation: (3, 3) ``rotation_base_from_frame``. position: (3,) m, in the base.
+    """A frame's pose in another. rotation: (3, 3) ``rotation_base_from_frame``. position: (3,) m, in the base.
 
-    is_located: whether the position is known as well; it is not of a joint in a URDF whose origin has rpy alone.
+    is_located: whether the position is known; a URDF joint whose origin has only rpy does not define it.
     """
 
     base: str
@@ -38,14 +38,14 @@ class Placed(NamedTuple):
 
 @dataclass
 class FrameTree:
-    """Fixed transforms, by child. Names without a leading slash."""
+    """Tree of fixed transforms, by child. Names have no leading slash."""
 
     _parents: dict[str, tuple[str, Array, Array, str]] = field(default_factory=dict)
     problems: list[Reason] = field(default_factory=list)
 
     @staticmethod
     def of(transforms: Iterable[Any], descriptions: Iterable[str]) -> FrameTree:
-        """From messages (geometry_msgs/TransformStamped) and texts of URDFs; a transform of the former goes first."""
+        """Build from messages (geometry_msgs/TransformStamped), which take precedence, and texts of URDFs."""
         tree = FrameTree()
         for text in descriptions:
             tree._add_urdf(text)
@@ -75,7 +75,7 @@ class FrameTree:
                 self._parents[_plain(joint.child)] = (_plain(joint.parent), rotation, position, "/robot_description")
 
     def as_urdf(self, description: str = "") -> str:
-        """Return a description (URDF) with the transforms of /tf_static as further fixed joints."""
+        """Return a description (URDF) with the transforms of /tf_static as additional fixed joints."""
         from html import escape
 
         joints = [
@@ -94,7 +94,7 @@ class FrameTree:
         return set(self._parents)
 
     def named(self, frame_id: str) -> str | None:
-        """The frame as the tree spells it: with or without a namespace before the link's name; None if unknown."""
+        """Return the frame as spelled in the tree, with or without a namespace; None if unknown."""
         name = _plain(frame_id)
         known = {*self._parents, *(parent for parent, *_ in self._parents.values())}
         if name in known:
@@ -104,7 +104,7 @@ class FrameTree:
         return same[0] if len(same) == 1 else None
 
     def base(self, frame: str, wanted: str) -> str | None:
-        """The body above a frame: `wanted`, with any namespace; else the highest that is no earth frame."""
+        """Return the body above a frame: `wanted`, with any namespace; else the highest that is no earth frame."""
         name = frame
         above: list[str] = []
         while name in self._parents and len(above) < LONGEST_CHAIN:
@@ -118,7 +118,7 @@ class FrameTree:
         return vehicle[-1] if vehicle else None
 
     def placed(self, frame_id: str, base_frame: str) -> Placed | None:
-        """Where a frame sits in the body; None if the transforms do not lead from one to the other."""
+        """Return the pose of a frame in the body; None if the transforms do not connect them."""
         frame = self.named(frame_id)
         if frame is None:
             return None
@@ -136,7 +136,7 @@ class FrameTree:
         return Placed(base, frame, rotation, position if is_located else np.zeros(3), source, is_located)
 
     def likely(self, words: Iterable[str]) -> str | None:
-        """The one frame whose name holds one of these words, for a frame_id that the tree does not have."""
+        """Return the only frame whose name has one of these words, for a frame_id that is not in the tree."""
         found = [frame for frame in sorted(self._parents) if any(word in frame.lower() for word in words)]
         return found[0] if len(found) == 1 else None
 
@@ -153,13 +153,15 @@ def _same(frame: str, base: str) -> bool:
     return frame.rsplit("/", 1)[-1] == _plain(base).rsplit("/", 1)[-1]
 
 
-# The range of parameter lever_arm, m: more is a transform in another unit.
+# range of parameter lever_arm, m; a larger value is a transform in another unit
 FARTHEST = 100.0
 
 
 class Frames(NamedTuple):
-    """frame_ids of the streams' messages, '' where none has come. points_down: the DVL's data are
-    forward-right-down. reference_in_body: the reference is the velocity of the body's own frame.
+    """frame_ids of the streams' messages, '' before the first one.
+
+    points_down: the DVL's data are forward-right-down. reference_in_body: the reference measures the velocity of the
+    body frame's origin.
     """
 
     dvl: str
@@ -170,20 +172,20 @@ class Frames(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """Values of parameters that transforms give, and what to say of them."""
+    """Parameters from transforms, and a sentence that describes them."""
 
     values: dict[str, Any]
     said: str
 
 
 def not_default(parameters: Parameters) -> frozenset[str]:
-    """Names of the parameters that somebody has set to another value than the default."""
+    """Return the names of parameters with another value than the default."""
     default = Parameters()
     return frozenset(name for name in default.as_dict() if getattr(parameters, name) != getattr(default, name))
 
 
 def placement(tree: FrameTree, frames: Frames, parameters: Parameters, given: Collection[str]) -> Placement | None:
-    """What transforms say of mounting_rpy, lever_arm and imu_rpy, unless given; None if they do not place the DVL."""
+    """Return mounting_rpy, lever_arm and imu_rpy from transforms, unless given; None if they do not place the DVL."""
     placed = tree.placed(frames.dvl, parameters.base_frame)
     if placed is None or not placed.source:
         return None
@@ -194,7 +196,7 @@ def placement(tree: FrameTree, frames: Frames, parameters: Parameters, given: Co
         said.append("mounting " + " ".join(f"{math.degrees(angle):.4g}°" for angle in values["mounting_rpy"]))
         is_drivers = frames.points_down and placed.rotation[2, 2] < 0.0 and not parameters.is_z_down
         if is_drivers and parameters.dvl_axes == FROM_MESSAGE:
-            values["dvl_axes"] = FLU  # the transform is of the driver's own axes, which the data are in
+            values["dvl_axes"] = FLU  # the transform describes the driver's own axes, in which the data are
     if "lever_arm" not in given and placed.is_located:
         reference = tree.placed(frames.reference, parameters.base_frame) if frames.reference else None
         at = np.zeros(3) if reference is None else reference.position

@@ -1,1 +1,1 @@
-"""Files on disk: read whole and of a size that they have, written whole or not at all, YAML as ROS 2 takes it."""
+"""Atomic writing of files, reading with a size limit, and YAML as ROS 2 parses it."""

@@ -1,4 +1,4 @@
-"""Files that are always the old or the new one, whole, whatever happens while they are written."""
+"""Atomic replacement of files: a reader sees the old or the new file, never a part."""
 
 from __future__ import annotations
 
@@ -20,53 +20,54 @@ from typing import NamedTuple
 
 from ..errors import InputError
 
-# How long one writer waits for another in the same folder, s; after that it goes on, and leaves the tidying to others.
+# Longest wait for another writer in the same folder. After it the file is written, but old backups are not tidied.
 PATIENCE_S = 5.0
 _PREFIX = ".dvl_calib."
 _TEMPORARY, _STRANDED = ".tmp", ".bak"
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Keep = Callable[[Sequence[Path]], Sequence[Path]]
-"""Which of the files before, newest first, are kept as backups, in the same order."""
+"""Select the previous files that are kept as backups; newest first, in and out."""
 
 
 def newest_only(before: Sequence[Path]) -> Sequence[Path]:
-    """Keep the file before, as ``.bak``."""
+    """Keep only the last file, as ``.bak``."""
     return before[:1]
 
 
 def save_text(path: Path, text: str) -> None:
-    """Write a text as `save_bytes` does."""
+    """Write a text atomically, as `save_bytes`."""
     save_bytes(path, text.encode())
 
 
 def save_bytes(path: Path, content: bytes, keep: Keep = newest_only) -> None:
-    """Write a file so that it is always the old or the new one, whole; the old one is kept as ``.bak``.
+    """Write a file atomically and keep the previous one as ``.bak``.
 
-    One of this process's own streams, such as /dev/stdout, is written to instead.
+    An own stream of this process, such as /dev/stdout, is written to directly.
 
     Parameters
     ----------
-    path: Where to; a link stays a link, and what it leads to is replaced.
-    content: All of the file.
-    keep: Which of the files before are kept; by default the last. If several, they are ``.bak``, ``.bak.2``, ...
+    path: Destination. A link stays a link; the file that it points to is replaced.
+    content: The whole file.
+    keep: Selects the previous files to keep as ``.bak``, ``.bak.2``, ...; by default the last one.
 
     Raises
     ------
-    InputError: If it cannot be written; then the old file is untouched and no other is left.
+    InputError: If it cannot be written; the old file is then unchanged and no temporary file remains.
 
     """
     save_all({path: content}, keep)
 
 
 def save_all(contents: Mapping[Path, bytes], keep: Keep = newest_only) -> None:
-    """Write files that belong together as `save_bytes` does. If one of them cannot be written, all are as before."""
+    """Write several files as `save_bytes`. If one cannot be written, none is changed."""
     path = Path()
     try:
         with ExitStack() as stack:
             saves: dict[Path, _Save] = {}
             alone: dict[Path, bool] = {}
-            for path, content in contents.items():  # all that takes space, before anything is replaced
+            # everything that needs disk space happens before the first replacement
+            for path, content in contents.items():
                 stream = own_stream(path)
                 if stream is not None:
                     _write_stream(stream, content)
@@ -74,9 +75,9 @@ def save_all(contents: Mapping[Path, bytes], keep: Keep = newest_only) -> None:
                 target = _target(path)
                 if target.parent not in alone:
                     alone[target.parent] = stack.enter_context(_locked(target.parent))
-                saves[path] = stack.enter_context(_prepared(target, content))
+                saves[path] = stack.enter_context(_prepared_save(target, content))
             try:
-                for path in saves:  # named if it fails
+                for path in saves:  # the error message names this path
                     os.replace(saves[path].temporary, saves[path].target)
             except BaseException:
                 for save in saves.values():
@@ -84,14 +85,14 @@ def save_all(contents: Mapping[Path, bytes], keep: Keep = newest_only) -> None:
                 raise
             for save in saves.values():
                 _tidy(save, keep, alone[save.target.parent])
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: an impossible file name
         full = isinstance(error, OSError) and error.errno in NO_SPACE
         remedy = "free some space, or name a file on another disk" if full else "name another place"
-        raise InputError(f"{path}: could not be written ({_why(error)}); {remedy}") from error
+        raise InputError(f"{path}: could not be written ({_error_text(error)}); {remedy}") from error
 
 
 def check_writable(path: Path) -> None:
-    """Raise InputError if a file could not be written there, before work is done for it."""
+    """Raise InputError if a file cannot be written to this path."""
     try:
         if own_stream(path) is not None:
             return
@@ -105,11 +106,11 @@ def check_writable(path: Path) -> None:
         where = (
             f"the folder {Path(os.path.realpath(path)).parent} is not writable" if "\0" not in str(path) else "no name"
         )
-        raise InputError(f"{path}: {where} ({_why(error)}); name another") from error
+        raise InputError(f"{path}: {where} ({_error_text(error)}); name another") from error
 
 
 def check_folder_writable(path: Path) -> None:
-    """Raise InputError if a folder could not be made there, with those that it lies in, before work is done for it."""
+    """Raise InputError if a folder and its missing parents cannot be created at this path."""
     above = path.parent
     try:
         while not above.exists() and above != above.parent:
@@ -117,17 +118,17 @@ def check_folder_writable(path: Path) -> None:
         with tempfile.TemporaryFile(dir=above):
             pass
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: the folder {above} is not writable ({_why(error)}); name another") from error
+        raise InputError(f"{path}: the folder {above} is not writable ({_error_text(error)}); name another") from error
 
 
 def backup_of(path: Path) -> Path:
-    """Where the file is that `save_bytes` last replaced; beside what a link points to."""
+    """Return the path of the backup that `save_bytes` makes; for a link, next to its target."""
     target = Path(os.path.realpath(path))
     return target.with_name(f"{target.name}.bak")
 
 
 def backups_of(path: Path) -> list[Path]:
-    """Every backup that there is of a file, and the one that the next `save_bytes` will make."""
+    """Return all existing backups of a file and the next one that `save_bytes` will make."""
     target = Path(os.path.realpath(path))
     with suppress(OSError):
         return sorted({backup_of(target), *_backups(target)})
@@ -135,12 +136,12 @@ def backups_of(path: Path) -> list[Path]:
 
 
 def own_stream(path: Path) -> int | None:
-    """The file descriptor of this process that a path names (/dev/stdout, /dev/fd/3), None if it names a file.
+    """Return the file descriptor of this process that a path names (/dev/stdout, /dev/fd/3), else None.
 
-    /dev/null is taken for one, too: -1.
+    /dev/null gives -1.
     """
     here = os.path.abspath(path)
-    for _ in range(40):  # links, as many as the kernel follows
+    for _ in range(40):  # the kernel follows at most 40 links
         folder, name = os.path.split(here)
         folder = os.path.realpath(folder)
         if re.fullmatch(rf"/proc/{os.getpid()}(/task/\d+)?/fd", folder) and name.isdigit():
@@ -152,7 +153,7 @@ def own_stream(path: Path) -> int | None:
     return -1 if here == os.devnull else None
 
 
-def _why(error: OSError | ValueError) -> str:
+def _error_text(error: OSError | ValueError) -> str:
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
@@ -161,12 +162,12 @@ def _write_stream(handle: int, content: bytes) -> None:
         return
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
-            stream.flush()  # what was printed before comes before
+            stream.flush()  # keeps the order of earlier output
     _write(handle, content)
 
 
 def _target(path: Path) -> Path:
-    """Where a file is written: a link stays a link. Raises InputError for what must not be replaced by a file."""
+    """Resolve links to the file to replace. Raises InputError for a folder, a device or another user's link."""
     if path.is_symlink() and path.lstat().st_uid not in (0, os.geteuid()):
         raise InputError(f"{path}: is a link that another user has made; name another file")
     target = Path(os.path.realpath(path))
@@ -179,11 +180,8 @@ def _target(path: Path) -> Path:
     return target
 
 
-# ---------------------------------------------------------------------- the order of a save
-
-
 class _Save(NamedTuple):
-    """A file to be replaced, the hidden one that replaces it, and another name of the one before, if there is one."""
+    """A file to replace, its temporary replacement, and a second name of the previous file, if any."""
 
     target: Path
     temporary: str
@@ -194,7 +192,7 @@ class _Save(NamedTuple):
         return not os.path.exists(self.temporary)
 
     def undo(self) -> None:
-        """Put the file before in its place again."""
+        """Restore the previous file."""
         with suppress(OSError):
             if self.is_done and self.before is None:
                 os.unlink(self.target)
@@ -203,13 +201,13 @@ class _Save(NamedTuple):
 
 
 @contextmanager
-def _prepared(target: Path, content: bytes) -> Iterator[_Save]:
-    """All of a save but the renaming.
+def _prepared_save(target: Path, content: bytes) -> Iterator[_Save]:
+    """Prepare a save: everything except the final rename.
 
-    Until that every failure leaves the old file alone. Killed after it, the file before is stranded under a hidden
-    name, from which the next save takes it.
+    If the process is killed after the rename, the previous file remains under a hidden name, where the next save finds
+    it.
     """
-    with _written_beside(target, content) as temporary:
+    with _temporary_file(target, content) as temporary:
         save = _Save(target, temporary, _second_name(target, temporary) if target.exists() else None)
         try:
             yield save
@@ -220,7 +218,7 @@ def _prepared(target: Path, content: bytes) -> Iterator[_Save]:
 
 
 def _tidy(save: _Save, keep: Keep, is_alone: bool) -> None:
-    """See to the backups; the new file is there."""
+    """Name the backups and remove leftovers, after the rename."""
     with suppress(OSError):
         _rotate(save.target, save.before, keep, is_alone)
     with suppress(OSError):
@@ -231,11 +229,11 @@ def _tidy(save: _Save, keep: Keep, is_alone: bool) -> None:
 
 
 @contextmanager
-def _written_beside(target: Path, content: bytes) -> Iterator[str]:
-    """Name of a hidden file with this content, on the disk; what is left of it in the end is removed."""
+def _temporary_file(target: Path, content: bytes) -> Iterator[str]:
+    """Write a hidden temporary file next to `target`, synced to disk; remove it at the end."""
     handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=_PREFIX, suffix=_TEMPORARY)
     try:
-        with suppress(OSError):  # tells other savers that its writer lives
+        with suppress(OSError):  # tells other writers that this one is alive
             fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
         os.fchmod(handle, stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o644)
         _write(handle, content)
@@ -256,7 +254,7 @@ def _write(handle: int, content: bytes) -> None:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[bool]:
-    """Whether no other process saves in this folder meanwhile. Leaves nothing behind, whatever end it comes to."""
+    """Lock a folder. Yield whether the lock was obtained."""
     handle = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
     try:
         yield _lock(handle, PATIENCE_S)
@@ -278,7 +276,7 @@ def _lock(handle: int, patience_s: float) -> bool:
 
 
 def _second_name(target: Path, temporary: str) -> Path:
-    """Make the file before known under a hidden name, too, which says whose it is."""
+    """Link the previous file to a hidden name that identifies its target."""
     name = target.with_name(f"{_stranded_prefix(target)}{secrets.token_hex(4)}{_STRANDED}")
     try:
         os.link(target, name)
@@ -287,7 +285,7 @@ def _second_name(target: Path, temporary: str) -> Path:
         try:
             shutil.copy2(target, copy)
             _sync(Path(copy))
-            os.replace(copy, name)  # whole, whenever it is seen
+            os.replace(copy, name)  # atomic
         except BaseException:
             with suppress(OSError):
                 os.unlink(copy)
@@ -300,7 +298,7 @@ def _stranded_prefix(target: Path) -> str:
 
 
 def _rotate(target: Path, before: Path | None, keep: Keep, is_alone: bool) -> None:
-    """Give the file before, and what a killed save left of those before it, their names as backups."""
+    """Rename the previous file, and files left by killed saves, to their backup names."""
     stranded = [] if before is None else [before]
     if is_alone:
         found = target.parent.glob(f"{_stranded_prefix(target)}*{_STRANDED}")
@@ -309,7 +307,7 @@ def _rotate(target: Path, before: Path | None, keep: Keep, is_alone: bool) -> No
         return
     inodes = [each.stat().st_ino for each in [*stranded, target]]
     for each in [each for at, each in enumerate(stranded) if inodes[at] in inodes[:at] + inodes[-1:]]:
-        os.unlink(each)  # of a save that was killed before its renaming
+        os.unlink(each)  # left by a save that was killed before its rename
         stranded.remove(each)
     known = _backups(target) if keep is not newest_only else [each for each in [backup_of(target)] if each.exists()]
     kept = keep([*stranded, *known])
@@ -318,11 +316,11 @@ def _rotate(target: Path, before: Path | None, keep: Keep, is_alone: bool) -> No
             os.unlink(each)
     places = dict(zip(kept, map(backup_of(target).with_name, _backup_names(target, len(kept))), strict=True))
     moves = [(each, place) for each, place in places.items() if each != place]
-    # where a file goes, none is that has not gone: those that go up from the last on, then those that go down
+    # move each file only to a free name: upward moves from the last on, then downward moves
     up = [move for move in moves if move[0] in stranded or _number(move[0]) < _number(move[1])]
     for each, place in [*reversed(up), *(move for move in moves if move not in up)]:
         os.replace(each, place)
-        with suppress(FileNotFoundError):  # two names of one file: renaming one to the other does nothing
+        with suppress(FileNotFoundError):  # os.replace between two links of one file does nothing
             os.unlink(each)
 
 
@@ -335,7 +333,7 @@ def _backup_names(target: Path, count: int) -> list[str]:
 
 
 def _backups(target: Path) -> list[Path]:
-    """All backups of a file, the newest first."""
+    """Return all backups of a file, newest first."""
     pattern = re.compile(re.escape(target.name) + r"\.bak(\.[1-9]\d{0,3})?")
     return sorted((each for each in target.parent.iterdir() if pattern.fullmatch(each.name)), key=_number)
 
@@ -346,7 +344,7 @@ def _number(backup: Path) -> int:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove what writers left that were killed. Those that live hold a lock on theirs."""
+    """Remove temporary files of killed writers. Living writers hold a lock on theirs."""
     for path in folder.glob(f"{_PREFIX}*{_TEMPORARY}"):
         with suppress(OSError):
             handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -359,7 +357,7 @@ def _remove_leftovers(folder: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Bring a file or a folder to the disk."""
+    """Flush a file or folder to the disk."""
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     try:
         os.fsync(handle)

@@ -1,4 +1,4 @@
-"""Text files that are read whole, and JSON."""
+"""Size-limited reading of files, and JSON output."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from .atomic import save_text
 
 
 def as_json(document: Any) -> str:
-    """JSON, in which numbers that are not finite are null."""
+    """Format as JSON; numbers that are not finite become null."""
     return json.dumps(_finite(document), indent=1, allow_nan=False) + "\n"
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write JSON, whole or not at all. Raises InputError."""
+    """Write JSON atomically. Raises InputError."""
     save_text(path, as_json(document))
 
 
@@ -31,14 +31,14 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-# A result file has some ten thousand bytes; what is much larger is none, and would take minutes to parse
+# A result file has about 10 kB. A much larger file is not one, and would take minutes to parse.
 LARGEST_FILE = 1 << 22
 
 
 def read_file(path: Path, what: str, largest: int = LARGEST_FILE) -> bytes:
-    """Content of a file that somebody names as `what`.
+    """Read a file. `what` names its kind in errors.
 
-    Raises InputError if it cannot be read, is larger, or is none: a pipe or a device may never answer or never end.
+    Raises InputError if it cannot be read, is too large, or is a pipe or device, which might block forever.
     """
     try:
         handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -53,7 +53,7 @@ def read_file(path: Path, what: str, largest: int = LARGEST_FILE) -> bytes:
             os.close(handle)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"{path}: no such {what}") from None
-    except (OSError, ValueError) as error:  # ValueError: a name that no file can have
+    except (OSError, ValueError) as error:  # ValueError: an impossible file name
         why = (error.strerror if isinstance(error, OSError) else None) or error
         raise InputError(f"{path}: cannot be read as {what} ({why})") from error
     if len(content) > largest:

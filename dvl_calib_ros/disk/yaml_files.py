@@ -1,4 +1,4 @@
-"""YAML, safely loaded, with the numbers and texts that ROS 2 takes for such."""
+"""Safe loading of YAML, with the numbers and texts of ROS 2."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from .text_files import read_file
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """SafeLoader that takes scalars for what rcl's YAML parser does.
+    """A SafeLoader that reads scalars like rcl's YAML parser.
 
-    1e-3 is a number (YAML 1.1 wants 1.0e-3), 2026-05-01 is text (YAML 1.1 has dates). Aliases are refused: a few lines
-    of them that refer to each other stand for more than fits in memory. So is a key that stands twice: ROS takes both
-    sections of a node, PyYAML only the last.
+    1e-3 is a number (YAML 1.1 wants 1.0e-3), 2026-05-01 is text (YAML 1.1 has dates). Aliases are refused: a few nested
+    aliases can expand to more than the memory. Duplicate keys are refused: ROS merges two sections of a node, PyYAML
+    keeps only the last.
     """
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
-        if yaml.__with_libyaml__:  # a quarter of the time, and ROS parses with it as well
+        if yaml.__with_libyaml__:  # four times faster, and ROS uses the same parser
             events = yaml.cyaml.CParser(text)
             self.check_event, self.peek_event = events.check_event, events.peek_event
             self.get_event = events.get_event
@@ -39,13 +39,13 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
             name = (key.tag, key.value)
             if name in lines:
-                problem = f"{key.value!r} stands there twice, first in line {lines[name]}; keep one"
+                problem = f"{key.value!r} is there twice, first in line {lines[name]}; keep one"
                 raise yaml.composer.ComposerError(None, None, problem, key.start_mark)
             lines[name] = key.start_mark.line + 1
         return node
 
 
-# What rcl's parser takes for a number. YAML 1.1 has more: 1:30 is ninety, 1_0 is ten
+# Numbers for rcl's parser. YAML 1.1 has more: 1:30 is ninety, 1_0 is ten.
 _NUMBERS = {
     "int": (r"[-+]?(?:0|[1-9]\d*|0[0-7]+|0x[\da-fA-F]+)$", "-+0123456789"),
     "float": (
@@ -62,7 +62,7 @@ for _name, (_pattern, _first) in _NUMBERS.items():
 
 
 def parse_scalar(text: str) -> Any:
-    """A value as written after ``name:=``; text that is no YAML is text."""
+    """Parse a value as written after ``name:=``. Invalid YAML is returned as text."""
     try:
         return yaml.load(text, Loader=_Loader)  # a SafeLoader
     except (yaml.YAMLError, ValueError, RecursionError):
@@ -70,14 +70,14 @@ def parse_scalar(text: str) -> Any:
 
 
 def compose_yaml(text: str) -> Any:
-    """The nodes of YAML, which know where in the text they stand; of text that `load_yaml` takes."""
+    """Return the YAML nodes with their positions in the text. The text must be valid for `load_yaml`."""
     return yaml.compose(text, Loader=_Loader)  # a SafeLoader
 
 
 def load_yaml(path: Path, what: str, text: str | None = None) -> Any:
-    """Content of a YAML file. Raises InputError naming the file, the line and what the file should have been.
+    """Load a YAML file. Raises InputError with the file, the line and `what` the file should be.
 
-    text: what is to be read instead of what the file holds now.
+    text: content to parse instead of the file's current content.
     """
     content = read_file(path, what) if text is None else None
     try:

@@ -1,1 +1,1 @@
-"""Effects that a simulator lacks and a vehicle has: one class each, in one registry."""
+"""Effects that a vehicle has and a simulator lacks: one class each, in one registry."""

@@ -1,7 +1,7 @@
-"""What an effect is: something the simulator lacks and a vehicle has.
+"""Base classes of effects, which a vehicle has and a simulator lacks.
 
-One class each, in one registry (`EFFECTS`); the same class adds the effect to a simulation and explains it in a
-diagnosis, through one function, `trace`.
+Each effect is a class in the registry (`EFFECTS`). Its `trace` both adds the effect to a simulation and explains it in
+a diagnosis.
 """
 
 from __future__ import annotations
@@ -25,13 +25,12 @@ HOUR_S = 3600.0
 
 @dataclass(frozen=True)
 class EffectInput:
-    """The motion that an effect acts on: the truth in the simulator, the best knowledge of it in the diagnosis.
+    """Motion that an effect acts on: the truth in the simulator, its best estimate in the diagnosis.
 
     time: (N,) s, increasing. velocity_body: (N, 3) m/s over ground of the reference point, forward-left-up.
     rotation_dvl_from_body: (3, 3) T. rotation_enu_from_body: (N, 3, 3). angular_velocity: (N, 3) rad/s, body frame;
-    None where the bag has none. reference_frame: the frame in which the reference velocity was recorded; what delays or
-    filters it there turns with the vehicle only if that is the body. start: s, when the recording began; None: with
-    the first time.
+    None if not recorded. reference_frame: frame in which the reference velocity was recorded; a delay or filter in that
+    frame rotates with the vehicle only if it is the body. start: s, beginning of the recording; None: the first time.
     """
 
     time: Array
@@ -44,53 +43,53 @@ class EffectInput:
 
     @property
     def attitude(self) -> Array:
-        """rotation_enu_from_body, of an effect that needs it. Raises ValueError without."""
+        """rotation_enu_from_body for an effect that needs it. Raises ValueError if missing."""
         if self.rotation_enu_from_body is None:
             raise ValueError("this effect needs the attitude (rotation_enu_from_body)")
         return self.rotation_enu_from_body
 
     @property
     def turn_rate(self) -> Array:
-        """angular_velocity, of an effect that needs it. Raises ValueError without."""
+        """angular_velocity for an effect that needs it. Raises ValueError if missing."""
         if self.angular_velocity is None:
             raise ValueError("this effect needs the angular velocity")
         return self.angular_velocity
 
     @property
     def velocity_dvl(self) -> Array:
-        """(N, 3) m/s in the nominal frame of the DVL."""
+        """Velocity (N, 3) m/s in the nominal frame of the DVL."""
         return self.velocity_body @ self.rotation_dvl_from_body.T
 
     @property
     def speed(self) -> Array:
-        """(N,) m/s."""
+        """Speed (N,) m/s."""
         return np.linalg.norm(self.velocity_body, axis=1)
 
     @property
     def elapsed(self) -> Array:
-        """(N,) s since the start."""
+        """Time since the start (N,) s."""
         return self.time - (self.time[0] if self.start is None else self.start)
 
 
 class EffectNeeds(Enum):
-    """What a recording must hold for an effect to be testable."""
+    """Data that a recording needs for testing an effect."""
 
     ATTITUDE = "attitude"
     ANGULAR_VELOCITY = "angular velocity"
 
 
 class ActsOn(Enum):
-    """Where an effect stands in the order of physics, in which these follow each other.
+    """Stage of an effect in the physical order of measurement, in which the stages follow each other.
 
-    MOTION: the velocity at which the DVL is moved, at the time of measurement. MOUNTING: how the DVL is turned against
-    that, on top of the misalignment φ. DVL: what it makes of it, beside the calibration. DVL_CLOCK: when it says that
-    was. REFERENCE: the simulator takes the trace off the reference velocity. REFERENCE_CLOCK, ATTITUDE_CLOCK: when
-    these say that was. Traces are in the body frame:
+    MOTION: the DVL's velocity at the time of measurement. MOUNTING: the rotation of the DVL in addition to the
+    misalignment φ. DVL: its measurement, in addition to the calibrated errors. DVL_CLOCK: its stamps. REFERENCE: the
+    simulator subtracts the trace from the reference velocity. REFERENCE_CLOCK, ATTITUDE_CLOCK: their stamps. Traces are
+    in the body frame:
 
         u = v + traces on MOTION(v)                 D = (I + diag(δk)) Exp(φ + turns on MOUNTING(u)) T
         v_dvl = D u + T traces on DVL(u)            stamped s + late on DVL_CLOCK
 
-    Within one stage traces, turns and lateness add up. An effect on a clock is a `ClockEffect`, one on the mounting a
+    Within one stage traces, rotations and delays add up. An effect on a clock is a `ClockEffect`, one on the mounting a
     `MountingEffect`; any other an `Effect`.
     """
 
@@ -105,11 +104,11 @@ class ActsOn(Enum):
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """One parameter.
+    """One parameter of an effect.
 
-    typical: size in `unit` that would be worth knowing of. low, high: bounds. default: its value where none is given;
-    an effect with all parameters at their defaults does nothing. linear: the trace is linear in it, the others fixed.
-    said: what it is called before its value and unit, '' where the effect's name says that; None: as its name.
+    typical: a relevant size, in `unit`. low, high: bounds. default: value if not given; an effect with all defaults
+    does nothing. linear: the trace is linear in it, with the others fixed. said: displayed name before value and unit,
+    '' if the effect's name suffices; None: `name`.
     """
 
     name: str
@@ -124,14 +123,14 @@ class EffectParameter:
 
     @property
     def spoken(self) -> str:
-        """What it is called before its value and unit."""
+        """Displayed name before value and unit."""
         return self.name if self.said is None else self.said
 
 
 def along_axes(
     suffix: str, unit: str, typical: float, bound: float, description: str, linear: bool = True
 ) -> tuple[EffectParameter, ...]:
-    """One parameter for each of x, y and z, within ±bound; `{}` in the description is the axis."""
+    """Return a parameter for each of x, y and z, within ±bound; `{}` in the description is the axis."""
     return tuple(
         EffectParameter(
             f"{axis}_{suffix}", unit, typical, -bound, bound, description.format(axis), linear=linear, said=axis
@@ -141,15 +140,15 @@ def along_axes(
 
 
 def vector(values: Mapping[str, float], suffix: str) -> Array:
-    """The three values (3,) of `along_axes`, 0 where not given."""
+    """Return the three values (3,) of `along_axes`, 0 if missing."""
     return np.array([values.get(f"{axis}_{suffix}", 0.0) for axis in "xyz"])
 
 
 class AnyEffect:
-    """What systematic effects and effects on the noise have in common.
+    """Base of systematic effects and of effects on the noise.
 
-    name: as in the documentation. parameters: in the order of `values`. needs: what a recording must hold.
-    confounded_with: effects that some data cannot tell from this one.
+    name: as in the documentation. parameters: in the order of `values`. needs: data that a recording must have.
+    confounded_with: effects that some data cannot distinguish from this one.
     """
 
     name: ClassVar[str]
@@ -168,13 +167,12 @@ class AnyEffect:
 class Effect(AnyEffect, ABC):
     """A systematic effect: the same motion always gives the same trace.
 
-    remedy: what to do about it where it is found, as part of a sentence. manoeuvre: what to fly to see it and tell it
-    from what it is confounded with. of_the_day: whether its size is another in every recording; else it belongs to the
-    vehicle. relative_to_first: whether it is a change against the first of several recordings. bends_arm: whether
-    little of it, left out, moves the lever arm by decimetres, as a clock's delay does beside an arm of metres. again:
-    parameters of a second time that it happens, which is looked for where a first was found -> those of the first.
-    rarer: parameters that are looked for where several recordings ask for them. of_velocity: whether the trace depends
-    on the velocity of the motion.
+    remedy: what to do about it, as part of a sentence. manoeuvre: motion that makes it observable and distinguishes it
+    from confounded effects. of_the_day: whether its size differs per recording; else it belongs to the vehicle.
+    relative_to_first: whether it is a change from the first of several recordings. bends_arm: whether a small omitted
+    size changes the lever arm by decimetres, as a delay does with an arm of metres. again: parameters of a second
+    occurrence, searched after a first was found -> those of the first. rarer: parameters searched only if several
+    recordings need them. of_velocity: whether the trace depends on the velocity of the motion.
     """
 
     remedy: ClassVar[str] = ""
@@ -188,27 +186,27 @@ class Effect(AnyEffect, ABC):
 
     @property
     def usual(self) -> Effect:
-        """The same, without what is rarer."""
+        """The effect without its rarer parameters."""
         return self.without(self.rarer)
 
     @property
     def once(self) -> Effect:
-        """The same, happening once at most."""
+        """The effect without a second occurrence."""
         return self.without(self.again)
 
     @property
     def of_the_vehicle(self) -> Effect:
-        """The same, of one size in all recordings."""
+        """The effect with one size in all recordings."""
         found = copy(self)
         vars(found)["of_the_day"] = False
         return found
 
     def without(self, names: Collection[str]) -> Effect:
-        """The same, without some parameters, which stay at their defaults of 0."""
+        """Return the effect without some parameters, which keep their defaults of 0."""
         if not names:
             return self
         found, defaults = copy(self), self.defaults
-        for name in ("trace", "late", "turn"):  # what it does goes by all parameters, which it may count
+        for name in ("trace", "late", "turn"):  # these methods expect all parameters
             if act := getattr(self, name, None):
                 vars(found)[name] = lambda of, values, act=act: act(of, {**defaults, **values})
         vars(found)["parameters"] = tuple(each for each in self.parameters if each.name not in names)
@@ -216,38 +214,42 @@ class Effect(AnyEffect, ABC):
 
     @property
     def linear(self) -> bool:
-        """Whether the trace is linear in all parameters together."""
+        """Whether the trace is linear in all parameters jointly."""
         return all(parameter.linear for parameter in self.parameters)
 
     @abstractmethod
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """What the effect adds to (DVL velocity - ideal DVL velocity as expected from the reference).
+        """Return the effect's part of (DVL velocity - ideal DVL velocity predicted from the reference).
 
-        values: every parameter by name. (N, 3) m/s in the nominal body frame, at `motion.time`; where it comes in is
-        told by `ActsOn`. An effect on the reference returns minus what it adds to the reference velocity.
+        values: every parameter by name. (N, 3) m/s in the nominal body frame, at `motion.time`; `ActsOn` defines the
+        stage. An effect on the reference returns minus its addition to the reference velocity.
         """
 
 
 class EffectWithMemory(Effect):
-    """An effect whose trace is that of a filter: linear in the velocity, also of the time before a recording began."""
+    """An effect that is a linear filter of the velocity, with memory of the time before a recording."""
 
     @abstractmethod
     def filtered(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
-        """What `trace` is of a velocity (N, 3) m/s, body frame, or of several (N, 3, p)."""
+        """Return `trace` for a velocity (N, 3) m/s, body frame, or for several (N, 3, p)."""
 
     @abstractmethod
     def of_before(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
-        """That part of a velocity (N, 3) m/s, body frame, or of several (N, 3, p), that what the filter has kept of the
-        time before the motion explains, by least squares."""
+        """Return the least-squares part of a velocity that the filter's memory at the start explains.
+
+        velocity: (N, 3) m/s, body frame, or several (N, 3, p).
+        """
 
     def follows(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
-        """A velocity (N, 3) m/s, body frame, or several (N, 3, p), less what is `filtered` of it, less what is
-        `of_before` in that."""
+        """Return a velocity minus its filter response, minus the part of that by the initial memory.
+
+        velocity: (N, 3) m/s, body frame, or several (N, 3, p).
+        """
         left: Array = velocity - self.filtered(motion, velocity, values)
         return left - self.of_before(motion, left, values)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """What the filter adds to the motion's own velocity."""
+        """Return the filter's addition to the motion's own velocity."""
         return self.filtered(motion, motion.velocity_body, values)
 
 
@@ -259,20 +261,20 @@ class ClockEffect(Effect):
 
     @abstractmethod
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """(N,) s by which what is measured at times (N,) s since the start is stamped late."""
+        """Return the delay (N,) s of the stamps of measurements at times (N,) s since the start."""
 
 
 class MountingEffect(Effect):
-    """A systematic effect on how the DVL is turned."""
+    """A systematic effect on the rotation of the DVL."""
 
     acts_on = ActsOn.MOUNTING
 
     @abstractmethod
     def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """(N, 3) rad, or (3,) for all times, that is added to the misalignment φ; `motion` is the DVL's own."""
+        """Return (N, 3) rad, or (3,) for all times, added to the misalignment φ; `motion` is the DVL's own."""
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Tᵀ (Exp(turn) - I) T v: what it adds where there is no other misalignment."""
+        """Return Tᵀ (Exp(turn) - I) T v, the addition without another misalignment."""
         velocity = motion.velocity_dvl
         return (
             Rotation.from_rotvec(self.turn(motion, values)).apply(velocity) - velocity
@@ -280,21 +282,21 @@ class MountingEffect(Effect):
 
 
 Disturbance = Callable[[Array, EffectInput], Array]
-"""Samples (N, 3) m/s of one sensor and the motion at their times -> the samples as they come out."""
+"""Samples (N, 3) m/s of one sensor and the motion at their times -> the disturbed samples."""
 
 
 class NoiseEffect(AnyEffect, ABC):
-    """An effect on the noise: it changes samples by chance, so it has no trace; the diagnosis has tests of its own."""
+    """An effect on the noise. It is random, so it has no trace; the diagnosis has separate tests for it."""
 
     @abstractmethod
     def disturb(
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
-        """Samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, as they come out with the effect."""
+        """Return the samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, with the effect."""
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
-        """The same for samples that come one by one, or few at a time, which are then a continuation of those before.
+        """Return a function for successive batches of samples, each a continuation of the previous ones.
 
-        Raises InputError where that cannot be done.
+        Raises InputError if that is impossible.
         """
         raise InputError(f"effect {self.name}: cannot be made sample by sample; simulate a recorded motion instead")

@@ -1,6 +1,6 @@
-"""Effects together, in the order of physics (`ActsOn`): each acts on what those before it have made of the motion.
+"""Joint application of effects in the physical order of `ActsOn`: each acts on the result of the previous ones.
 
-The simulator goes this way forwards, the diagnosis backwards, from what was measured to the motion; both through here.
+The simulator applies them forwards, the diagnosis backwards from the measurement to the motion; both use this module.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Injection:
 
 
 def traces(injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn) -> Array:
-    """Sum (N, 3) m/s, body frame, of what the systematic effects of one stage add there."""
+    """Return the sum (N, 3) m/s, body frame, of the systematic effects of one stage."""
     total = np.zeros_like(motion.velocity_body)
     for each in injections:
         if isinstance(each.effect, Effect) and each.effect.acts_on is acts_on:
@@ -32,12 +32,12 @@ def traces(injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn
 
 
 def at_dvl(injections: Sequence[Injection], motion: EffectInput) -> EffectInput:
-    """The motion of the DVL itself: that of the reference point with the traces on MOTION."""
+    """Return the DVL's own motion: the reference point's with the traces on MOTION."""
     return replace(motion, velocity_body=motion.velocity_body + traces(injections, motion, ActsOn.MOTION))
 
 
 def turns(injections: Sequence[Injection], motion: EffectInput) -> Array:
-    """(N, 3) rad, or (3,) for all times, by which the mounting is turned on top of φ; motion: of the DVL."""
+    """Return (N, 3) rad, or (3,) for all times, of rotation in addition to φ; motion: of the DVL."""
     total = np.zeros(3)
     for each in injections:
         if isinstance(each.effect, MountingEffect):
@@ -46,7 +46,7 @@ def turns(injections: Sequence[Injection], motion: EffectInput) -> Array:
 
 
 def late(injections: Sequence[Injection], clock: ActsOn, elapsed: Array) -> Array:
-    """(N,) s by which a clock's stamps are late of what is measured at times (N,) s since the start."""
+    """Return the delay (N,) s of a clock's stamps for measurements at times (N,) s since the start."""
     total = np.zeros(len(elapsed))
     for each in injections:
         if isinstance(each.effect, ClockEffect) and each.effect.acts_on is clock:

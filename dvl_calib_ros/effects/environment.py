@@ -1,4 +1,4 @@
-"""Effects of what surrounds the vehicle: water instead of ground, a compass that is off."""
+"""Effects of the environment: water instead of ground, an inaccurate compass."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _CURRENT = "{} component of the added velocity (the negative of the current)"
 
 
 class WaterLock(Effect):
-    """The DVL tracks the water, all the time or for some of it, so it misses what the current does."""
+    """The DVL tracks the water, always or for some time, so the current is missing from its velocity."""
 
     name = "water_lock"
     summary = "the DVL tracks water: an earth-fixed velocity (the negative of the current) is added from from_s to to_s"
     remedy = (
-        "a part of the run is on the water's layer: have the driver hand on bottom track only; in a whole run the bed "
-        "may move as well: --apply takes it out"
+        "a part of the run tracks the water: have the driver send bottom track only; in a whole run the bed "
+        "may also move: --apply corrects it"
     )
     manoeuvre = "straight legs on four headings or more, over ground known to be in range"
     parameters = (
@@ -40,19 +40,19 @@ class WaterLock(Effect):
     confounded_with = ("heading_error", "velocity_bias")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """R_body_from_enu c while from_s <= t < to_s."""
+        """Return R_body_from_enu c while from_s <= t < to_s."""
         locked = slice(*np.searchsorted(motion.elapsed, [values["from_s"], values["to_s"]]))
-        east, north = motion.attitude[locked, 0], motion.attitude[locked, 1]  # of each axis of the body
+        east, north = motion.attitude[locked, 0], motion.attitude[locked, 1]  # for each axis of the body
         added = np.zeros_like(motion.velocity_body)
         added[locked] = values["east_mps"] * east + values["north_mps"] * north
         return added
 
 
 class HeadingError(Effect):
-    """The heading is wrong by an amount that swings with the heading, as of an uncompensated compass, or that grows.
+    """The heading error varies with the heading, as of an uncompensated compass, or grows with time.
 
-    It turns the reference, which is what the wrong heading is used for. A constant error is misalignment about z. Iron
-    that keeps its magnetism makes one cycle, iron that takes on the earth's two.
+    It rotates the reference, which is computed with the wrong heading. A constant error is misalignment about z. Hard
+    iron causes one cycle per turn, soft iron two.
     """
 
     name = "heading_error"
@@ -60,7 +60,7 @@ class HeadingError(Effect):
         "the reference's yaw ψ (east to north) is wrong by sin_rad · sin ψ + cos_rad · cos ψ; in several recordings "
         "also by sin2_rad · sin 2ψ + cos2_rad · cos 2ψ, or by rad_per_hour · (t - start)"
     )
-    remedy = "calibrate the compass, away from what is magnetic; no mounting makes this"
+    remedy = "calibrate the compass, away from magnetic material; a mounting cannot cause this"
     manoeuvre = "straight legs on eight headings, at two speeds"
     parameters = (
         EffectParameter(
@@ -100,7 +100,7 @@ class HeadingError(Effect):
     confounded_with = ("water_lock",)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """g - R_body_from_enu Rz(-error) R_enu_from_body g; one in the body frame that was made with it is no other."""
+        """Return g - R_body_from_enu Rz(-error) R_enu_from_body g, also for a body-frame reference."""
         rotation = motion.attitude
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         error = values["sin_rad"] * np.sin(yaw) + values["cos_rad"] * np.cos(yaw)

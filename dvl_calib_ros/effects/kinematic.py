@@ -1,4 +1,4 @@
-"""Effects of how the vehicle moves: where the DVL sits, how the vehicle skids and tilts."""
+"""Effects of the vehicle's motion: position of the DVL, sideslip, tilt."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .base import ActsOn, Effect, EffectInput, EffectNeeds, EffectParameter, alo
 
 
 class LeverArm(Effect):
-    """ω×l: the DVL is not where the reference velocity is measured, so turning moves it."""
+    """Velocity ω×l, because the DVL is not at the reference velocity's point."""
 
     name = "lever_arm"
     summary = "the DVL sits at l from the reference point and moves when the vehicle turns: ω × l"
@@ -25,12 +25,12 @@ class LeverArm(Effect):
     confounded_with = ("sideslip", "reference_time_offset", "reference_lag")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """ω × l."""
+        """Return ω × l."""
         return cross(motion.turn_rate, vector(values, "m"))
 
 
 class Sideslip(Effect):
-    """Sway in a turn that the DVL sees and the reference does not, as one that is derived from course does not."""
+    """Sway in a turn that the DVL measures and the reference does not, for example one derived from course."""
 
     name = "sideslip"
     summary = "sway that only the DVL sees: coefficient · ω_z · horizontal speed"
@@ -54,19 +54,17 @@ class Sideslip(Effect):
     confounded_with = ("lever_arm", "reference_time_offset", "reference_lag")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """(0, coefficient · ω_z · speed, 0)."""
+        """Return (0, coefficient · ω_z · speed, 0)."""
         sway = values["coefficient_s"] * motion.turn_rate[:, 2] * np.hypot(*motion.velocity_body[:, :2].T)
         return sway[:, None] * [0.0, 1.0, 0.0]
 
 
 class TiltCoupling(Effect):
-    """Velocity that leaks in with the tilt of the vehicle."""
+    """Velocity error proportional to the tilt of the vehicle."""
 
     name = "tilt_coupling"
     summary = "an error in proportion to pitch or roll, body frame"
-    remedy = (
-        "the velocity of DVL or reference is not turned by roll and pitch as the vehicle is: look at the driver's frame"
-    )
+    remedy = "the velocity of DVL or reference is not rotated by the vehicle's roll and pitch: check the driver's frame"
     manoeuvre = "straight legs in waves, or with pitch and roll held at several angles"
     parameters = (
         EffectParameter(
@@ -84,7 +82,7 @@ class TiltCoupling(Effect):
     confounded_with = ("velocity_bias", "lever_arm")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Gains (3, 2) times pitch and roll."""
+        """Return gains (3, 2) times pitch and roll."""
         rotation = motion.attitude
         pitch = -np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0))
         roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])

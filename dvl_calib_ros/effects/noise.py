@@ -1,4 +1,4 @@
-"""Effects on the noise: what the simulator or the messages' covariances do not tell of."""
+"""Effects on the noise that simulators or message covariances lack."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _SHARE = "share of the samples, 0 .. 1"
 
 
 class Outliers(NoiseEffect):
-    """Now and then a sample is far off."""
+    """Occasional samples with large errors."""
 
     name = "outliers"
-    summary = "some DVL samples are far off"
+    summary = "some DVL samples have large errors"
     parameters = (
         EffectParameter("share", "1", 0.01, 0.0, 1.0, _SHARE),
         EffectParameter(
@@ -29,17 +29,17 @@ class Outliers(NoiseEffect):
     def disturb(
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
-        """Normal errors on a share of the samples, on all axes at once."""
+        """Add normal errors to a share of the samples, on all axes together."""
         hit = rng.random(len(velocity)) < values["share"]
         return velocity + hit[:, None] * rng.normal(0.0, values["std_mps"], velocity.shape)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
-        """As likely and as large; other samples are hit than if all came at once."""
+        """Return the same with the same probability; the samples hit differ from those of one call."""
         return lambda velocity, motion: self.disturb(velocity, motion, values, rng)
 
 
 class StaleSamples(NoiseEffect):
-    """Now and then the sample before is sent again with a new stamp."""
+    """Occasional repetition of the previous sample with a new stamp."""
 
     name = "stale_samples"
     summary = "some DVL samples repeat the one before"
@@ -49,11 +49,11 @@ class StaleSamples(NoiseEffect):
     def disturb(
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
-        """Each stale sample is the last fresh one."""
+        """Replace each stale sample by the last fresh one."""
         return self.following(values, rng)(velocity, motion)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
-        """Remembers the last fresh one."""
+        """Return a function that remembers the last fresh sample."""
         last: Array = np.empty((0, 3))
 
         def disturbance(velocity: Array, motion: EffectInput) -> Array:
@@ -71,7 +71,7 @@ class StaleSamples(NoiseEffect):
 
 
 class NoiseInflation(NoiseEffect):
-    """More white noise than the DVL reports, or noise that grows as it goes faster or turns."""
+    """More white noise than the DVL reports, or noise that grows with speed or turn rate."""
 
     name = "noise_inflation"
     summary = "the DVL's noise is larger than reported, or grows with speed or turn rate"
@@ -88,18 +88,18 @@ class NoiseInflation(NoiseEffect):
     def disturb(
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
-        """White noise of std + per_speed · speed + per_turn_rate · ‖ω‖."""
+        """Add white noise of std + per_speed · speed + per_turn_rate · ‖ω‖."""
         turn_rate = np.linalg.norm(motion.turn_rate, axis=1)
         std = values["std_mps"] + values["per_speed"] * motion.speed + values["per_turn_rate_m"] * turn_rate
         return velocity + std[:, None] * rng.standard_normal(velocity.shape)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
-        """White noise needs no memory."""
+        """Return `disturb`: white noise needs no memory."""
         return lambda velocity, motion: self.disturb(velocity, motion, values, rng)
 
 
 class ColouredReferenceNoise(NoiseEffect):
-    """Noise of the reference that stays alike for a while, as of multipath."""
+    """Slowly varying noise of the reference, for example by multipath."""
 
     name = "coloured_reference_noise"
     summary = "the reference's noise is correlated in time"
@@ -114,11 +114,11 @@ class ColouredReferenceNoise(NoiseEffect):
     def disturb(
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
-        """First-order Gauss-Markov noise, exact at any spacing of the samples."""
+        """Add first-order Gauss-Markov noise, exact for any sampling interval."""
         return self.following(values, rng)(velocity, motion)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
-        """Remembers the last noise and when that was."""
+        """Return a function that remembers the last noise and its time."""
         tau = values["correlation_time_s"]
         last: tuple[float, Array] | None = None
 

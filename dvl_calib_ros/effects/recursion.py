@@ -1,4 +1,4 @@
-"""Along time: slopes, and first-order recursions of any decay from sample to sample."""
+"""Slopes, and first-order recursions with varying decay, along time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..calibration.numerics.frames import Array
 
 
 def slopes(time: Array, values: Array) -> Array:
-    """(N, k) per s of values (N, k) at times (N,) s, N > 1: `numpy.gradient` in fewer passes over them."""
+    """Return slopes (N, k) per s of values (N, k) at times (N,) s, N > 1, faster than `numpy.gradient`."""
     steps = np.diff(time)
     between = np.diff(values, axis=0)
     between /= steps[:, None]
@@ -20,9 +20,9 @@ def slopes(time: Array, values: Array) -> Array:
 
 
 def recursion(decay: Array, added: Array) -> Array:
-    """x (N, ...) with x_n = decay_n x_(n-1) + added_n, from x_0 = added_0 on.
+    """Return x (N, ...) with x_n = decay_n x_(n-1) + added_n and x_0 = added_0.
 
-    decay: (N,), of which the first says nothing. added: (N, ...). It is a triangular system of two bands.
+    decay: (N,), the first is unused. added: (N, ...). It solves a triangular system with two bands.
     """
     if not added.size:
         return added.copy()

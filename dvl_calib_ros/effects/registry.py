@@ -61,7 +61,10 @@ E = TypeVar("E", bound=AnyEffect)
 
 
 class Registry(Mapping[str, E], Generic[E]):
-    """Name -> the one instance of each effect of a kind, own ones first. Looks for entry points when first used."""
+    """Mapping from name to the only instance of each effect of a kind, own ones first.
+
+    Entry points are read at the first use.
+    """
 
     def __init__(self, kind: type[E]) -> None:
         self._kind = kind
@@ -82,7 +85,7 @@ class Registry(Mapping[str, E], Generic[E]):
 
 @lru_cache(maxsize=1)
 def all_effects() -> tuple[AnyEffect, ...]:
-    """Systematic effects and those of the noise, own ones first. Raises InputError for a broken plug-in."""
+    """Return systematic and noise effects, own ones first. Raises InputError for a broken plug-in."""
     effects = {kind.name: kind() for kind in OWN}
     for point in entry_points(group=ENTRY_POINTS):
         effect = _plugged_in(point)
@@ -102,7 +105,7 @@ def _plugged_in(point: EntryPoint) -> AnyEffect:
         for attribute in wanted:
             getattr(effect, attribute)
         _check_stage(effect)
-    except Exception as error:  # whatever a foreign package does wrong
+    except Exception as error:  # any fault of a foreign package
         raise InputError(
             f"{_named(point)}: cannot be used ({type(error).__name__}: {error}); mend or uninstall that package"
         ) from error
@@ -110,7 +113,7 @@ def _plugged_in(point: EntryPoint) -> AnyEffect:
 
 
 _CLOCKS = (ActsOn.DVL_CLOCK, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_CLOCK)
-# Where an effect can stand, by the first of these that it is one of
+# allowed stages of an effect, by the first matching class
 _STAGES: tuple[tuple[type[AnyEffect], tuple[ActsOn, ...]], ...] = (
     (NoiseEffect, (ActsOn.DVL, ActsOn.REFERENCE)),
     (ClockEffect, _CLOCKS),
@@ -120,7 +123,7 @@ _STAGES: tuple[tuple[type[AnyEffect], tuple[ActsOn, ...]], ...] = (
 
 
 def _check_stage(effect: AnyEffect) -> None:
-    """Raise TypeError for an effect that stands where nothing would ask it what it does."""
+    """Raise TypeError for an effect at a stage where it would never be applied."""
     kind, stages = next((kind, stages) for kind, stages in _STAGES if isinstance(effect, kind))
     if effect.acts_on not in stages:
         listed = " or ".join(f"ActsOn.{stage.name}" for stage in stages)
@@ -137,7 +140,7 @@ NOISE_EFFECTS: Registry[NoiseEffect] = Registry(NoiseEffect)  # type: ignore[typ
 
 
 def effect_table() -> str:
-    """Every effect with its parameters, in Markdown."""
+    """Return every effect with its parameters, in Markdown."""
     lines = ["| effect | is | parameters | needs | looks like |", "|---|---|---|---|---|"]
     lines += [_row(effect) for effect in chain(EFFECTS.values(), NOISE_EFFECTS.values())]
     return "\n".join(lines) + "\n"

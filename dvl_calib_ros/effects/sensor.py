@@ -11,7 +11,7 @@ from .base import HOUR_S, ActsOn, Effect, EffectInput, EffectParameter, Mounting
 
 
 class VelocityBias(Effect):
-    """A constant velocity on the DVL's axes, as of beam biases."""
+    """A constant velocity on the DVL's axes, for example by beam biases."""
 
     name = "velocity_bias"
     summary = "a constant velocity added on the DVL's axes"
@@ -23,7 +23,7 @@ class VelocityBias(Effect):
     confounded_with = ("quadratic_scale", "mount_flexure", "water_lock")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Tᵀ b."""
+        """Return Tᵀ b."""
         bias = motion.rotation_dvl_from_body.T @ vector(values, "mps")
         return np.broadcast_to(bias, motion.velocity_body.shape).copy()
 
@@ -44,7 +44,7 @@ class QuadraticScale(Effect):
     confounded_with = ("velocity_bias",)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """coefficient · speed · v."""
+        """Return coefficient · speed · v."""
         return values["coefficient_s_per_m"] * motion.speed[:, None] * motion.velocity_body
 
 
@@ -65,12 +65,12 @@ class ScaleDrift(Effect):
     confounded_with = ("misalignment_drift",)
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """rate · (t - t_0) · v."""
+        """Return rate · (t - t_0) · v."""
         return values["rate_per_hour"] / HOUR_S * motion.elapsed[:, None] * motion.velocity_body
 
 
 class MisalignmentDrift(MountingEffect):
-    """The mounting turns slowly along the run."""
+    """Slow rotation of the mounting along the run."""
 
     name = "misalignment_drift"
     summary = "the misalignment changes along the run: φ = rate · (t - start)"
@@ -83,12 +83,12 @@ class MisalignmentDrift(MountingEffect):
     confounded_with = ("scale_drift",)
 
     def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """(t - t_0) · rate."""
+        """Return (t - t_0) · rate."""
         return motion.elapsed[:, None] * vector(values, "rad_per_hour") / HOUR_S
 
 
 class MountFlexure(MountingEffect):
-    """The mounting gives way to the water: misalignment that depends on speed."""
+    """Bending of the mounting by the water: misalignment that depends on speed."""
 
     name = "mount_flexure"
     summary = "the mounting bends with speed: φ = flexure · ‖v‖"
@@ -100,15 +100,15 @@ class MountFlexure(MountingEffect):
     confounded_with = ("velocity_bias", "quadratic_scale")
 
     def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """speed · flexure."""
+        """Return speed · flexure."""
         return motion.speed[:, None] * vector(values, "rad_per_mps")
 
 
 class MountingMoved(MountingEffect):
-    """The DVL was mounted otherwise than in the first of several recordings."""
+    """A mounting that differs from the one in the first of several recordings."""
 
     name = "mounting_moved"
-    summary = "the mounting differs from that of the first of several recordings"
+    summary = "the mounting differs from the first of several recordings"
     remedy = "the DVL has been moved between the recordings: calibrate each day by itself"
     manoeuvre = "straight legs that speed up and slow down, in each recording"
     parameters = along_axes("rad", "rad", 0.02, 1.5, "change of φ about the DVL's axis {}", linear=False)
@@ -116,15 +116,15 @@ class MountingMoved(MountingEffect):
     relative_to_first = True
 
     def turn(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """The change of φ."""
+        """Return the change of φ."""
         return vector(values, "rad")
 
 
 class SoundSpeedMoved(Effect):
-    """The speed of sound was off by another amount than in the first of several recordings."""
+    """A speed-of-sound error that differs from the one in the first of several recordings."""
 
     name = "sound_speed_moved"
-    summary = "the scale-factor error differs from that of the first of several recordings: ratio · v"
+    summary = "the scale-factor error differs from the first of several recordings: ratio · v"
     remedy = "set the speed of sound on each day"
     manoeuvre = "straight legs, in each recording"
     parameters = (EffectParameter("ratio", "1", 0.005, -0.2, 0.2, "change of the scale-factor error"),)
@@ -133,20 +133,20 @@ class SoundSpeedMoved(Effect):
     relative_to_first = True
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """ratio · v."""
+        """Return ratio · v."""
         return values["ratio"] * motion.velocity_body
 
 
 class AxisNonorthogonality(Effect):
-    """Axes that are not at right angles, as of beams that are not where they should be.
+    """Axes that are not orthogonal, for example by wrong beam directions.
 
-    The symmetric part; the skew part is misalignment. Going straight ahead the two look the same.
+    This is the symmetric part; the skew part is misalignment. On a straight leg the two look the same.
     """
 
     name = "axis_nonorthogonality"
     summary = "the DVL's axes are not at right angles: symmetric shear S v, DVL frame"
-    remedy = "ask the DVL's maker: its beams are not where they are said to be"
-    manoeuvre = "sway and heave beside surge: drift across, dive or go in waves"
+    remedy = "ask the DVL's maker: its beam directions differ from the specification"
+    manoeuvre = "sway and heave in addition to surge: drift across, dive or drive in waves"
     parameters = tuple(
         EffectParameter(
             f"{axes}_rad",
@@ -163,7 +163,7 @@ class AxisNonorthogonality(Effect):
     confounded_with = ("sideslip", "lever_arm")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Tᵀ S T v with S symmetric, zero on its diagonal."""
+        """Return Tᵀ S T v with S symmetric and a zero diagonal."""
         xy, xz, yz = (values[parameter.name] for parameter in self.parameters)
         shear = np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
         return motion.velocity_dvl @ shear @ motion.rotation_dvl_from_body

@@ -1,4 +1,4 @@
-"""Effects of time: stamps that are late, jump or drift; a reference that is filtered."""
+"""Effects of time: stamps with a delay, step or drift; a filtered reference."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..calibration.registration.delay_search import LONGEST_S
 from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory
 from .recursion import recursion, slopes
 
-# As far as clocks are registered
+# search range of the clock registration
 LONGEST_OFFSET_S = LONGEST_S
 
 
@@ -28,32 +28,32 @@ class _DvlClock(ClockEffect):
     acts_on = ActsOn.DVL_CLOCK
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """v(t - late) - v(t), body frame."""
+        """Return v(t - late) - v(t), body frame."""
         late = self.late(motion.elapsed, values)
         return delayed(motion.time, motion.velocity_body, late) - motion.velocity_body
 
 
 class DvlTimeOffset(_DvlClock):
-    """The DVL's stamps are late: what is stamped t was measured before."""
+    """The DVL's stamps are delayed: a sample stamped t was measured earlier."""
 
     name = "dvl_time_offset"
-    summary = "the DVL's stamps are late by τ: v(t - τ) - v(t), body frame"
+    summary = "the DVL's stamps have a delay of τ: v(t - τ) - v(t), body frame"
     remedy = "--apply writes dvl_time_offset; better, set the DVL's clock (PTP, or the time of validity in the driver)"
     manoeuvre = "straight legs that speed up and slow down, in waves or with quick changes of speed"
-    parameters = _seconds("how late a stamp is; positive: late")
+    parameters = _seconds("delay of the stamps")
     confounded_with = ("reference_time_offset", "reference_lag", "attitude_time_offset")
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """τ."""
+        """Return τ."""
         return np.full(len(elapsed), values["seconds"])
 
 
 class TimeOffsetJump(_DvlClock):
-    """The DVL's clock is set at some instant, or at two: from then on its stamps are later (or earlier)."""
+    """The DVL's clock is set once or twice: from then on its stamps are later (or earlier)."""
 
     name = "time_offset_jump"
     summary = "the DVL's stamps are later by τ from at_s on, as after its clock was set; by more from again_at_s on"
-    remedy = "--apply writes dvl_time_jump where it is one; keep who sets the DVL's clock from doing it during a run"
+    remedy = "--apply writes dvl_time_jump for a single jump; do not let the DVL's clock be set during a run"
     manoeuvre = "turns and changes of speed before and after"
     parameters = (
         *_seconds("how much later a stamp is from then on"),
@@ -69,7 +69,7 @@ class TimeOffsetJump(_DvlClock):
     confounded_with = ("dvl_time_offset", "clock_drift")
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """τ from at_s on, and more from again_at_s on."""
+        """Return τ from at_s on, and more from again_at_s on."""
         first = np.where(elapsed >= values["at_s"], values["seconds"], 0.0)
         return first + np.where(elapsed >= values["again_at_s"], values["again_seconds"], 0.0)
 
@@ -78,7 +78,7 @@ class ClockDrift(_DvlClock):
     """The DVL's clock runs fast (or slow)."""
 
     name = "clock_drift"
-    summary = "the DVL's clock runs fast: its stamps get later by so many seconds per hour"
+    summary = "the DVL's clock runs fast: its stamps get later by seconds_per_hour"
     remedy = "--apply writes dvl_clock_drift; better, discipline the DVL's clock (PTP, PPS)"
     manoeuvre = "turns and changes of speed at the beginning, in the middle and at the end"
     parameters = (
@@ -89,50 +89,50 @@ class ClockDrift(_DvlClock):
     confounded_with = ("dvl_time_offset", "time_offset_jump")
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """rate · (t - t_0)."""
+        """Return rate · (t - t_0)."""
         return values["seconds_per_hour"] / 3600.0 * elapsed
 
 
 class ReferenceTimeOffset(ClockEffect):
-    """The reference's stamps are late. Recorded in ENU it then is turned by an attitude that is too new."""
+    """The reference's stamps are delayed; if recorded in ENU, it is then rotated by a later attitude."""
 
     name = "reference_time_offset"
-    summary = "the reference's stamps are late by τ: -(g(t - τ) - g(t)), in the frame it was recorded in"
+    summary = "the reference's stamps have a delay of τ: -(g(t - τ) - g(t)), in the frame it was recorded in"
     remedy = "--apply writes reference_time_offset; better, stamp the reference when it measures"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
-    parameters = _seconds("how late a stamp is; positive: late")
+    parameters = _seconds("delay of the stamps")
     acts_on = ActsOn.REFERENCE_CLOCK
     confounded_with = ("dvl_time_offset", "reference_lag", "attitude_time_offset", "sideslip", "lever_arm")
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """τ."""
+        """Return τ."""
         return np.full(len(elapsed), values["seconds"])
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """g(t) - g(t - τ), in the frame in which the reference was recorded, turned into the body."""
+        """Return g(t) - g(t - τ), in the frame in which the reference was recorded, rotated to the body."""
         reference = _in_reference_frame(motion, motion.velocity_body)
         late = self.late(motion.elapsed, values)
         return _in_body(motion, reference - delayed(motion.time, reference, late))
 
 
 class AttitudeTimeOffset(ClockEffect):
-    """The stamps of attitude and angular velocity are late, so a reference in an earth frame is turned wrongly."""
+    """The stamps of attitude and angular velocity are delayed, so an earth-frame reference is rotated wrongly."""
 
     name = "attitude_time_offset"
-    summary = "the IMU's stamps are late by τ: v - R(t - τ)ᵀ R(t) v, with R its attitude"
+    summary = "the IMU's stamps have a delay of τ: v - R(t - τ)ᵀ R(t) v, with R its attitude"
     remedy = "--apply writes imu_time_offset; better, stamp the IMU when it measures"
     manoeuvre = "turns to both sides at two speeds, and straight legs that speed up and slow down"
-    parameters = _seconds("how late a stamp is; positive: late")
+    parameters = _seconds("delay of the stamps")
     acts_on = ActsOn.ATTITUDE_CLOCK
     needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("dvl_time_offset", "reference_time_offset", "sideslip", "lever_arm")
 
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """τ."""
+        """Return τ."""
         return np.full(len(elapsed), values["seconds"])
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """v - R(t - τ)ᵀ R(t) v; a reference in the body frame needs no attitude, but for a lever arm."""
+        """Return v - R(t - τ)ᵀ R(t) v; a body-frame reference needs no attitude, except for a lever arm."""
         attitude, late = motion.attitude, self.late(motion.elapsed, values)
         if motion.reference_frame is VelocityFrame.BODY or len(motion.time) < 2 or not late.any():
             return np.zeros_like(motion.velocity_body)
@@ -159,39 +159,39 @@ class ReferenceLag(EffectWithMemory):
     confounded_with = ("reference_time_offset", "dvl_time_offset", "sideslip", "lever_arm")
 
     def filtered(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
-        """g - (g filtered), turned into the body."""
+        """Return g - (g filtered), rotated to the body."""
         reference = _in_reference_frame(motion, velocity)
         error = lag_error(motion.time, reference.reshape(len(reference), -1), values["time_constant_s"])
         return _in_body(motion, -error.reshape(reference.shape))
 
     def of_before(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
-        """What the filter had in it at the first sample dies away with its time constant, whatever it was."""
+        """Return the exponential decay of the filter's unknown state at the first sample."""
         constant = values["time_constant_s"]
         if constant <= 0.0:
             return np.zeros_like(velocity)
-        return _in_body(motion, _dying_away(motion.time, _in_reference_frame(motion, velocity), constant))
+        return _in_body(motion, _decaying_part(motion.time, _in_reference_frame(motion, velocity), constant))
 
     def follows(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
-        """The same, turned to and fro once."""
+        """Compute the same with a single rotation to and fro."""
         reference, constant = _in_reference_frame(motion, velocity), values["time_constant_s"]
         if constant <= 0.0:
             return velocity
         error = lag_error(motion.time, reference.reshape(len(reference), -1), constant)
         error += reference.reshape(error.shape)
-        error -= _dying_away(motion.time, error, constant)
+        error -= _decaying_part(motion.time, error, constant)
         return _in_body(motion, error.reshape(reference.shape))
 
 
-def _dying_away(time: Array, values: Array, time_constant: float) -> Array:
-    """That part of values (N, ...) at times (N,) s that dies away from the first on with a time constant, s."""
+def _decaying_part(time: Array, values: Array, time_constant: float) -> Array:
+    """Return the part of values (N, ...) at times (N,) s that decays from the first with a time constant, s."""
     left = np.exp((time[0] - time) / time_constant)
     return np.multiply.outer(left, np.tensordot(left, values, axes=1) / (left @ left))
 
 
 def delayed(time: Array, values: Array, delay: float | Array) -> Array:
-    """What `values` (N, 3) were `delay` s before, one or (N,); before the first and after the last, as there.
+    """Return `values` (N, 3) at times earlier by `delay` s (one or (N,)); outside the range the nearest value.
 
-    Cubic between samples: a straight line would cut the crests of waves sampled at 1 Hz by a seventh.
+    Cubic interpolation: a linear one would reduce the crests of waves sampled at 1 Hz by a seventh.
     """
     if not np.any(delay) or len(time) < 2:
         return values
@@ -200,11 +200,11 @@ def delayed(time: Array, values: Array, delay: float | Array) -> Array:
 
 
 def lag_error(time: Array, values: Array, time_constant: float) -> Array:
-    """First-order low-pass of `values` (N, k) less `values`: exact where slopes are straight between their times.
+    """Return the first-order low-pass of `values` (N, k) minus `values`, exact for piecewise linear slopes.
 
-    With e = output - input, de/dt = -e / T - slope. Where the slope goes from s_0 to s_1 within a step of h, one
-    solution is p(t) = T² (s_1 - s_0) / h - T slope(t), so e_n = exp(-h / T) (e_(n-1) - p_(n-1)) + p_n. The filter
-    begins with the first value.
+    With e = output - input, de/dt = -e / T - slope. If the slope goes from s_0 to s_1 within a step of h, one solution
+    is p(t) = T² (s_1 - s_0) / h - T slope(t), so e_n = exp(-h / T) (e_(n-1) - p_(n-1)) + p_n. The filter starts with
+    the first value.
     """
     if time_constant <= 0.0 or len(time) < 2:
         return np.zeros_like(values)
@@ -217,21 +217,21 @@ def lag_error(time: Array, values: Array, time_constant: float) -> Array:
     return recursion(decay, added)
 
 
-def _turns(motion: EffectInput) -> bool:
+def _is_rotated(motion: EffectInput) -> bool:
     return motion.reference_frame is not VelocityFrame.BODY and motion.rotation_enu_from_body is not None
 
 
 def _in_reference_frame(motion: EffectInput, velocity: Array) -> Array:
-    """(N, 3) or (N, 3, p), body frame -> that of the reference."""
-    return _turned(motion.attitude, velocity) if _turns(motion) else velocity
+    """Rotate (N, 3) or (N, 3, p) from the body to the reference's frame."""
+    return _turned(motion.attitude, velocity) if _is_rotated(motion) else velocity
 
 
 def _in_body(motion: EffectInput, velocity: Array) -> Array:
-    return _turned(np.swapaxes(motion.attitude, 1, 2), velocity) if _turns(motion) else velocity
+    return _turned(np.swapaxes(motion.attitude, 1, 2), velocity) if _is_rotated(motion) else velocity
 
 
 def _turned(rotation: Array, velocity: Array) -> Array:
-    """(N, 3) or (N, 3, p), each by its own (N, 3, 3)."""
+    """Rotate (N, 3) or (N, 3, p), each by its own (N, 3, 3)."""
     if velocity.ndim == 2:
         return np.einsum("nij,nj->ni", rotation, velocity)
-    return np.asarray(rotation @ velocity)  # of several columns in a fifth of the time
+    return np.asarray(rotation @ velocity)  # for several columns five times faster

@@ -1,1 +1,1 @@
-"""The published validation procedure, its studies, and cross-checks of recorded bags; results are plain data."""
+"""The published validation procedure, its studies, and cross-checks of recorded bags. Results are plain data."""

@@ -1,4 +1,4 @@
-"""How fast the misalignment is found: its error against the time of calibration, from ten seconds on."""
+"""Convergence of the misalignment: its error over calibration time, from ten seconds on."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from .protocol import Trajectory
 from .results import ConvergenceCurve, Failure, mean_of_known
 
 TIMES_S = (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
-# Noise of the reference, m/s per axis: that of the procedure, and that of a good receiver
+# noise of the reference, m/s per axis: the procedure's, and a good receiver's
 REFERENCE_STD = (protocol.GNSS_STD, 0.02)
-# What a published network that aligns a DVL reports: so many degrees after so many seconds
+# result reported for a published network that aligns a DVL: error in degrees after a time in s
 PUBLISHED_DEG, PUBLISHED_S = 0.8, 25.0
 _AIDED, _FREE = ("M3",), ("A1", "F1", "M7")
 
 
 def curve_keys(models: Sequence[str]) -> list[tuple[str, float | None]]:
-    """Name and noise of the curves, of those of these models that are drawn."""
+    """Return names and noise levels of the curves for these models."""
     aided = [*(name for name in _AIDED if name in models), *BASELINES]
     keys: list[tuple[str, float | None]] = [(name, std) for std in REFERENCE_STD for name in aided]
     return keys + [(name, None) for name in _FREE if name in models]
@@ -40,9 +40,9 @@ def squared_errors(
     parameters: Parameters,
     failures: list[Failure],
 ) -> Array:
-    """Squared error of φ on one run (curves, T, 3) rad², mean over combinations; nan for what cannot run on it.
+    """Return squared errors of φ on one run (curves, T, 3) rad², averaged over combinations; nan for unusable models.
 
-    measured: (B, N, 3) m/s. references: by their noise (B, N, 3) m/s. failures: what raises is added.
+    measured: (B, N, 3) m/s. references: noise -> (B, N, 3) m/s. failures: receives exceptions.
     """
     ends = [run.first(seconds) for seconds in TIMES_S]
     cut = slice(0, ends[-1])
@@ -60,8 +60,8 @@ def squared_errors(
                 rotations = [
                     align(data.run.time[:end], data.velocity_dvl[:, :end], data.reference[:, :end]) for end in ends
                 ]
-                off = np.stack([_turns_off(each, truth) for each in rotations])
-            except Exception as error:  # costs this curve's share of the run alone
+                off = np.stack([_rotation_errors(each, truth) for each in rotations])
+            except Exception as error:  # only this curve's share of the run is lost
                 failures.append(Failure.of(error, name, run.name))
                 continue
             by_key[name, std] = (off**2).mean(axis=1)
@@ -73,8 +73,8 @@ def _of_states(state: GaussianState, truth: Array) -> Array:
     return mean_of_known((state.x[..., :3] - truth) ** 2, 1)
 
 
-def _turns_off(body_from_dvl: Array, misalignment: Array) -> Array:
-    """Axis times angle (B, 3) rad by which rotations (B, 3, 3) miss the one of a misalignment φ (B, 3)."""
+def _rotation_errors(body_from_dvl: Array, misalignment: Array) -> Array:
+    """Return rotation vectors (B, 3) rad from the rotation of a misalignment φ (B, 3) to rotations (B, 3, 3)."""
     norm = np.linalg.norm(misalignment, axis=-1, keepdims=True)
     truth = Rotation.from_rotvec(misalignment / norm * np.arctan(norm))  # see `error_model.corrected_mounting`
     found = Rotation.from_matrix(np.swapaxes(body_from_dvl, -1, -2))
@@ -82,7 +82,7 @@ def _turns_off(body_from_dvl: Array, misalignment: Array) -> Array:
 
 
 def curves(models: Sequence[str], squares: Array) -> tuple[ConvergenceCurve, ...]:
-    """squares: (..., curves, T, 3) rad², over seeds and runs; nan where a curve cannot run."""
+    """Average squared errors (..., curves, T, 3) rad² over seeds and runs; nan if a curve cannot run."""
     mean = mean_of_known(squares, tuple(range(squares.ndim - 3)))
     return tuple(
         ConvergenceCurve(name, std, np.sqrt(each))
@@ -92,7 +92,7 @@ def curves(models: Sequence[str], squares: Array) -> tuple[ConvergenceCurve, ...
 
 
 def curves_document(found: Sequence[ConvergenceCurve]) -> dict[str, Any]:
-    """Plain data, degrees."""
+    """Return plain data, degrees."""
     return {
         "times_s": list(TIMES_S),
         "published": {"seconds": PUBLISHED_S, "degrees": PUBLISHED_DEG},

@@ -1,4 +1,4 @@
-"""Recorded bags checked against each other: calibrate on each, correct every other one that has GNSS."""
+"""Cross-check of recorded bags: calibrate on each, correct every other one that has GNSS."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ from .results import Failure, Improvement
 
 @dataclass(frozen=True, repr=False)
 class CrossCheck(Answering):
-    """Difference (vector RMSE, m/s) of the DVL to GNSS, whose noise is part of it, on bags that were not calibrated on.
+    """Velocity error (vector RMSE, m/s) of the DVL against GNSS on bags that were not used for calibration.
 
-    bags: (L,). models: (M,). n_paired: (L,) samples that had a reference. uncorrected: (L,) verified on. corrected:
-    (L, M, L) calibrated on, model, verified on; nan on the bag itself, without paired samples, and where the model had
-    nothing to calibrate with; a model with lever arm and delay has them corrected, the delay being that of the day: as
-    the bag verified on shows it, where it does. selected: (L,) model that `navigation` of a bag calibrated on is by.
-    navigation: dead reckoning by (calibrated on, verified on). notes: what the replays said. found: what the bags say
-    of themselves.
+    The noise of GNSS is included. bags: (L,). models: (M,). n_paired: (L,) samples with a reference. uncorrected: (L,)
+    by verifying bag. corrected: (L, M, L) by calibrating bag, model and verifying bag; nan on the bag itself, without
+    paired samples, and for models without usable data. A model with lever arm and delay corrects both, with the delay
+    estimated from the verifying bag if observable. selected: (L,) model of each calibrating bag for `navigation`.
+    navigation: dead reckoning by (calibrating, verifying) bag. notes: messages of the replays. found: results of
+    discovery.
     """
 
     bags: tuple[str, ...]
@@ -60,28 +60,27 @@ class CrossCheck(Answering):
 
     @property
     def improvement(self) -> Improvement:
-        """How much the best of the models improves bags that it was not calibrated on."""
+        """Improvement by the best model, on bags that it was not calibrated on."""
         return Improvement.of(self.models, self.corrected.transpose(1, 0, 2), self.uncorrected)
 
     @property
     def verdict(self) -> str:
-        """The answer: better, not_better or not_known."""
+        """Answer: better, not_better or not_known."""
         return self.improvement.verdict
 
     @property
     def names(self) -> list[str]:
-        """(L,) of the bags, without their folders."""
+        """Names (L,) of the bags, without their folders."""
         return [Path(bag).name or bag for bag in self.bags]
 
 
 @dataclass(frozen=True)
 class _Replayed:
-    """parameters: with what the bag says of itself; found: that in sentences. corrections: (M, 3, 3), nan where a model
-    had no sample. moments: of the paired samples, None without.
+    """Replay of one bag. parameters: with the bag's discovered values, described in found.
 
-    delayed: by model with a lever arm and delay, if it claims any, what it corrects. recording: all streams, thinned.
-    selected: model that was selected, and what it corrects; None if it used nothing. dvl: its messages. failed: why
-    there is none of this.
+    corrections: (M, 3, 3), nan for a model without samples. moments: of the paired samples, None without. delayed: by
+    model with a lever arm and delay, if it claims any, its corrections. recording: all streams, thinned. selected:
+    selected model and its corrections; None if it used nothing. dvl: its messages. failed: why there is no result.
     """
 
     parameters: Parameters
@@ -105,7 +104,7 @@ def cross_check(
     workers: Workers,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> CrossCheck:
-    """Replay every bag, verify on all others. given: what parameters and topics are named. Raises InputError."""
+    """Replay every bag and verify it on all others. given: named parameters and topics. Raises InputError."""
     if len(set(bags)) < len(bags):
         raise InputError(f"{', '.join(map(str, bags))}: a bag is named twice; it cannot be checked against itself")
     found = run_all(partial(_replay_or_nothing, parameters, tuple(models), given), bags, workers, on_progress)
@@ -147,8 +146,8 @@ def cross_check(
     )
 
 
-def _of_the_day(terms: Terms, verified: _Replayed) -> Terms:
-    """With the delay that the bag verified on shows: clocks are synchronised anew every day."""
+def _with_own_delay(terms: Terms, verified: _Replayed) -> Terms:
+    """Replace the delay by the verifying bag's, because clocks are synchronised anew in each recording."""
     own = next(iter(verified.delayed.values()), None)
     return terms if own is None else terms._replace(time_offset=own.time_offset)
 
@@ -157,13 +156,13 @@ def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> 
     if verified.recording is None:
         return float("nan")
     every = np.arange(len(verified.recording.dvl.times))
-    error = verified.recording.compared(every, _of_the_day(terms, verified), parameters).error
+    error = verified.recording.compared(every, _with_own_delay(terms, verified), parameters).error
     error = error[np.isfinite(error[:, 0])]
     return float(np.sqrt(np.mean((error**2).sum(axis=1)))) if len(error) else float("nan")
 
 
 def _navigation(bags: Sequence[Path], found: Sequence[_Replayed]) -> Mapping[tuple[str, str], Navigation]:
-    """Dead reckoning of every bag, corrected by what every other one says."""
+    """Return the dead reckoning of every bag, corrected by every other one's calibration."""
     navigation = {}
     for calibrated, one in zip(bags, found, strict=True):
         for verified, other in zip(bags, found, strict=True):
@@ -171,15 +170,15 @@ def _navigation(bags: Sequence[Path], found: Sequence[_Replayed]) -> Mapping[tup
             if verified == calibrated or terms is None or other.recording is None:
                 continue
             folds = np.zeros(len(other.recording.dvl.times), dtype=np.int64)
-            # as mounted, the delay is what it is
-            reckoned = dead_reckoned(other.recording, folds, [_of_the_day(terms, other)], one.parameters)
+            # uncorrected: with the delay that the clocks really have
+            reckoned = dead_reckoned(other.recording, folds, [_with_own_delay(terms, other)], one.parameters)
             if reckoned is not None:
                 navigation[str(calibrated), str(verified)] = reckoned
     return navigation
 
 
 def _replay_or_nothing(parameters: Parameters, models: Sequence[str], given: Given, bag: Path) -> _Replayed:
-    """What raises costs its own bag, not the others. Raises InputError for one that cannot be read."""
+    """Replay one bag; an exception affects only this bag. Raises InputError if it cannot be read."""
     try:
         return _replay_one(parameters, models, given, bag)
     except InputError:
@@ -237,19 +236,19 @@ def _replay_one(named: Parameters, models: Sequence[str], given: Given, bag: Pat
     )
 
 
-# States of a lever arm and a delay
+# states of lever arm and delay
 BEYOND = ("lever_arm_x", "lever_arm_y", "lever_arm_z", "time_offset")
 
 
 def _terms(estimate: Estimate) -> Terms:
-    """What an estimate corrects."""
+    """Return the corrections by an estimate."""
     errors = MODELS[estimate.model].error_terms_from_state @ estimate.state
     *arm, late = (estimate.state_of(name) for name in BEYOND)
     return Terms(errors, np.array(arm), late)
 
 
 def cross_check_document(check: CrossCheck) -> dict[str, Any]:
-    """`evaluate --json` of bags; m/s."""
+    """Return the JSON of `evaluate --json` for bags; m/s."""
     by_bag = partial(zip, check.bags, strict=True)
     return {
         "verdict": check.verdict,

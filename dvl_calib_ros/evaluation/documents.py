@@ -1,4 +1,4 @@
-"""An evaluation as plain documents: JSON for machines, CSV for spreadsheets."""
+"""An evaluation as JSON and CSV."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CSV_COLUMNS = ("study", "set", "calibrated_on", "from_s", "to_s", "model", "seed
 
 
 def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
-    """`evaluate --json`: velocities in m/s, angles in rad, means over the seeds unless it says per_seed."""
+    """Return the JSON of `evaluate --json`: velocities in m/s, angles in rad; means over seeds, or per_seed."""
     e = evaluation
     names = [each.name for each in e.sets]
     return {
@@ -59,7 +59,7 @@ def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def evaluation_csv(evaluation: Evaluation) -> str:
-    """`evaluate --csv`: one line per Avg.VRMSE of every study, set or run, window, model and seed."""
+    """Return the CSV of `evaluate --csv`: one line per Avg.VRMSE of every study, set or run, window, model and seed."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(CSV_COLUMNS)

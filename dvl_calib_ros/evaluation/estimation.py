@@ -1,8 +1,7 @@
-"""Many calibrations of one run at once: the same models, priors and filter as live and in replay.
+"""Vectorised calibration of many variants of one run, with the models, priors and filter of live use and replay.
 
-What differs is the layout: B variants of a run (combinations of errors), each aligned and gated as a recording of it
-would be, go through the models and the filter as one array. That this gives the state that replaying a bag of the same
-data gives is proved in test_evaluation.py.
+B variants of a run (combinations of errors) are aligned and gated like recordings, then processed as one array.
+test_evaluation.py verifies that the states equal those of replayed bags.
 """
 
 from __future__ import annotations
@@ -37,9 +36,9 @@ _START_S = 1_600_000_000
 
 @dataclass(frozen=True)
 class SensorData:
-    """What the sensors gave on a run, in B variants. Body frame, forward-left-up; the DVL is mounted straight.
+    """Sensor data of a run in B variants. Body frame, forward-left-up; the DVL is mounted without rotation.
 
-    run: its truth, times and attitude. velocity_dvl: (B, N, 3) m/s. reference: (B, N, 3) m/s.
+    run: true motion, times and attitude. velocity_dvl: (B, N, 3) m/s. reference: (B, N, 3) m/s.
     """
 
     run: Trajectory
@@ -49,10 +48,10 @@ class SensorData:
 
 @dataclass(frozen=True)
 class AlignedVariants:
-    """What the calibrator's own alignment and gates make of B variants of a run of N samples.
+    """B variants of a run of N samples after the calibrator's alignment and gates.
 
-    rows: of all variants, one after the other (B N). A sample that is not let through (too fast to be valid, say) is
-    a row that no model uses. has: for each need the rows (B, N) that have it. sway_heave: (B, 2) m/s, the priors.
+    rows: of all variants in sequence (B N). A rejected sample, for example above max_speed, is a row that no model
+    uses. has: for each need the rows (B, N) that satisfy it. sway_heave: (B, 2) m/s, the priors.
     """
 
     rows: AlignedBlock
@@ -60,13 +59,13 @@ class AlignedVariants:
     sway_heave: Array
 
     def observations(self, needs: Needs, parameters: Parameters) -> Observations:
-        """What models with these needs see of all rows; of those without, anything finite."""
+        """Return the observations of models with these needs for all rows; any finite values for unusable rows."""
         n_samples = self.has[needs].shape[1]
         return Observer(parameters).observe(self.rows, needs, np.repeat(self.sway_heave, n_samples, axis=0))
 
 
 def streams_of(data: SensorData, variant: int) -> Streams:
-    """One variant as a recording of it would give it."""
+    """Return one variant as the streams of a recording."""
     run = data.run
     stamps_ns = np.rint((_START_S + run.time) * 1e9).astype(np.int64)
     imu = no_samples(Stream.IMU)
@@ -80,7 +79,7 @@ def streams_of(data: SensorData, variant: int) -> Streams:
 
 
 def true_prior(data: SensorData, parameters: Parameters) -> tuple[float, float] | None:
-    """Sway and heave of ``prior_source: reference``: here the truth's, over the prior's window."""
+    """Return sway and heave of ``prior_source: reference``: here the true ones, over the prior's window."""
     if parameters.prior_source != "reference":
         return None
     _, sway, heave = data.run.velocity[: data.run.first(parameters.prior_window)].mean(axis=0).tolist()
@@ -88,10 +87,10 @@ def true_prior(data: SensorData, parameters: Parameters) -> tuple[float, float] 
 
 
 def aligned(data: SensorData, parameters: Parameters) -> AlignedVariants:
-    """All variants of a run, by the rules of a calibration."""
+    """Align all variants of a run by a calibration's rules."""
     prior, n_samples = true_prior(data, parameters), len(data.run.time)
     found = [align(streams_of(data, variant), parameters, prior) for variant in range(len(data.velocity_dvl))]
-    # a row for every sample, also for those that are not let through
+    # a row for every sample, including rejected ones
     at = np.zeros((len(found), n_samples), dtype=np.intp)
     present = np.zeros(at.shape, dtype=bool)
     first = 0
@@ -112,22 +111,22 @@ def aligned(data: SensorData, parameters: Parameters) -> AlignedVariants:
 
 
 def _finite(reference: Array) -> Array:
-    """Velocities 0 where there are none; covariances stay as they are."""
+    """Replace missing velocities by 0; covariances are unchanged."""
     return np.concatenate([np.nan_to_num(reference[:, :3]), reference[:, 3:]], axis=1)
 
 
 def estimate(
     models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int], failures: list[Failure]
 ) -> Mapping[str, GaussianState]:
-    """States of every model that can run on the data, after the first `ends` samples (E ascending numbers).
+    """Return the states of every usable model after the first `ends` samples (E ascending numbers).
 
     Returns x (E, B, n) and P (E, B, n, n) by the model's name. parameters: without process noise, lever arm or
-    mounting. A variant whose estimate raises is nan in that model alone, and is added to `failures`.
+    mounting. A variant whose estimation raises is nan in that model only, and is added to `failures`.
     """
     able = [name for name in models if MODELS[name].needs is not Needs.ATTITUDE or _has_attitude(data)]
     try:
         return _estimate(able, data, parameters, ends)
-    except Exception:  # one by one, so that what raises costs nobody else
+    except Exception:  # repeat individually, so that an exception affects only its own variant
         return {name: _estimate_by_variant(name, data, parameters, ends, failures) for name in able}
 
 
@@ -138,7 +137,7 @@ def _has_attitude(data: SensorData) -> bool:
 def _estimate_by_variant(
     name: str, data: SensorData, parameters: Parameters, ends: Sequence[int], failures: list[Failure]
 ) -> GaussianState:
-    """`estimate` of one model, each variant by itself."""
+    """Run `estimate` for one model, with each variant separately."""
     n_state, n_variants = MODELS[name].n_state, len(data.velocity_dvl)
     x = np.full((len(ends), n_variants, n_state), np.nan)
     p = np.full((len(ends), n_variants, n_state, n_state), np.nan)
@@ -164,7 +163,7 @@ def _estimate(
         if not group:
             continue
         seen = variants.observations(needs, parameters)
-        for model in group:  # each on its own, in its own size: here it is the variants that fill the arrays
+        for model in group:  # models run separately, because the variants already fill the arrays
             found[model.name] = _estimate_one(model, seen, variants, parameters, ends)
     return {name: found[name] for name in models}
 
@@ -200,7 +199,7 @@ def _estimate_fed(name: str, data: SensorData, parameters: Parameters, ends: Seq
 
 
 def _heights(seen: Observations, variants: AlignedVariants, given: Mask) -> Array:
-    """`Observations.height` of all rows (B N,), by those that models are given (B, N)."""
+    """Return `Observations.height` of all rows (B N,), from those that models receive (B, N)."""
     heights = np.zeros(given.shape)
     columns = (each.reshape(given.shape) for each in (variants.rows.stamps_ns, seen.rising))
     for own, at, stamps_ns, rising in zip(heights, given, *columns, strict=True):
@@ -209,7 +208,7 @@ def _heights(seen: Observations, variants: AlignedVariants, given: Mask) -> Arra
 
 
 def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
-    """Measurements of one model, B variants in a row (1, B N, ...) -> of B models (B, N, ...)."""
+    """Reshape one model's measurements of B variants from (1, B N, ...) to (B, N, ...)."""
 
     def split(values: NDArray[T]) -> NDArray[T]:
         same_for_all = values.shape[1] == 1
@@ -226,7 +225,7 @@ def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
 
 
 def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> GaussianState:
-    """x (E, K, n) and P (E, K, n, n) after the first `ends` samples."""
+    """Return x (E, K, n) and P (E, K, n, n) after the first `ends` samples."""
     if not np.isfinite(data.gate).any():
         return kalman.least_squares(x, p, data, ends)
     states = []

@@ -1,10 +1,10 @@
 """Error measures of a calibration, and the least-squares rotation on SO(3) as a baseline.
 
 Kinsey and Whitcomb, "In situ alignment calibration of attitude and Doppler sensors for precision underwater vehicle
-navigation: theory and experiment" (2007), align displacements: what the DVL integrates to against positions. Troni and
+navigation: theory and experiment" (2007), align displacements: the integrated DVL against positions. Troni and
 Whitcomb, "New velocity-based algorithms for the in situ calibration of Doppler velocity log sensors" (2010), align
-velocities. Either is the rotation C that minimises Σ |g_i - C v_i|², found by a singular value decomposition (Wahba's
-problem). They estimate no scale, have no prior, and claim no σ.
+velocities. Both compute the rotation C that minimises Σ |g_i - C v_i|² by a singular value decomposition (Wahba's
+problem). They have no scale, no prior, and no σ.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from .results import Coverage
 
 
 def troni_whitcomb(time: Array, measured: Array, reference: Array) -> Array:
-    """From velocities (..., N, 3) m/s."""
+    """Fit the rotation to velocities (..., N, 3) m/s."""
     return nearest_rotation(np.swapaxes(reference, -1, -2) @ measured)
 
 
 def kinsey_whitcomb(time: Array, measured: Array, reference: Array) -> Array:
-    """From displacements since the start: of velocities (..., N, 3) m/s, at times (N,) s.
+    """Fit the rotation to displacements since the start, from velocities (..., N, 3) m/s at times (N,) s.
 
-    In the body frame, where the misalignment is constant; the reference's positions are its integrated velocity.
+    This uses the body frame, in which the misalignment is constant; positions are the integrated reference velocity.
     """
     step = np.diff(time, prepend=time[:1])[:, None]
     return troni_whitcomb(time, np.cumsum(measured * step, axis=-2), np.cumsum(reference * step, axis=-2))
@@ -41,18 +41,17 @@ BASELINES: Mapping[str, Callable[[Array, Array, Array], Array]] = {
 }
 
 
-# Two-sided intervals of a normal distribution
+# two-sided intervals of a normal distribution
 WITHIN_68, WITHIN_95 = (float(normal_isf(0.5 - 0.5 * share)) for share in (0.68, 0.95))
 
 
 @dataclass(frozen=True)
 class RunMoments:
-    """Second moments of measured velocities v against the truth g of ... runs: all that a VRMSE depends on.
+    """Second moments of measured velocities v and true ones g of ... runs, sufficient for every VRMSE.
 
-    Of whole runs, many corrections at once, against the truth, which has all axes; `calibration.folds.Moments` sums by
-    fold against references, which may lack some.
-
-    vv: E[v vᵀ] (..., 3, 3). gv: E[g vᵀ] (..., 3, 3). gg: E[gᵀg] (...,). (m/s)².
+    They are for whole runs, many corrections, and a true velocity with all axes. `calibration.folds.Moments` sums by
+    fold, with references that may lack axes. vv: E[v vᵀ] (..., 3, 3). gv: E[g vᵀ] (..., 3, 3). gg: E[gᵀg] (...,).
+    (m/s)².
     """
 
     vv: Array
@@ -61,7 +60,7 @@ class RunMoments:
 
     @staticmethod
     def of(measured: Array, truth: Array) -> RunMoments:
-        """RunMoments of measured (..., N, 3) and true (N, 3) velocities, m/s."""
+        """Compute from measured (..., N, 3) and true (N, 3) velocities, m/s."""
         n = len(truth)
         transposed = np.swapaxes(measured, -1, -2)
         vv, vg = transposed @ measured / n, transposed @ truth / n
@@ -70,23 +69,23 @@ class RunMoments:
 
     @staticmethod
     def stack(each: Sequence[RunMoments]) -> RunMoments:
-        """RunMoments of several runs along a new first axis."""
+        """Stack several runs along a new first axis."""
         return RunMoments(*(np.stack([getattr(one, name) for one in each]) for name in ("vv", "gv", "gg")))
 
 
 def vrmse(moments: RunMoments, correction: Array) -> Array:
-    """sqrt(E‖g - C v‖²) (...,) m/s of velocities corrected by matrices C (..., 3, 3); shapes broadcast.
+    """Return sqrt(E‖g - C v‖²) (...,) m/s of velocities corrected by matrices C (..., 3, 3); shapes broadcast.
 
-    E‖g - C v‖² = E[gᵀg] - 2 tr(C E[g vᵀ]ᵀ) + tr(C E[v vᵀ] Cᵀ), so a correction costs a few products, not a pass
+    E‖g - C v‖² = E[gᵀg] - 2 tr(C E[g vᵀ]ᵀ) + tr(C E[v vᵀ] Cᵀ), so a correction costs a few products instead of a pass
     over the samples.
     """
     linear = 2.0 * moments.gv - correction @ moments.vv
     mean_square = moments.gg - np.sum(correction * linear, axis=(-2, -1))
-    return np.sqrt(np.maximum(mean_square, 0.0))  # rounding may take a perfect correction below zero
+    return np.sqrt(np.maximum(mean_square, 0.0))  # rounding may make a perfect correction negative
 
 
 def heading_spread(rotation_enu_from_body: Array) -> float:
-    """Circular standard deviation of the heading, rad, of attitudes (N, 3, 3)."""
+    """Return the circular standard deviation of the heading, rad, of attitudes (N, 3, 3)."""
     from scipy.stats import circstd
 
     forward = rotation_enu_from_body[:, :2, 0]
@@ -94,7 +93,7 @@ def heading_spread(rotation_enu_from_body: Array) -> float:
 
 
 def coverage(model: str, state_names: Sequence[str], errors: Array, std: Array) -> Coverage:
-    """Coverage of errors (N, n), estimate - truth, with their claimed standard deviations (N, n)."""
+    """Return the coverage of errors (N, n), estimate - truth, by their claimed standard deviations (N, n)."""
     inside_68: NDArray[Any] = np.abs(errors) <= WITHIN_68 * std
     inside_95: NDArray[Any] = np.abs(errors) <= WITHIN_95 * std
     return Coverage(

@@ -20,21 +20,24 @@ from .metrics import BASELINES, RunMoments, heading_spread, vrmse
 from .protocol import Trajectory
 from .results import CalibrationRun, CalibrationSet, Failure, mean_of_known
 
-# A leg is a single heading while it turns by no more than this, and is worth calibrating on from this length
+# largest heading range of a leg of a single heading, and smallest length for a calibration
 LEG_HEADING_RANGE = np.deg2rad(25.0)
 LEG_SAMPLES = 60
-# Noise of the reference in the study of errors in variables, m/s per axis, and the set whose run it takes: the one at
-# constant speed, since the formula has one ‖v‖
+# Noise of the reference in the errors-in-variables study, m/s per axis, and its set: one with constant speed, because
+# the formula has a single ‖v‖.
 NOISE_STUDY_STD = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
 NOISE_STUDY_SET = "E2"
-# Wide, so that what is measured is the pull of the data and not that of the prior; a filter that knows the noise
+# a wide prior, so that the bias comes from the data; a filter with the true noise
 NOISE_STUDY_PRIOR_STD_SCALE = 0.1
 NOISE_STUDY_SMALLEST_STD = 0.01
 
 
 @dataclass(frozen=True)
 class Procedure:
-    """What to run. models: names. runs: trajectories by name. studies: False for the published procedure alone."""
+    """Configuration of a run.
+
+    models: names. runs: trajectories by name. studies: False for the published procedure only.
+    """
 
     runs: Mapping[str, Trajectory]
     models: tuple[str, ...]
@@ -49,16 +52,16 @@ class Procedure:
 
     @property
     def n_columns(self) -> int:
-        """Uncalibrated, and the models."""
+        """Number of columns: uncalibrated and the models."""
         return 1 + len(self.models)
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """What calibrating on one run (B combinations) gave; nan for models that cannot run on it.
+    """Result of calibrating on one run (B combinations); nan for unusable models.
 
-    by_time: (E, C) Avg.VRMSE m/s after each window. The rest is after the run's own window: avg_vrmse (C,). errors,
-    std: model -> (B, n) estimate - truth of the error states, and the σ claimed. yaw_observed: (M,) share of
+    by_time: (E, C) Avg.VRMSE m/s after each window. The others are after the run's own window: avg_vrmse (C,). errors,
+    std: model -> (B, n) estimate - truth of the error states, and the claimed σ. yaw_observed: (M,) share of
     combinations. corrections: (C, B, 3, 3).
     """
 
@@ -72,12 +75,12 @@ class RunOutcome:
 
 @dataclass(frozen=True)
 class SeedOutcome:
-    """One seed. by_set: one per set, E are the windows of `protocol.WINDOWS_S`.
+    """Result of one seed. by_set: one per set, E are the windows of `protocol.WINDOWS_S`.
 
-    each, single_heading: one per run of `each_runs` and `single_headings`. pull: (G, V, B) by how much noise in the
-    reference moves the first scale state. baselines: (S, K) Avg.VRMSE of `baselines.BASELINES`. convergence: (L,
-    curves, T, 3) squared errors of the misalignment over time on each of the runs, see `convergence`. failures: what
-    raised, and is nan.
+    each, single_heading: one per run of `each_runs` and `single_headings`. pull: (G, V, B) change of the first scale
+    state by noise in the reference. baselines: (S, K) Avg.VRMSE of `baselines.BASELINES`. convergence: (L, curves, T,
+    3) squared errors of the misalignment over time on each run, see `convergence`. failures: exceptions, whose results
+    are nan.
     """
 
     by_set: tuple[RunOutcome, ...]
@@ -90,7 +93,7 @@ class SeedOutcome:
 
 
 def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
-    """The whole procedure with the noise of one seed."""
+    """Run the whole procedure with one noise seed."""
     measured = {name: dvl_velocities(run, seed) for name, run in procedure.runs.items()}
     moments = {name: RunMoments.of(measured[name], run.velocity) for name, run in procedure.runs.items()}
     failures: list[Failure] = []
@@ -151,7 +154,7 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
 
 
 def seed_or_failure(procedure: Procedure, seed: int) -> SeedOutcome | Failure:
-    """`run_seed`, or why there is nothing of that seed."""
+    """Return `run_seed`, or its exception."""
     try:
         return run_seed(procedure, seed)
     except Exception as error:
@@ -167,7 +170,7 @@ def _others(moments: Mapping[str, RunMoments], name: str) -> RunMoments:
 
 
 def _baselines(data: SensorData, window_s: float | None, failures: list[Failure]) -> list[Array]:
-    """Corrections (B, 3, 3) by each of the baselines; nan where one raises."""
+    """Return corrections (B, 3, 3) by each baseline; nan if it raises."""
     end = data.run.first(window_s)
     found = []
     for name, align in BASELINES.items():
@@ -180,12 +183,12 @@ def _baselines(data: SensorData, window_s: float | None, failures: list[Failure]
 
 
 def sensor_data(run: Trajectory, seed: int) -> SensorData:
-    """A run as the sensors see it with every combination of errors."""
+    """Simulate the sensors of a run with every combination of errors."""
     return SensorData(run, dvl_velocities(run, seed), references(run, seed))
 
 
 def dvl_velocities(run: Trajectory, seed: int) -> Array:
-    """What the DVL measures (B, N, 3) m/s with every combination of errors."""
+    """Simulate DVL velocities (B, N, 3) m/s with every combination of errors."""
     return np.stack(
         [
             protocol.unit_under_test(run.velocity, errors, protocol.random_stream("dvl", seed, run.name, index))
@@ -195,7 +198,7 @@ def dvl_velocities(run: Trajectory, seed: int) -> Array:
 
 
 def references(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) -> Array:
-    """What GNSS measures (B, N, 3) m/s, with other noise in every combination."""
+    """Simulate GNSS velocities (B, N, 3) m/s, with independent noise per combination."""
     return np.stack(
         [
             protocol.reference(run.velocity, protocol.random_stream("gnss", seed, run.name, index), gnss_std)
@@ -209,13 +212,13 @@ def _part(data: SensorData, start: int, end: int) -> SensorData:
 
 
 def corrections(model: Model, state: GaussianState) -> Array:
-    """Correction matrices (..., 3, 3) of states x (..., n)."""
+    """Return correction matrices (..., 3, 3) of states x (..., n)."""
     terms = state.x @ model.error_terms_from_state.T
     return correction_matrix(terms[..., :3], terms[..., 3:], np.eye(3))
 
 
 def true_state(model: Model) -> Array:
-    """(B, n) error states that the model should find; a scale that stands for several axes should find their mean."""
+    """Return the true error states (B, n) of a model; a scale common to several axes is their mean."""
     from_state = model.error_terms_from_state[:, : model.n_errors]
     return protocol.truth() @ np.linalg.pinv(from_state).T
 
@@ -229,7 +232,7 @@ def _calibrate(
     procedure: Procedure,
     failures: list[Failure],
 ) -> RunOutcome:
-    """models: which of the procedure's. own: index of the run's own window."""
+    """Calibrate some of the procedure's models on one run. own: index of the run's own window."""
     states = estimate(models, data, procedure.parameters, ends, failures)
     n_variants = len(data.velocity_dvl)
     matrices = np.full((len(ends), procedure.n_columns, n_variants, 3, 3), np.nan)
@@ -250,34 +253,31 @@ def _calibrate(
     return RunOutcome(by_time, by_time[own], errors, std, yaw_observed, matrices[own])
 
 
-# ------------------------------------------------------------------ studies
-
-
 def runs_with_attitude(runs: Mapping[str, Trajectory]) -> list[str]:
-    """Names of the trajectories that have attitude."""
+    """Return the names of the trajectories with attitude."""
     return [name for name, run in runs.items() if run.rotation_enu_from_body is not None]
 
 
 def each_runs(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
-    """What `SeedOutcome.each` calibrates on."""
+    """Return the calibration runs of `SeedOutcome.each`."""
     return tuple(_described(runs[name], 0, len(runs[name].time)) for name in runs_with_attitude(runs))
 
 
 def single_headings(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
-    """What `SeedOutcome.single_heading` calibrates on."""
+    """Return the calibration runs of `SeedOutcome.single_heading`."""
     legs = [leg for name in runs_with_attitude(runs) for leg in _legs(runs[name])]
     return tuple(_described(runs[name], start, end) for name, start, end in legs)
 
 
 def _described(run: Trajectory, start: int, end: int) -> CalibrationRun:
     rotation = run.rotation_enu_from_body
-    assert rotation is not None  # only runs with attitude are asked for
+    assert rotation is not None  # only runs with attitude get here
     from_s, to_s = (float(run.time[at] - run.time[0]) for at in (start, end - 1))
     return CalibrationRun(run.name, from_s, to_s, heading_spread(rotation[start:end]))
 
 
 def _legs(run: Trajectory) -> list[tuple[str, int, int]]:
-    """Stretches (name, start, end) on one heading, from the start on, as long as they get."""
+    """Return stretches (name, start, end) on one heading, greedily from the start."""
     rotation = run.rotation_enu_from_body
     assert rotation is not None
     heading = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
@@ -296,12 +296,12 @@ def _legs(run: Trajectory) -> list[tuple[str, int, int]]:
 
 
 def models_in_noise_study(models: Sequence[str]) -> tuple[str, ...]:
-    """Models with a reference velocity that estimate a scale."""
+    """Return the models with a reference velocity that estimate a scale."""
     return tuple(name for name in models if MODELS[name].aided and MODELS[name].scale_axes)
 
 
 def _noise_study(procedure: Procedure, data: SensorData, seed: int, failures: list[Failure]) -> Array:
-    """By how much noise of each size in the reference moves the first scale state (G, V, B)."""
+    """Return the change of the first scale state by noise of each level in the reference (G, V, B)."""
     models = models_in_noise_study(procedure.studied)
     if not models:
         return np.empty((0, len(NOISE_STUDY_STD), len(protocol.COMBINATIONS)))
@@ -319,6 +319,6 @@ def _noise_study(procedure: Procedure, data: SensorData, seed: int, failures: li
 
 
 def noise_study_run(procedure: Procedure) -> Trajectory:
-    """The run of the study of errors in variables: constant speed, since the formula has one ‖v‖."""
+    """Return the run of the errors-in-variables study: constant speed, because the formula has a single ‖v‖."""
     names = {each.name: each.calibration_run for each in protocol.SETS}
     return procedure.runs[names[NOISE_STUDY_SET]]

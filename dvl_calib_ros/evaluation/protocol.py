@@ -1,14 +1,14 @@
 """The published validation procedure: injected errors, data sets, published figures, trajectories.
 
-Source: Yampolsky and Klein, "Information-Aided DVL Calibration"; the paper publishes neither P0, R nor its noise
-seeds. Errors and beams are those of the recorded frame (forward-right-down); what comes out is forward-left-up.
+Source: Yampolsky and Klein, "Information-Aided DVL Calibration". The paper publishes neither P0, R nor its noise seeds.
+Errors and beams use the recorded frame (forward-right-down); results are forward-left-up.
 
     Txx_dvl.csv       time s; velocity over ground m/s, body frame: surge (forward), sway (starboard), heave (down)
     Txx_attitude.csv  optional: time s, the same stamps; roll, pitch, yaw rad of that body in north-east-down, Z-Y-X
 
 The recorded velocities are public: T01-T13 in github.com/ansfl/A-KIT (its runs 1-10, 13, 11, 12), T14 and T15 in
-github.com/ansfl/BeamsNet (windows of its training velocities, turned by -44.4° about z into the body). Neither names
-a licence, so they are fetched by who needs them and no part of this project.
+github.com/ansfl/BeamsNet (windows of its training velocities, rotated by -44.4° about z to the body). Neither has a
+licence, so users download them, and this project does not include them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ SETS = (
     CalibrationSet("E4", "T15", None),
 )
 WINDOWS_S: tuple[float | None, ...] = (50.0, 100.0, 120.0, 140.0, 160.0, 180.0, 200.0, None)
-# Runs that the models with attitude are judged on: manoeuvres, none of them a calibration run of the paper
+# runs to evaluate models with attitude: manoeuvres, none of them a calibration run of the paper
 MANOEUVRING = tuple(f"T{number:02d}" for number in range(1, 11))
 TRAJECTORIES = tuple(f"T{number:02d}" for number in range(1, 16))
 
@@ -72,43 +72,43 @@ COMBINATIONS: tuple[DvlErrors, ...] = tuple(
 
 
 def combination_in_words(index: int) -> str:
-    """A combination as a reader wants it."""
+    """Describe a combination of errors."""
     angles, percent = list(product(MISALIGNMENTS_DEG, SCALES_PERCENT))[index]
     return f"misalignment {angles} °, scale {percent} %, forward-right-down"
 
 
 @cache
 def truth() -> Array:
-    """φ (rad) and δk (B, 6) of every combination, as an estimate in forward-left-up should find them.
+    """Return φ (rad) and δk (B, 6) of every combination, as estimates in forward-left-up.
 
-    The beam biases are in no model's state.
+    The beam biases are not part of any model.
     """
     pairs = [equivalent_error_terms(errors) for errors in COMBINATIONS]
     return np.array([[*FLU_FROM_FRD @ misalignment, *scale] for misalignment, scale in pairs])
 
 
 def unit_under_test(velocity_flu: Array, errors: DvlErrors, rng: np.random.Generator) -> Array:
-    """What the DVL with these errors measures (N, 3) m/s of a velocity over ground, both forward-left-up."""
+    """Simulate a DVL with these errors (N, 3) m/s from a velocity over ground, both forward-left-up."""
     return measure_dvl(velocity_flu @ FLU_FROM_FRD, errors, np.eye(3), rng) @ FLU_FROM_FRD
 
 
 def reference(velocity_flu: Array, rng: np.random.Generator, gnss_std: float = GNSS_STD) -> Array:
-    """The GNSS velocity (N, 3) m/s of a velocity over ground, body frame."""
+    """Simulate GNSS (N, 3) m/s from a velocity over ground, body frame."""
     return measure_gnss(velocity_flu, gnss_std, rng)
 
 
 def random_stream(sensor: str, seed: int, trajectory: str, combination: int) -> np.random.Generator:
-    """Generator of one sensor's noise.
+    """Return the generator of one sensor's noise.
 
-    Keyed by what it is for, so that no result depends on the order or the number of workers.
+    It depends only on its purpose, so that results do not depend on the order or number of workers.
     """
     return np.random.default_rng([seed, combination, crc32(f"{sensor} {trajectory}".encode())])
 
 
 LONGEST_WINDOW_S = max(window for window in WINDOWS_S if window is not None)
-SHORTEST_S = 60.0  # of a trajectory that is only evaluated on
+SHORTEST_S = 60.0  # of a trajectory used only for evaluation
 MIN_OTHERS = 2
-# Faster than any vehicle with a DVL: the file is in other units
+# faster than any vehicle with a DVL: wrong units
 MAX_SPEED = 10.0
 LARGEST_ANGLES = np.array([np.pi, np.pi / 2, 2 * np.pi])
 
@@ -117,8 +117,8 @@ LARGEST_ANGLES = np.array([np.pi, np.pi / 2, 2 * np.pi])
 class Trajectory:
     """A recorded run. Body frame forward-left-up.
 
-    time: (N,) s. velocity: (N, 3) m/s over ground, taken for the truth. rotation_enu_from_body: (N, 3, 3),
-    angular_velocity: (N, 3) rad/s in the body frame, None without attitude.
+    time: (N,) s. velocity: (N, 3) m/s over ground, used as truth. rotation_enu_from_body: (N, 3, 3), angular_velocity:
+    (N, 3) rad/s in the body frame, None without attitude.
     """
 
     name: str
@@ -129,7 +129,7 @@ class Trajectory:
 
     @cached_property
     def quaternions(self) -> Array:
-        """(N, 4) x, y, z, w of the attitude, which the run has."""
+        """Quaternions (N, 4) x, y, z, w of the attitude, which the run must have."""
         quaternions: Array = Rotation.from_matrix(self.rotation_enu_from_body).as_quat()
         return quaternions
 
@@ -139,13 +139,13 @@ class Trajectory:
         return float((self.time[-1] - self.time[0]) * len(self.time) / (len(self.time) - 1))
 
     def first(self, window_s: float | None) -> int:
-        """Number of samples in the first window_s (None: all)."""
+        """Return the number of samples in the first window_s (None: all)."""
         if window_s is None:
             return len(self.time)
         return int(np.searchsorted(self.time, self.time[0] + window_s))
 
     def part(self, start: int, end: int) -> Trajectory:
-        """Samples start .. end - 1."""
+        """Return the samples start .. end - 1."""
         rotation, rates = self.rotation_enu_from_body, self.angular_velocity
         return Trajectory(
             self.name,
@@ -157,10 +157,10 @@ class Trajectory:
 
 
 def load_folder(folder: Path, partial: bool = False) -> tuple[dict[str, Trajectory], tuple[str, ...]]:
-    """The trajectories of a folder by name, and what is to be known about them.
+    """Load the trajectories of a folder by name; also return notes.
 
-    partial: go on without those that are missing, as long as the procedure makes sense at all. Raises InputError naming
-    the file, and the row where there is one.
+    partial: continue without missing trajectories, if the procedure remains meaningful. Raises InputError with file and
+    row.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give one with T01_dvl.csv .. T15_dvl.csv, or none")
@@ -182,12 +182,12 @@ def _check_missing(folder: Path, missing: list[str], partial: bool) -> None:
     if missing and not enough:
         raise InputError(f"{folder}: {files} missing; it takes {', '.join(needed)} and {MIN_OTHERS} others at least")
     if missing and not partial:
-        raise InputError(f"{folder}: {files} missing; fetch what is missing, or go on without it by --partial")
+        raise InputError(f"{folder}: {files} missing; fetch these files, or continue without them by --partial")
 
 
 def _load(folder: Path, name: str, shortest_s: float) -> Trajectory:
     path = folder / f"{name}_dvl.csv"
-    time, velocity = _whole(path, "m/s")
+    time, velocity = _read_whole_file(path, "m/s")
     fast = np.linalg.norm(velocity, axis=1) > MAX_SPEED
     if fast.any():
         row = int(np.argmax(fast))
@@ -203,8 +203,8 @@ def _load(folder: Path, name: str, shortest_s: float) -> Trajectory:
     return _with_attitude(run, attitude) if attitude.is_file() else run
 
 
-def _whole(path: Path, unit: str) -> tuple[Array, Array]:
-    """Time and values of a file of which nothing is missing, or averages would not be those of the procedure."""
+def _read_whole_file(path: Path, unit: str) -> tuple[Array, Array]:
+    """Return time and values of a file without omissions, because the procedure averages over whole files."""
     time, values, left_out = read_columns(path, unit)
     if left_out:
         raise InputError(f"{left_out[0]}; the procedure takes whole files, fetch it again")
@@ -212,7 +212,7 @@ def _whole(path: Path, unit: str) -> tuple[Array, Array]:
 
 
 def _with_attitude(run: Trajectory, path: Path) -> Trajectory:
-    time, rpy = _whole(path, "rad")
+    time, rpy = _read_whole_file(path, "rad")
     wide = (np.abs(rpy) > LARGEST_ANGLES + 1e-9).any(axis=1)
     if wide.any():
         raise InputError(f"{path}: row {int(np.argmax(wide)) + 1} holds no roll, pitch, yaw in rad; convert the file")
@@ -220,12 +220,12 @@ def _with_attitude(run: Trajectory, path: Path) -> Trajectory:
     apart = np.abs(time[:common] - run.time[:common]) > 1e-6
     if apart.any() or len(time) != len(run.time):
         row = int(np.argmax(apart)) if apart.any() else common
-        raise InputError(f"{path}: row {row + 1}: its time is not that of {run.name}_dvl.csv; resample it to that")
+        raise InputError(f"{path}: row {row + 1}: its time differs from {run.name}_dvl.csv; resample it")
     rotation = attitude_enu_flu_from_ned_frd(rpy)
     return Trajectory(run.name, run.time, run.velocity, rotation, angular_velocities(time, rotation))
 
 
-# Own trajectories: kind of motion, length (s), whether attitude is recorded; lengths and rate as the published ones
+# simulated trajectories: kind of motion, length (s), whether attitude is recorded; lengths and rate as published
 _MANOEUVRES = ("box", "lawnmower", "figure8")
 _OWN: Mapping[str, tuple[str, float, bool]] = {
     **{f"T{number:02d}": (_MANOEUVRES[number % 3], 400.0, True) for number in range(1, 12)},
@@ -236,18 +236,18 @@ _OWN: Mapping[str, tuple[str, float, bool]] = {
 }
 _RATE_HZ = 1.0
 _MOTION_RATE_HZ = 20.0
-_CURRENT_STD = 0.1  # m/s, east and north, another one on every trajectory
+_CURRENT_STD = 0.1  # m/s, east and north, different on every trajectory
 _SEED = 2026
 
 
 def own_trajectories() -> dict[str, Trajectory]:
-    """Fifteen trajectories from the project's generator, of the lengths and kinds of the published ones."""
+    """Return fifteen simulated trajectories with the lengths and kinds of the published ones."""
     return {name: _simulated(name, *kind) for name, kind in _OWN.items()}
 
 
 def _simulated(name: str, kind: str, seconds: float, with_attitude: bool) -> Trajectory:
     rng = np.random.default_rng([_SEED, *name.encode()])
-    skipped_s = float(np.floor(rng.uniform(0.0, 100.0)))  # so that two of one kind are not the same run
+    skipped_s = float(np.floor(rng.uniform(0.0, 100.0)))  # so that two of one kind differ
     motion = make_motion(kind, skipped_s + seconds, _MOTION_RATE_HZ)
     at = slice(int(skipped_s * _MOTION_RATE_HZ), None, int(_MOTION_RATE_HZ / _RATE_HZ))
     rotation = motion.rotation_enu_from_body[at]

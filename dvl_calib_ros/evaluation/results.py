@@ -1,8 +1,7 @@
-"""What an evaluation found: immutable plain data that outlives the code that made it.
+"""Results of an evaluation, as immutable plain data.
 
-Axes of the arrays are named in the docstrings: S sets, C columns (uncalibrated, then the models), M models, W windows,
-L runs, Q seeds. All velocities in m/s, angles in rad, nan where a model cannot run on that data (a model that needs
-attitude on a run without).
+Array axes in the docstrings: S sets, C columns (uncalibrated, then the models), M models, W windows, L runs, Q seeds.
+All velocities in m/s, angles in rad; nan if a model cannot run on the data (for example without attitude).
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ UNCALIBRATED = "uncalibrated"
 
 
 def mean_of_known(values: Array, axis: int | tuple[int, ...]) -> Array:
-    """Mean along axes of what is not nan; nan where all of it is."""
+    """Return the mean along axes without nan; nan if all values are."""
     known = np.isfinite(values)
     count = np.asarray(known.sum(axis=axis))
     total = np.asarray(np.where(known, values, 0.0).sum(axis=axis))
@@ -30,7 +29,7 @@ def mean_of_known(values: Array, axis: int | tuple[int, ...]) -> Array:
 
 
 class Improvement(NamedTuple):
-    """Mean velocity error (m/s) without a correction, and with that of the model that improves it most."""
+    """Mean velocity error (m/s) without correction, and with the model that reduces it most."""
 
     model: str
     before: float
@@ -38,7 +37,7 @@ class Improvement(NamedTuple):
 
     @staticmethod
     def of(models: Sequence[str], corrected: Array, uncorrected: Array) -> Improvement:
-        """Of models (M): corrected (M, ...), uncorrected (...); each where both are known."""
+        """Compute from corrected (M, ...) and uncorrected (...) errors of M models, where both are known."""
         found = []
         for name, after in zip(models, corrected, strict=True):
             both = np.isfinite(after) & np.isfinite(uncorrected)
@@ -49,11 +48,11 @@ class Improvement(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """better, not_better or not_known."""
+        """Answer: better, not_better or not_known."""
         return "not_known" if not self.model else "better" if self.after < self.before else "not_better"
 
     def sentence(self, what: str) -> str:
-        """Word it. what: bags or runs."""
+        """Return the sentence. what: bags or runs."""
         if not self.model:
             return f"Nothing could be calibrated and checked on other {what}."
         error = f"{self.model} leaves a velocity error of {self.after:.3f} m/s rms"
@@ -62,10 +61,10 @@ class Improvement(NamedTuple):
 
 @dataclass(frozen=True)
 class Failure:
-    """What raised and was left out: one estimate of many, or a whole seed.
+    """An omitted result whose computation raised: one estimate of many, or a whole seed.
 
-    what: a model, a baseline, or what else was tried. run: trajectory or set. combination, seed: which; None for all
-    of them. why: the exception in one line.
+    what: a model, a baseline, or another computation. run: trajectory or set. combination, seed: None for all of them.
+    why: the exception in one line.
     """
 
     what: str
@@ -76,7 +75,7 @@ class Failure:
 
     @staticmethod
     def of(error: Exception, what: str, run: str = "", combination: int | None = None) -> Failure:
-        """Of an exception."""
+        """Build from an exception."""
         said = " ".join(str(error).split())
         return Failure(what, run, combination, f"{type(error).__name__}: {said}" if said else type(error).__name__)
 
@@ -98,7 +97,7 @@ class CalibrationSet:
 
 @dataclass(frozen=True)
 class CalibrationRun:
-    """A stretch of a trajectory that is calibrated on, s from its start. heading_spread: circular std, rad."""
+    """A stretch of a trajectory for calibration, s from its start. heading_spread: circular std, rad."""
 
     trajectory: str
     from_s: float
@@ -108,11 +107,11 @@ class CalibrationRun:
 
 @dataclass(frozen=True)
 class Coverage:
-    """Share of errors (estimate - truth) that lie within the 68 % and 95 % intervals the model's σ claims.
+    """Share of errors (estimate - truth) within the model's 68 % and 95 % intervals.
 
     model: name. state_names: the n error states (nuisance states have no truth). within_68, within_95: (n,) per state.
     pooled_68, pooled_95: over all states. n_errors: errors per state. mean_error, rms_error, mean_std: (n,).
-    normalised_rms: rms of error / σ over all states, 1 for an honest σ, by how much it is too small above.
+    normalised_rms: rms of error / σ over all states: 1 for a correct σ, larger if σ is too small.
     """
 
     model: str
@@ -130,11 +129,11 @@ class Coverage:
 
 @dataclass(frozen=True)
 class ErrorsInVariables:
-    """How noise in the reference pulls the scale estimate.
+    """Bias of the scale estimate by noise in the reference (errors in variables).
 
-    models: the G models with GNSS that estimate scale. gnss_std: (V,) m/s. predicted, measured: (G, V) pull of the
+    models: the G models with GNSS that estimate scale. gnss_std: (V,) m/s. predicted, measured: (G, V) bias of the
     model's first scale state, dimensionless; measured is a mean over combinations and seeds, standard_error (G, V) its
-    standard error. noisy_axes: (G,) axes of the reference whose noise is in that state's regressor. formula: in words.
+    standard error. noisy_axes: (G,) axes of the reference whose noise is in that state's regressor. formula: as text.
     """
 
     models: tuple[str, ...]
@@ -148,10 +147,10 @@ class ErrorsInVariables:
 
 @dataclass(frozen=True)
 class EachStudy:
-    """Calibrate on each of L runs with attitude, evaluate on all other trajectories.
+    """Calibration on each of L runs with attitude, evaluated on all other trajectories.
 
-    runs: (L,). avg_vrmse: (L, C, Q). yaw_observed: (L, M) share of combinations and seeds in which the model says that
-    it has seen yaw. coverage: per model, over runs, combinations and seeds.
+    runs: (L,). avg_vrmse: (L, C, Q). yaw_observed: (L, M) share of combinations and seeds in which yaw is observable
+    for the model. coverage: per model, over runs, combinations and seeds.
     """
 
     runs: tuple[CalibrationRun, ...]
@@ -160,7 +159,7 @@ class EachStudy:
     coverage: tuple[Coverage, ...]
 
     def median(self, trajectories: Collection[str] | None = None) -> Array:
-        """(C,) median over the runs (of these trajectories) of the mean over the seeds; nan without such runs."""
+        """Return the median (C,) over runs (of these trajectories) of the mean over seeds, or nan."""
         rows = [i for i, run in enumerate(self.runs) if trajectories is None or run.trajectory in trajectories]
         if not rows:
             return np.full(self.avg_vrmse.shape[1], np.nan)
@@ -168,21 +167,21 @@ class EachStudy:
 
     @property
     def run_names(self) -> list[str]:
-        """(L,) as people name them."""
+        """Displayed names (L,) of the runs."""
         return [f"{run.trajectory} {run.from_s:.0f}–{run.to_s:.0f} s" for run in self.runs]
 
     @property
     def seed_mean(self) -> Array:
-        """(L, C) Avg.VRMSE, mean over the seeds."""
+        """Avg.VRMSE (L, C), mean over the seeds."""
         return mean_of_known(self.avg_vrmse, -1)
 
 
 @dataclass(frozen=True)
 class Trace:
-    """Velocity of one evaluated trajectory, for a picture: body frame, forward-left-up, N samples (decimated).
+    """Velocity of one evaluated trajectory for a figure: body frame, forward-left-up, N samples (decimated).
 
-    time: (N,) s. truth, uncorrected: (N, 3). corrected: model -> (N, 3). calibrated_on: a set's name. combination:
-    in words.
+    time: (N,) s. truth, uncorrected: (N, 3). corrected: model -> (N, 3). calibrated_on: a set's name. combination: as
+    text.
     """
 
     trajectory: str
@@ -195,17 +194,17 @@ class Trace:
 
     @property
     def best(self) -> str:
-        """The model that does best on it."""
+        """Model with the smallest error."""
         return min(self.corrected, key=lambda name: float(((self.corrected[name] - self.truth) ** 2).sum()))
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Hold-out verification of one model's calibration on one set: velocity error (vector rms, m/s) against the
-    reference, its noise included, on samples that the calibration had not seen.
+    """Hold-out verification of one model's calibration on one set.
 
-    uncorrected, corrected, predicted: rms over combinations of errors. verdict: the one most of them got. verdicts: how
-    many got which.
+    Velocity error (vector rms, m/s) against the reference, including its noise, on samples that the calibration did not
+    use. uncorrected, corrected, predicted: rms over combinations of errors. verdict: the most frequent one. verdicts:
+    count of each.
     """
 
     set_name: str
@@ -219,7 +218,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class ConvergenceCurve:
-    """One way to calibrate. name: model or baseline. gnss_std: noise of the reference, m/s, None without any.
+    """Error over time of one method. name: model or baseline. gnss_std: noise of the reference, m/s, None without one.
 
     rms: (T, 3) rad about the body's x, y, z at `convergence.TIMES_S`, over runs, combinations of errors and seeds.
     """
@@ -230,30 +229,30 @@ class ConvergenceCurve:
 
     @property
     def angle_deg(self) -> Array:
-        """(T,) rms of the whole angle, degrees."""
+        """Rms (T,) of the whole angle, degrees."""
         return np.degrees(np.sqrt((self.rms**2).sum(axis=1)))
 
     @property
     def level_deg(self) -> Array:
-        """(T,) rms of pitch and yaw together, degrees: what turns a velocity ahead."""
+        """Rms (T,) of pitch and yaw together, degrees, which rotate a forward velocity."""
         return np.degrees(np.sqrt((self.rms[:, 1:] ** 2).sum(axis=1)))
 
     @property
     def label(self) -> str:
-        """In words."""
+        """Label of the curve."""
         return f"{self.name}, no reference" if self.gnss_std is None else f"{self.name}, {self.gnss_std:g} m/s"
 
 
 @dataclass(frozen=True, repr=False)
 class Evaluation(Answering):
-    """The published procedure and the studies around it.
+    """Result of the published procedure and the studies around it.
 
-    source: folder or generator, in words. own_generator: True if the trajectories are not recorded ones, so that the
-    published figures do not apply. notes: what the reader must know. columns: `UNCALIBRATED`, then the models.
-    avg_vrmse: (S, C, Q). windows_s: (W,), None is all. avg_vrmse_by_time: (S, W, C, Q). published: set -> column ->
-    m/s. coverage: over the sets; coverage_of_all: over these and the runs of `each`. parameters: as used, plain
-    values. baselines: (S,) Avg.VRMSE of what was done before, by name. convergence: the misalignment's error against
-    time. failures: what raised, and is in none of these. version: of the software.
+    source: folder or generator, as text. own_generator: whether the trajectories are simulated, so that the published
+    figures do not apply. notes: warnings. columns: `UNCALIBRATED`, then the models. avg_vrmse: (S, C, Q). windows_s:
+    (W,), None is all. avg_vrmse_by_time: (S, W, C, Q). published: set -> column -> m/s. coverage: over the sets.
+    coverage_of_all: over these and the runs of `each`. parameters: plain values. baselines: (S,) Avg.VRMSE of earlier
+    methods, by name. convergence: error of the misalignment over time. failures: exceptions; their results are
+    excluded. version: of the software.
     """
 
     source: str
@@ -283,12 +282,12 @@ class Evaluation(Answering):
 
     @property
     def improvement(self) -> Improvement:
-        """How much the best of the models improves runs that it was not calibrated on, over all sets and seeds."""
+        """Improvement by the best model, on runs that it was not calibrated on, over all sets and seeds."""
         return Improvement.of(self.models, self.avg_vrmse[:, 1:].swapaxes(0, 1), self.avg_vrmse[:, 0])
 
     @property
     def verdict(self) -> str:
-        """The answer: better, not_better or not_known."""
+        """Answer: better, not_better or not_known."""
         return self.improvement.verdict
 
     @property
@@ -297,7 +296,7 @@ class Evaluation(Answering):
         return (UNCALIBRATED, *self.models)
 
     def best(self, values: Array) -> dict[str, tuple[str, float]]:
-        """Of values (C,): name and value of the lowest model with GNSS, and of that without, where there is one."""
+        """Return name and smallest of values (C,) among the models with GNSS, and among those without, if any."""
         found = {
             words: [
                 (name, float(value))
@@ -309,36 +308,36 @@ class Evaluation(Answering):
         return {words: min(each, key=lambda pair: pair[1]) for words, each in found.items() if each}
 
     def of_models(self, values: Array) -> Array:
-        """Of values (..., C) those of the models (..., M)."""
+        """Select the models' part (..., M) of values (..., C)."""
         return np.asarray(values[..., [self.columns.index(name) for name in self.models]])
 
     @property
     def seed_mean(self) -> Array:
-        """(S, C) Avg.VRMSE, mean over the seeds."""
+        """Avg.VRMSE (S, C), mean over the seeds."""
         return mean_of_known(self.avg_vrmse, -1)
 
     @property
     def seed_mean_by_time(self) -> Array:
-        """(S, W, C) Avg.VRMSE, mean over the seeds."""
+        """Avg.VRMSE (S, W, C), mean over the seeds."""
         return mean_of_known(self.avg_vrmse_by_time, -1)
 
     @property
     def set_mean(self) -> Array:
-        """(C,) mean over the sets of `seed_mean`; nan where a model does not run on every set."""
+        """Mean (C,) over the sets of `seed_mean`; nan if a model does not run on every set."""
         return np.asarray(self.seed_mean.mean(axis=0))
 
     @property
     def published_table(self) -> Array:
-        """(S, C) published Avg.VRMSE, nan where there is none."""
+        """Published Avg.VRMSE (S, C), nan if missing."""
         rows = [[self.published.get(each.name, {}).get(c, np.nan) for c in self.columns] for each in self.sets]
         return np.array(rows, dtype=float)
 
     @property
     def published_of_these(self) -> Array:
-        """(S, C) `published_table`; nan everywhere if the trajectories are others."""
+        """`published_table` (S, C), or nan everywhere if the trajectories are others."""
         return np.full_like(self.published_table, np.nan) if self.own_generator else self.published_table
 
     @property
     def ratio(self) -> Array:
-        """(S, C) here over published."""
+        """Ratio (S, C) of this result to the published one."""
         return self.seed_mean / self.published_table

@@ -50,18 +50,18 @@ from .results import (
     mean_of_known,
 )
 
-# Without those that take a calibration for each combination: minutes, where they are named.
+# without models that need a calibration per combination: they take minutes, and run only where they are named
 EVALUATED = tuple(name for name in BY_VELOCITY if not MODELS[name].estimator)
-# What evaluation sets otherwise than a live calibration: the published procedure has no gate, and M5 and M6 come out
-# as published with the prior from the reference velocity. Its GNSS measures three axes, also where heave is zero.
+# Parameters that differ from a live calibration: the published procedure has no gate, and M5 and M6 match the published
+# results with the prior from the reference velocity. Its GNSS measures three axes, also if heave is zero.
 DEFAULTS: Mapping[str, Any] = {"gate_probability": 0.0, "prior_source": "reference", "gnss_axes": "xyz"}
-# The unit under test is mounted straight, at the reference point, in step, and its errors are constant.
+# the DVL is mounted without rotation, at the reference point, without delay, and its errors are constant
 FIXED = ("mounting_rpy", "lever_arm", "dvl_time_offset", "initial_calibration", "process_std_misalignment",
          "process_std_scale", "max_speed")  # fmt: skip
-# Trajectories and the combination of the pictures
+# trajectories and combination of the figures
 TRACED, TRACED_COMBINATION = ("T01", "T07"), 0
 TRACE_SAMPLES = 400
-# Failures that a note names
+# number of failures named in a note
 NAMED_FAILURES = 5
 
 OWN_NOTES: tuple[str, ...] = ("simulated trajectories: the published figures are for others, so no ratio is given",)
@@ -79,10 +79,10 @@ def evaluate(
     workers: Workers = Workers(),  # noqa: B008  (frozen)
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> Evaluation:
-    """Run the procedure over a folder of trajectories, or without one over the project's own.
+    """Run the procedure on a folder of trajectories, or on simulated ones.
 
-    parameters: as for the node, see `DEFAULTS` and `FIXED`. What raises among the estimates is left out, and is in
-    `Evaluation.failures` and its notes. Raises InputError, also where nothing is left.
+    parameters: as for the node, see `DEFAULTS` and `FIXED`. Estimates that raise are omitted, and listed in
+    `Evaluation.failures` and its notes. Raises InputError, also if no result remains.
     """
     runs, notes = (own_trajectories(), OWN_NOTES) if folder is None else load_folder(folder, partial_folder)
     parameters, ignored = _for_procedure(parameters)
@@ -115,7 +115,7 @@ def evaluate(
     return Evaluation(
         source="own generator (simulated trajectories)" if own_generator else f"folder {folder}",
         own_generator=own_generator,
-        notes=(*notes, *ignored, *_left_out(failures)),
+        notes=(*notes, *ignored, *_failure_notes(failures)),
         trajectories=tuple(runs),
         models=procedure.models,
         sets=procedure.sets,
@@ -142,8 +142,8 @@ def evaluate(
     )
 
 
-def _left_out(failures: Sequence[Failure]) -> list[str]:
-    """A note that counts what raised, and names the first of it."""
+def _failure_notes(failures: Sequence[Failure]) -> list[str]:
+    """Return a note with the number of failures and the first one."""
     if not failures:
         return []
     named = "; ".join(map(str, failures[:NAMED_FAILURES]))
@@ -152,7 +152,7 @@ def _left_out(failures: Sequence[Failure]) -> list[str]:
 
 
 def _for_procedure(parameters: Parameters) -> tuple[Parameters, tuple[str, ...]]:
-    """The parameters that the procedure runs with, and a note for every one that it does not take."""
+    """Return the procedure's parameters, and a note on every parameter that it ignores."""
     defaults = {name: SCHEMA[name].default for name in FIXED}
     ignored = [name for name, default in defaults.items() if getattr(parameters, name) != default]
     notes = tuple(f"{name} is not used by the procedure" for name in ignored)
@@ -175,7 +175,7 @@ def _coverage(models: Sequence[str], outcomes: Sequence[RunOutcome]) -> tuple[Co
 def _each_study(
     procedure: Procedure, runs: tuple[CalibrationRun, ...], outcomes: Sequence[Sequence[RunOutcome]]
 ) -> EachStudy | None:
-    """outcomes: per seed, one per run."""
+    """Summarise a study. outcomes: per seed, one per run."""
     if not runs:
         return None
     return EachStudy(
@@ -206,11 +206,11 @@ def _errors_in_variables(procedure: Procedure, outcomes: Sequence[SeedOutcome]) 
 
 
 def _predicted_pull(name: str, run: Trajectory, std: Array) -> tuple[Array, float]:
-    """Pull of a model's first scale state by noise (V,) m/s in the reference, after `FORMULA`, and its noisy axes.
+    """Return the bias of a model's first scale state by reference noise (V,) m/s, and the noisy axes.
 
-    Least squares with a noisy regressor h + n finds E‖h‖² / (E‖h‖² + E‖n‖²) of its coefficient (attenuation); here
-    the noise is in z as well, so that what is lost is of 1 + δk, not of δk. Which axes of the reference are in h is
-    asked of the model itself: by how much does h move with a step along each axis?
+    By `FORMULA`: least squares with a noisy regressor h + n attenuates its coefficient by E‖h‖² / (E‖h‖² + E‖n‖²). Here
+    the noise is in z as well, so the attenuation applies to 1 + δk instead of δk. The noisy axes are found from the
+    change of the model's h by a step along each axis of the reference.
     """
     regressor = _scale_regressor(name, run.velocity, np.zeros(3), run)
     steps = [_scale_regressor(name, run.velocity, step, run) - regressor for step in np.eye(3)]
@@ -220,7 +220,7 @@ def _predicted_pull(name: str, run: Trajectory, std: Array) -> tuple[Array, floa
 
 
 def _scale_regressor(name: str, velocity: Array, step: Array, run: Trajectory) -> Array:
-    """Column of H of the first scale state (N, m), with a reference that is off by a step (m/s)."""
+    """Return the column of H for the first scale state (N, m), with `step` (m/s) added to the reference."""
     _, h = MODELS[name].linearise(
         Observations(
             velocity_dvl=velocity,
@@ -235,7 +235,7 @@ def _scale_regressor(name: str, velocity: Array, step: Array, run: Trajectory) -
 
 
 def _traces(procedure: Procedure, seed: int, outcome: SeedOutcome) -> list[Trace]:
-    """Pictures of corrections with what the first set found."""
+    """Return example velocities corrected by the calibration on the first set."""
     traces = []
     calibrated_on, corrections = procedure.sets[0], outcome.by_set[0].corrections[1:, TRACED_COMBINATION]
     for name in TRACED:
@@ -259,20 +259,20 @@ def _traces(procedure: Procedure, seed: int, outcome: SeedOutcome) -> list[Trace
 
 
 def _corrected(models: Sequence[str], corrections: Array, measured: Array) -> Mapping[str, Array]:
-    """Model -> corrected velocities, of those that ran."""
+    """Return model -> corrected velocities, for usable models."""
     return {
         name: measured @ matrix.T for name, matrix in zip(models, corrections, strict=True) if np.isfinite(matrix).all()
     }
 
 
-# One combination of every misalignment: one by one takes ten times longer than many at once
+# one scale per misalignment, because individual calibrations take ten times longer than vectorised ones
 VERIFIED = slice(None, None, len(SCALES_PERCENT))
 
 
 def verify_set(
     procedure: Procedure, seed: int, calibration_set: CalibrationSet
 ) -> tuple[tuple[HeldOut, ...], tuple[Failure, ...]]:
-    """One entry per model that runs on the set, over `VERIFIED` combinations of errors; and those that raised."""
+    """Verify each usable model on the set, over `VERIFIED` combinations of errors; also return failures."""
     failures: list[Failure] = []
     data = sensor_data(procedure.runs[calibration_set.calibration_run], seed)
     results = _calibrate(data, data.run.first(calibration_set.window_s), procedure, failures)
@@ -285,7 +285,7 @@ def verify_set(
 
 
 def _calibrate(data: SensorData, end: int, procedure: Procedure, failures: list[Failure]) -> list[Result]:
-    """Result of every `VERIFIED` combination over the first `end` samples, without those that raise."""
+    """Calibrate every `VERIFIED` combination on the first `end` samples, without those that raise."""
     parameters = procedure.parameters
     prior = true_prior(data, parameters)
     stretch = SensorData(data.run.part(0, end), data.velocity_dvl[:, :end], data.reference[:, :end])

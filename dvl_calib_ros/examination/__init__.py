@@ -1,1 +1,1 @@
-"""What is in a recording, and whether it can calibrate: stamps, gaps, frames, covariances, locks, motion."""
+"""Examination of a recording for calibration: stamps, gaps, frames, covariances, bottom lock, motion."""

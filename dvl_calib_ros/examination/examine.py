@@ -1,4 +1,4 @@
-"""The examination of a recording: what is in it, what is wrong with it, what its motion can show."""
+"""Examination of a recording: content, faults, and what its motion makes observable."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 from . import topic_checks
 
-# A reference below this rate (Hz) leaves turns to a straight line; 1 Hz receivers are a little slow at times
+# a reference below this rate (Hz) interpolates turns by straight lines; 1 Hz receivers are a little slow at times
 SLOW_REFERENCE = 0.8
-# What is said first
+# prefix of the findings that are reported first
 NO_IMU = "DOCTOR_NO_IMU"
-# Speeds that differ by more are not in one unit
+# ratios of speeds outside this range mean different units
 UNIT_FACTORS = (0.7, 1.4)
 UNITS = {1000.0: "mm/s", 100.0: "cm/s", 1.0 / 0.514444: "knots", 3.6: "km/h", 1.0 / 0.3048: "feet/s"}
-# A vehicle is taken to move if so many of its samples are faster than min_speed
+# a vehicle counts as moving if this share of its samples is faster than min_speed
 MOVES_SHARE = 0.05
 
 
 @dataclass(frozen=True)
 class Content:
-    """A topic that the calibration needs. role: DVL, reference or IMU; frame_id: of its first message."""
+    """A topic that the calibration needs. role: DVL, reference or IMU. frame_id: of its first message."""
 
     role: str
     topic: str
@@ -60,9 +60,9 @@ class Content:
 
 @dataclass(frozen=True, repr=False)
 class Examination(Answering):
-    """What the doctor says of a recording.
+    """Result of the doctor.
 
-    judged: the verdict of a replay, which decides; reasons: of that verdict. cannot: why there is no replay, else ''.
+    judged: verdict of a replay, which decides. reasons: of that verdict. cannot: why there is no replay, else ''.
     """
 
     paths: tuple[Path, ...]
@@ -84,21 +84,22 @@ class Examination(Answering):
 
     @property
     def verdict(self) -> str:
-        """Whether it can calibrate: yes, partly, or no. No where a replay rejects, yes only where it accepts."""
+        """Fitness for calibration: yes, partly, or no. A rejecting replay means no; yes needs an accepting one."""
         if self.judged is Severity.REJECT:
             return "no"
-        needed = [each for each in self.shown if each.name in ("pitch", "yaw")]  # what turns a track and lifts it
+        # the angles that rotate and lift a track
+        needed = [each for each in self.shown if each.name in ("pitch", "yaw")]
         all_shown = bool(needed) and not any(each.needs for each in needed)
         return "yes" if self.judged is Severity.ACCEPT and all_shown else "partly"
 
     @property
     def against(self) -> tuple[Reason, ...]:
-        """Reasons of the replay's verdict that speak against its calibration."""
+        """Reasons of the replay's verdict against its calibration."""
         return tuple(each for each in self.reasons if each.severity in (Severity.REJECT, Severity.MARGINAL))
 
     @property
     def why(self) -> str:
-        """Why it cannot, or not all of it, in a sentence; '' where nothing is missing or the findings say it."""
+        """Sentence on why it cannot calibrate fully; '' if it can or the findings explain it."""
         errors = [each for each in self.findings if each.severity is Severity.ERROR]
         if errors:
             return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
@@ -112,7 +113,7 @@ class Examination(Answering):
         return f"Not shown yet: {listed}." if listed else ""
 
     def document(self) -> dict[str, Any]:
-        """Plain data, for JSON."""
+        """Return plain data for JSON."""
         return {
             "verdict": self.verdict,
             "replay": {"verdict": self.judged.value, "reasons": [each.as_dict() for each in self.reasons]},
@@ -140,7 +141,7 @@ class Examination(Answering):
 
 
 def examine(recording: Recording | Sequence[Path], parameters: Parameters, given: Given | None = None) -> Examination:
-    """Look at everything. Raises InputError for what is no recording or has no DVL."""
+    """Examine a recording. Raises InputError if it is no recording or has no DVL."""
     if not isinstance(recording, Recording):
         recording = open_recording(recording, parameters=parameters)
     discovery = discover(recording, parameters, given)
@@ -159,7 +160,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
     judged = Severity.REJECT if verification is None else verification.verdict
-    if judged is not Severity.REJECT:  # then nothing that was found stands in the way
+    if judged is not Severity.REJECT:  # the replay is usable, so no finding prevents a calibration
         findings = [each.weighed(Severity.WARNING) if _has_error([each]) else each for each in findings]
     return Examination(
         recording.paths,
@@ -180,7 +181,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
 
 
 def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | None, str]:
-    """Return the replay that `dvl-calib replay` makes, whose verdict is the doctor's; or why there can be none."""
+    """Return the replay of `dvl-calib replay`, whose verdict is the doctor's; or the reason why there is none."""
     guessed = bool(discovery.mounting_because)
     try:
         replayed = checked_replay(
@@ -210,15 +211,15 @@ def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> C
 
 
 def _claimed(variances: Array, window_s: float) -> str:
-    """σ per axis that messages claim, of positions in m. variances: (N, 3), of positions those of `Recorded`."""
+    """Format the claimed σ per axis, for positions in m. variances: (N, 3), of positions as in `Recorded`."""
     if not window_s:
         return f"{math.sqrt(float(np.median(variances.mean(axis=1)))):.2g} m/s"
-    # a velocity is made of two positions; one without a height claims that to be anywhere
+    # a velocity comes from two positions; one without height claims a huge vertical variance
     return f"{window_s * math.sqrt(0.5 * float(np.median(variances))):.2g} m"
 
 
 def _body_velocity(dvl: Recorded, look: Look | None, parameters: Parameters) -> Array:
-    """The DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
+    """Return the DVL's usable velocities (N, 3) m/s in the body, by the nominal mounting."""
     values = dvl.values[np.isfinite(dvl.values).all(axis=1) & (dvl.values != 0.0).any(axis=1)]
     values = values[np.linalg.norm(values, axis=1) <= parameters.max_speed]
     turned = turns_dvl(VELOCITY_TYPES[dvl.msgtype], "" if look is None else look.frame_id, parameters)
@@ -233,12 +234,12 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     for role, topic in streams.items():
         found += topic_checks.stamp_findings(topic, Stream(role), discovery.parameters)
         found += topic_checks.gap_findings(topic)
-    # where velocities and turns show how the clocks stand, it does not matter when messages arrived
+    # clock offsets estimated from velocities and turns make times of arrival irrelevant
     if not _has_error(found) and not _are_clocks_known(discovery):
         found += topic_checks.clock_findings(streams, discovery.parameters)
     found += topic_checks.velocity_findings(dvl, True)
     if reference is not None:
-        if not _has_error(found):  # which would be why
+        if not _has_error(found):  # an error would explain it
             found += topic_checks.apart_findings(dvl, reference)
         found += [] if over_legs else topic_checks.velocity_findings(reference, False)
         if (
@@ -254,8 +255,8 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
         what = "no lever arm is taken out or found" if reference is not None else "nothing tells the heading"
         found.append(finding("DOCTOR_NO_IMU", what=what) if in_body else finding("DOCTOR_NO_IMU_EARTH"))
-    told_by_log = any(each.code == "DOCTOR_CLOCKS" for each in found)  # whose clock it is, and by how much
-    without = None if discovery.clocks is None else discovery.clocks.doubt  # no calibration can be done with that
+    told_by_log = any(each.code == "DOCTOR_CLOCKS" for each in found)  # the clock and its offset are already reported
+    without = None if discovery.clocks is None else discovery.clocks.doubt  # this doubt prevents every calibration
     found += [
         finding("DOCTOR_FRAMES", says=doubt).weighed(Severity.ERROR if doubt == without else Severity.WARNING)
         for doubt in discovery.contradictions
@@ -267,7 +268,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     if units:
         found += units
     elif not len(dvl):
-        pass  # it has been said why
+        pass  # the reason is already reported
     elif not len(speed) or (speed > parameters.min_speed).mean() < MOVES_SHARE:
         found.append(finding("DOCTOR_NOT_MOVING", topic=dvl.topic, min_speed=parameters.min_speed))
     elif reference is not None and not over_legs:
@@ -276,7 +277,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
 
 
 def _is_compared_over_legs(reference: Recorded) -> bool:
-    """Whether a reference is positions that are too noisy, or too seldom, for velocities to be of use."""
+    """Return whether a reference is positions that are too noisy or too infrequent for velocities."""
     is_position = VELOCITY_TYPES[reference.msgtype].position is not None
     is_noisy = len(reference) > 0 and topic_checks.shown_noise(reference.values) > NOISY_MPS
     return is_position and (is_noisy or topic_checks.interval_s(reference) > SELDOM_S)
@@ -291,7 +292,7 @@ def _has_error(found: Sequence[Reason]) -> bool:
 
 
 def _units(dvl: Recorded, reference: Recorded) -> list[Reason]:
-    """DVL and reference whose speeds differ by the factor between two units."""
+    """Report DVL and reference whose speeds differ by the factor between two units."""
     speeds = []
     for topic in (dvl, reference):
         norms = np.linalg.norm(topic.values, axis=1)
@@ -311,7 +312,7 @@ def _units(dvl: Recorded, reference: Recorded) -> list[Reason]:
 
 
 def _disagreement(discovery: Discovery, noise: float) -> list[Reason]:
-    """DVL and reference that no frames bring together.
+    """Report DVL and reference that disagree in all frames.
 
     noise: of the reference per axis, as a share of the speed.
     """
@@ -327,8 +328,8 @@ _NAMES = ("roll", "pitch", "yaw", "scale")
 class Shown:
     """Observability of one error in a recording.
 
-    std: standard deviation of the calibration, degrees or per cent. share: of the way from knowing nothing (0) to fine
-    (1). needs: the manoeuvre that shows more, '' if it is observable.
+    std: standard deviation of the calibration, degrees or per cent. share: progress from no knowledge (0) to fine (1).
+    needs: the manoeuvre that improves it, '' if it is observable.
     """
 
     name: str
@@ -339,7 +340,7 @@ class Shown:
 
 
 def _shown(replayed: Replayed) -> tuple[Shown, ...]:
-    """Return the observability of roll, pitch, yaw and scale; nothing where no sample could be used."""
+    """Return the observability of roll, pitch, yaw and scale; nothing if no sample was usable."""
     result = replayed.result
     if not result.estimate.used:
         return ()

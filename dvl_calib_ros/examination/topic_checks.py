@@ -1,4 +1,4 @@
-"""What can be seen of a single topic: stamps, gaps, zeros, repetitions, covariances, axes."""
+"""Checks of a single topic: stamps, gaps, zeros, repetitions, covariances, axes."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 
 SECOND_NS = 1_000_000_000
-# Fewer messages say nothing about rates and jitter.
+# with fewer messages, rates and jitter are not evaluated
 ENOUGH = 20
-# Shares of messages that are worth a word: a single outlier is not.
+# smallest shares of faulty messages that are reported
 SOME, MANY = 0.005, 0.05
-# Of stamps that repeat so often not one in twenty is used
+# with this share of repeated stamps, less than one sample in twenty is used
 MOST = 0.95
-# Stamps that jitter by more than this share of their interval ...
+# stamps with more jitter than this share of their interval ...
 JITTER = 0.05
-# ... against the rhythm of the sensor: an interval too long is followed by one too short (white jitter gives -0.5)
+# ... and with negative correlation of successive intervals, as in reception jitter (white jitter gives -0.5)
 AGAINST_RHYTHM = -0.3
-# Stamps that step by so much more than the log have been set (s)
+# a larger step of the stamps relative to the log means that the clock was set (s)
 SET_CLOCK = 1.0
-# A silence is a gap from this on, and from so many intervals (s, 1)
+# smallest gap, and its smallest number of intervals (s, 1)
 GAP, GAP_INTERVALS = 2.0, 5.0
-# A claimed noise is wrong if it is so many times what the data show, or so small a share of it
+# limits of the ratio of claimed to observed noise
 CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE = 5.0, 0.1
-# A reference's noise is slow and does not show from message to message; only what no receiver claims is told (m/s)
+# a reference's noise is slow and not visible between messages, so only impossible claims are reported (m/s)
 NO_RECEIVER = (1e-3, 1.0)
-# Standard deviation of a normal distribution over its median absolute deviation
+# ratio of a normal distribution's standard deviation to its median absolute deviation
 NORMAL_FROM_MEDIAN = 1.4826
-# A noise below this is none to speak of (m/s)
+# a smaller noise is negligible (m/s)
 QUIET = 0.02
 
 
 def interval_s(topic: Recorded) -> float:
-    """Median interval of the messages, s; 0 of fewer than two."""
+    """Return the median interval of the messages, s; 0 for fewer than two."""
     return float(np.median(np.diff(topic.log_ns))) * 1e-9 if len(topic) > 1 else 0.0
 
 
 def stamp_findings(topic: Recorded, stream: Stream, parameters: Parameters) -> list[Reason]:
-    """Messages that cannot be decoded, too few, zero stamps, of reception, that stray, go back, jump or repeat."""
+    """Report undecodable or too few messages, and faults of their stamps."""
     found = []
     if topic.unreadable:
         of_all = {"count": topic.unreadable, "total": topic.unreadable + len(topic)}
@@ -63,7 +63,7 @@ def stamp_findings(topic: Recorded, stream: Stream, parameters: Parameters) -> l
     if len(stamps) < ENOUGH:
         return found
     stray = strays(stamps, round(parameters.max_time_jump * SECOND_NS))
-    if stray.any():  # which a calibration leaves out
+    if stray.any():  # a calibration does not use them
         found.append(finding("STAMP_STRAY", count=int(stray.sum()), stream=STREAMS[stream.value]))
         stamps, log = stamps[~stray], log[~stray]
     steps, log_steps = np.diff(stamps) * 1e-9, np.diff(log) * 1e-9
@@ -83,7 +83,7 @@ def stamp_findings(topic: Recorded, stream: Stream, parameters: Parameters) -> l
 
 
 def _reception(name: str, steps: Array, log_steps: Array) -> list[Reason]:
-    """Whether stamps jitter as the reception does, about a sensor's steady rhythm."""
+    """Report stamps with the jitter of the reception around the sensor's steady rhythm."""
     period = float(np.median(steps))
     steady = (steps > 0.3 * period) & (steps < 1.7 * period)
     if period <= 0.0 or steady.sum() < ENOUGH:
@@ -103,7 +103,7 @@ def _reception(name: str, steps: Array, log_steps: Array) -> list[Reason]:
 
 
 def apart_findings(dvl: Recorded, reference: Recorded) -> list[Reason]:
-    """Whether DVL and reference are never measured at one time, by their stamps."""
+    """Report a DVL and a reference that are never measured at the same time, by their stamps."""
     ours, theirs = (np.sort(topic.stamps_ns[topic.stamps_ns != 0]) for topic in (dvl, reference))
     if not len(ours) or not len(theirs):
         return []
@@ -116,13 +116,13 @@ def apart_findings(dvl: Recorded, reference: Recorded) -> list[Reason]:
 
 
 def clock_offset_s(topic: Recorded) -> float | None:
-    """How far the stamps are ahead of the log, s; None without stamps."""
+    """Return how far the stamps are ahead of the log, s; None without stamps."""
     stamped = topic.stamps_ns != 0
     return float(np.median(topic.stamps_ns[stamped] - topic.log_ns[stamped])) * 1e-9 if stamped.any() else None
 
 
 def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> list[Reason]:
-    """Streams (by dvl, reference, imu) that stamp by another clock than the rest."""
+    """Report streams (by dvl, reference, imu) with another clock than the others."""
     offsets = {Stream(role): clock_offset_s(topic) for role, topic in topics.items()}
     found = []
     for each in arrival_offset({stream: ahead for stream, ahead in offsets.items() if ahead is not None}, parameters):
@@ -140,7 +140,7 @@ def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> li
 
 
 def gap_findings(topic: Recorded) -> list[Reason]:
-    """Silences, by log time."""
+    """Report gaps, by log time."""
     if len(topic) < ENOUGH:
         return []
     steps = np.diff(topic.log_ns) * 1e-9
@@ -153,7 +153,7 @@ def gap_findings(topic: Recorded) -> list[Reason]:
 
 
 def velocity_findings(topic: Recorded, is_dvl: bool) -> list[Reason]:
-    """Zeros, repetitions, what is not finite, refusals, axes and covariances of velocities."""
+    """Report zeros, repetitions, non-finite values, refusals, axes and covariances of velocities."""
     if not len(topic):
         return []
     found = []
@@ -183,16 +183,16 @@ def velocity_findings(topic: Recorded, is_dvl: bool) -> list[Reason]:
 
 
 def shown_noise(values: Array) -> float:
-    """Noise per axis (m/s) by what changes from message to message, which holds a little of the motion as well."""
+    """Return the noise per axis (m/s) from differences between messages, which include a little motion."""
     values = values[np.isfinite(values).all(axis=1)]
     if len(values) < ENOUGH:
         return 0.0
     changes = np.median(np.abs(np.diff(values, n=2, axis=0)), axis=0) * NORMAL_FROM_MEDIAN
-    return float(np.sqrt((changes**2).mean() / 6.0))  # of white noise a second difference has six times the variance
+    return float(np.sqrt((changes**2).mean() / 6.0))  # a second difference of white noise has six times its variance
 
 
 def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Reason]:
-    """A constant covariance that the data contradict."""
+    """Report a constant covariance that the data contradict."""
     variances = topic.variances[used]
     if np.isnan(variances).any() or (variances != variances[0]).any():
         return []
@@ -208,9 +208,9 @@ def _covariance(topic: Recorded, used: Array, is_dvl: bool) -> list[Reason]:
 
 
 def orientation_findings(imu: Recorded) -> list[Reason]:
-    """Whether an IMU gives an orientation at all."""
+    """Report an IMU without orientation."""
     q = imu.values
-    finite = np.isfinite(q @ np.ones(4))  # of four at once: a sum of narrow rows takes longer than all else here
+    finite = np.isfinite(q @ np.ones(4))  # one product for all four columns, because a sum over narrow rows is slow
     given = q if finite.all() else q[finite]
     if not len(given):
         why = "orientation_covariance[0] is -1"

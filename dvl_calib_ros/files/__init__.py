@@ -1,1 +1,1 @@
-"""Files of results, parameters, mountings and trajectories."""
+"""Files of results, parameters and mountings."""

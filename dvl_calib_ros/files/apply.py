@@ -1,4 +1,4 @@
-"""A saved calibration into the files that a vehicle is configured by, all of them or none, and out of them again."""
+"""Writing of a saved calibration into a vehicle's configuration files, all or none, and its reversal."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from .urdf import read_urdf
 
 @dataclass(frozen=True)
 class Targets:
-    """Files to write a calibration into; None for those that are not.
+    """Files to write a calibration into; None for no file.
 
-    urdf: whose joint of the DVL is turned and moved. output: where that URDF is written to instead. joint: the DVL's
-    joint; None: the one above the DVL's frame. keep_position: leave its xyz as it is. params: a parameter file of the
-    node. launch: a launch file (XML) with a static transform. fusion: parameters of robot_localization (YAML).
-
-    Raises InputError for what goes with a URDF where there is none.
+    urdf: its DVL joint is rotated and moved. output: URDF to write instead. joint: the DVL's joint; None: the one above
+    the DVL's frame. keep_position: keep its xyz. params: parameter file of the node. launch: launch file (XML) with a
+    static transform. fusion: parameters of robot_localization (YAML). Raises InputError for options that need a URDF
+    without one.
     """
 
     urdf: Path | None = None
@@ -37,18 +36,18 @@ class Targets:
 
     @property
     def paths(self) -> list[Path]:
-        """What is written."""
+        """Paths of the files to write."""
         urdf = self.output or self.urdf
         return [path for path in (urdf, self.params, self.launch, self.fusion) if path is not None]
 
 
 @dataclass(frozen=True)
 class Applied:
-    """What became of the files.
+    """Result of applying a calibration.
 
-    written: those that are new or changed, or would be. unchanged: those that were so already. kept: of each that was
-    there, where the one before is. notes: in sentences, what whoever uses them should know. changes: of a dry run what
-    would change, as a unified diff.
+    written: new or changed files, also planned ones. unchanged: files that already had the values. kept: path of each
+    replaced file's backup. notes: remarks for users of the files. changes: planned changes of a dry run, as a unified
+    diff.
     """
 
     written: tuple[Path, ...]
@@ -61,10 +60,10 @@ class Applied:
 def write_calibration(
     calibrated: CalibratedMounting, targets: Targets, force: bool = False, dry_run: bool = False
 ) -> Applied:
-    """Write a calibration into all files, or into none. Each one before is kept beside it.
+    """Write a calibration into all files, or into none. Each previous file is kept as a backup.
 
-    force: also what is rejected, not converged, or of another mounting. dry_run: write nothing, say what would change.
-    Raises InputError.
+    force: also for a calibration that is rejected, not converged, or of another mounting. dry_run: write nothing,
+    return the planned changes. Raises InputError.
     """
     if targets.paths:
         calibrated.check_applicable(force)
@@ -76,7 +75,7 @@ def write_calibration(
         before = {path: path.read_bytes() if path in there else b"" for path in new}
         changes = "".join(_difference(path, before[path], content) for path, content in new.items())
         return Applied(tuple(new), unchanged, {}, tuple(notes), changes)
-    save_all(new)  # a URDF that is turned beside parameters that are not would turn the DVL twice, or not at all
+    save_all(new)  # a new URDF with old parameters would apply the rotation twice or not at all
     kept = {path: backup_of(path) for path in new if path in there}
     return Applied(tuple(new), unchanged, kept, tuple(notes))
 
@@ -108,7 +107,7 @@ def _contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> 
 
 
 def roll_back(targets: Targets) -> dict[Path, Path]:
-    """Bring back the files before; what they were is then kept: of each file, where. Raises InputError."""
+    """Restore the backups; the replaced files become the backups. Return the backup of each file. Raises InputError."""
     if not targets.paths:
         raise InputError("--rollback: name the files again, with --urdf, --params, --launch or --fusion")
     before: dict[Path, bytes] = {}
@@ -118,5 +117,5 @@ def roll_back(targets: Targets) -> dict[Path, Path]:
             before[path] = backup.read_bytes()
         except OSError as error:
             raise InputError(f"{backup}: cannot be read ({error.strerror}); there is nothing to go back to") from error
-    save_all(before)  # and what is there now becomes the backup
+    save_all(before)  # the current files become the backups
     return {path: backup_of(path) for path in before}

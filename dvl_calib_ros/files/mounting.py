@@ -1,4 +1,4 @@
-"""The mounting of a result file in the forms that others take: URDF, TF, robot_localization, a comparison."""
+"""The mounting in a result file in other forms: URDF, TF, robot_localization, a comparison."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from .parameter_files import NODE_NAME, as_yaml, changed_parameters, load_parame
 from .result_file import load_result, static_transform_arguments
 from .urdf import Urdf, UrdfMounting, numbers
 
-# A mounting written by hand with three digits is meant to be the one that the calibration began with, rad.
+# tolerance (rad) for the initial mounting, which may be written by hand with three digits
 SAME_MOUNTING = 2e-3
-# A position written by hand in centimetres is meant to be the one that the calibration began with, m.
+# tolerance (m) for the initial position, which may be written by hand in centimetres
 SAME_POSITION = 0.011
-# Below this there is nothing to write, rad and m: nine digits are written.
+# smaller changes (rad and m) are not written: files have nine digits
 ALREADY = 1e-7
 POSITION_UNKNOWN = (
-    "the DVL's position in the body is not known, for nothing says where the reference point is: set dvl_position "
+    "the DVL's position in the body is unknown, because the position of the reference point is: set dvl_position "
     "to from_reference, with reference_position, and calibrate again, or record the transform of the reference's frame"
 )
 FUSION_NODE = "ekf_filter_node"
@@ -50,15 +50,14 @@ FUSION_NODE = "ekf_filter_node"
 
 @dataclass(frozen=True)
 class CalibratedMounting:
-    """The selected model's calibration of a result file.
+    """The selected model's calibration in a result file.
 
-    rotation_body_from_dvl (3, 3): corrected, of the forward-left-up axes that are calibrated. turned: whether the
-    driver's data, in dvl_frame, are forward-right-down, and were turned to those. position: (3,) m in the body, None
-    where that is not known. scale (3,): δk per DVL axis, 0 where
-    not estimated; scale_ahead: of motion ahead. lever_arm (3,): m from the reference point, body frame, and
-    dvl_time_offset: s, positive late; as they were found, else as the parameters say. objections: why it should not be
-    applied; doubts: what to know when it is; both in sentences. water: what was known of it, and cause_of_scale: what
-    that says of the scale; None where nothing.
+    rotation_body_from_dvl (3, 3): corrected, of the calibrated forward-left-up axes. turned: whether the driver's data,
+    in dvl_frame, are forward-right-down and were converted to them. position: (3,) m in the body, None if unknown.
+    scale (3,): δk per DVL axis, 0 if not estimated. lever_arm (3,): m from the reference point, body frame, estimated
+    or configured. dvl_time_offset: delay, s, estimated or configured. objections: reasons not to apply it. doubts:
+    warnings when it is applied; both in sentences. water: its properties, and cause_of_scale: the scale explained by
+    them; None if unknown.
     """
 
     path: Path
@@ -79,12 +78,12 @@ class CalibratedMounting:
 
     @property
     def lever_arm_found(self) -> bool:
-        """Whether the data showed the DVL to be elsewhere than the parameters say."""
+        """Whether the estimated lever arm replaces the configured one."""
         return self.lever_arm != self.parameters.lever_arm
 
     @property
     def compensating(self) -> dict[str, Any]:
-        """The parameters that take out what was found: mounting, and lever arm and delay where they were found."""
+        """Parameters that correct the errors found: mounting, and lever arm and delay if estimated."""
         rpy = rpy_from_rotation(self.rotation_body_from_dvl)
         values: dict[str, Any] = {"mounting_rpy": _rounded(rpy)}
         if self.lever_arm_found:
@@ -95,7 +94,7 @@ class CalibratedMounting:
 
     @property
     def rotation_body_from_dvl_frame(self) -> Array:
-        """Corrected mounting (3, 3) of dvl_frame itself, for those who use the driver's data as they come."""
+        """Corrected mounting (3, 3) of dvl_frame itself, for users of the driver's unconverted data."""
         return self.rotation_body_from_dvl @ FLU_FROM_FRD if self.turned else self.rotation_body_from_dvl
 
     @property
@@ -105,12 +104,12 @@ class CalibratedMounting:
 
     @property
     def scale_ahead(self) -> float:
-        """Scale-factor error of motion ahead: what the DVL measures too much of it, as a share."""
+        """Scale error of forward motion, positive if the DVL measures too much, as a share."""
         return float(self.parameters.rotation_dvl_from_body[:, 0] ** 2 @ self.scale)
 
     @property
     def speed_of_sound_factor(self) -> float:
-        """By how much the speed of sound, or what else scales velocities, is to be multiplied: 1 / (1 + δk) ahead."""
+        """Factor for the speed of sound, or another setting that scales velocities: 1 / (1 + δk) ahead."""
         return 1.0 / (1.0 + self.scale_ahead)
 
     def check_applicable(self, force: bool) -> None:
@@ -120,7 +119,7 @@ class CalibratedMounting:
 
     @property
     def static_transform(self) -> str:
-        """Arguments of tf2's static_transform_publisher. Raises InputError where the position is not known."""
+        """Arguments of tf2's static_transform_publisher. Raises InputError if the position is unknown."""
         if self.position is None:
             raise InputError(f"{self.path}: {POSITION_UNKNOWN}")
         rotation = self.rotation_body_from_dvl_frame
@@ -128,7 +127,7 @@ class CalibratedMounting:
 
 
 def load_calibrated_mounting(path: Path) -> CalibratedMounting:
-    """Read a result file. Raises InputError for what is none, is damaged, or was changed by hand."""
+    """Read a result file. Raises InputError if it is none, is damaged, or was changed by hand."""
     content, states = load_result(path)
     try:
         model = MODELS[content["model"]]
@@ -143,9 +142,9 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
             if content["mounting"].get(name) is not None
         }
         convergence = Convergence(content["models"][model.name]["convergence"])
-        objections, doubts = _judged(content.get("verification"), convergence)
-        objections += _said(content, Severity.REJECT)
-        doubts += _said(content, Severity.MARGINAL, Severity.WARNING)
+        objections, doubts = _objections_and_doubts(content.get("verification"), convergence)
+        objections += _saved_warnings(content, Severity.REJECT)
+        doubts += _saved_warnings(content, Severity.MARGINAL, Severity.WARNING)
         water = water_of_document(content["water"]) if "water" in content else None
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
@@ -162,7 +161,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         raise InputError(
             f"{path}: its mounting is of {frames[1]!r}, its parameters of {parameters.dvl_frame!r}; save it again"
         )
-    doubts += _unseen(model, state, parameters)
+    doubts += _unobservable(model, state, parameters)
     delay = scale_and_delay(model, state, parameters).time_offset
     of_scale = None
     if water is not None:
@@ -175,14 +174,14 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
 
 
 def _rounded(values: Sequence[float] | Array) -> list[float]:
-    """Nine digits, so that what is written is the same when it is written again."""
+    """Round to nine digits, so that a second write changes nothing."""
     return [float(f"{float(value):.9g}") + 0.0 for value in values]
 
 
-def _judged(
+def _objections_and_doubts(
     verification: Mapping[str, Any] | None, convergence: Convergence
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Objections and doubts from the verdict and the convergence that a result file states."""
+    """Return objections and doubts from the verdict and the convergence in a result file."""
     objections, doubts = [], []
     if convergence is Convergence.COLLECTING:
         objections.append("its data show no angle and no scale yet (collecting)")
@@ -199,13 +198,13 @@ def _judged(
     return tuple(objections), tuple(doubts)
 
 
-def _said(content: Mapping[str, Any], *severities: Severity) -> tuple[str, ...]:
-    """What the node knew against its calibration, of these severities."""
+def _saved_warnings(content: Mapping[str, Any], *severities: Severity) -> tuple[str, ...]:
+    """Return the warnings of these severities that the node saved with its calibration."""
     wanted = {each.value for each in severities}
     return tuple(str(each["says"]) for each in content.get("doubts", ()) if each["severity"] in wanted)
 
 
-def _unseen(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
+def _unobservable(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
     entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
     return tuple(
         f"{each.name} ({each.axis}) was not shown by the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"
@@ -214,22 +213,19 @@ def _unseen(model: Model, state: GaussianState, parameters: Parameters) -> tuple
 
 
 def angle_between(a: Array, b: Array) -> float:
-    """Angle of the rotation that takes one rotation (3, 3) to another, rad; exact for small ones."""
+    """Return the angle between two rotations (3, 3), rad; exact for small ones."""
     between = a.T @ b
     sine = np.array([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]])
     return math.atan2(0.5 * float(np.linalg.norm(sine)), 0.5 * (float(np.trace(between)) - 1.0))
 
 
-# ---------------------------------------------------------------------- URDF
-
-
 def calibrated_urdf(
     urdf: Urdf, mounting: UrdfMounting, calibrated: CalibratedMounting, force: bool = False, keep_position: bool = False
 ) -> bytes:
-    """The URDF with the calibrated mounting, and position where that was found; its own bytes if it has them already.
+    """Return the URDF with the calibrated mounting, and position if estimated; unchanged if it has them already.
 
-    Raises InputError if its mounting or position is another than the one the calibration began with, unless force is
-    set. keep_position: leave the position as it is.
+    Raises InputError if its mounting or position differs from the calibration's initial one, unless force is set.
+    keep_position: keep the position.
     """
     now, corrected = mounting.rotation_body_from_dvl, calibrated.rotation_body_from_dvl
     begun_with = calibrated.parameters.rotation_dvl_from_body.T
@@ -237,7 +233,7 @@ def calibrated_urdf(
         corrected, begun_with = corrected @ FLU_FROM_FRD, begun_with @ FLU_FROM_FRD
     known = None if keep_position or calibrated.position is None else np.array(calibrated.position)
     position = mounting.position if known is None else known
-    near = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # what was told may be rounded
+    near = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # a configured position may be rounded
     is_there = np.abs(mounting.position - position).max() < near
     if angle_between(now, corrected) < ALREADY and is_there:
         return urdf.content
@@ -254,19 +250,16 @@ def calibrated_urdf(
         raise InputError(
             f"{urdf.path}: has the DVL at {numbers(mounting.position)} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with {numbers(began_at)}{found}; --keep-position "
-            "turns the joint alone, --force moves it there"
+            "rotates the joint only, --force moves it there"
         )
     return urdf.moved(mounting, corrected, None if is_there else position)
 
 
-# ---------------------------------------------------------------------- parameters of the node
-
-
 def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: bool = False) -> bytes:
-    """A parameter file for the node with what compensates the calibration's findings; made if there is none.
+    """Return a parameter file for the node that corrects the errors found, new or based on the existing file.
 
-    Raises InputError if it sets mounting, lever arm or delay to another than the one the calibration began with,
-    unless force is set; or if it starts from a saved calibration, whose angles are relative to another mounting.
+    Unless force is set, raises InputError if the file's mounting, lever arm or delay differs from the calibration's
+    initial one. Also if it starts from a saved calibration, whose angles are relative to another mounting.
     """
     values = calibrated.compensating
     if not path.exists():
@@ -291,7 +284,7 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
 
 
 def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -> str:
-    """A ROS 2 parameter file that starts a calibration from a URDF's mounting. Raises InputError."""
+    """Return a ROS 2 parameter file that starts a calibration from a URDF's mounting. Raises InputError."""
     mounting = urdf.mounting(base, dvl, joint)
     rpy = rpy_from_rotation(mounting.rotation_body_from_dvl)
     return f"""# Mounting of the DVL from {urdf.path.name!r}, joint {mounting.joint.name!r}.
@@ -304,15 +297,12 @@ def urdf_parameters(urdf: Urdf, base: str, dvl: str, joint: str | None = None) -
 """
 
 
-# ---------------------------------------------------------------------- TF
-
-
 def launch_file(calibrated: CalibratedMounting) -> str:
-    """A launch file (XML) that publishes the calibrated mounting as a static transform.
+    """Return a launch file (XML) that publishes the calibrated mounting as a static transform.
 
-    Raises InputError where a frame's name would be evaluated in it.
+    Raises InputError if a frame's name would be evaluated in it.
     """
-    from xml.sax.saxutils import quoteattr  # imports what reads files over the net
+    from xml.sax.saxutils import quoteattr  # imports modules that read files over the net
 
     for frame in (calibrated.base_frame, calibrated.dvl_frame):
         if "$" in frame:
@@ -334,7 +324,7 @@ def _origin(calibrated: CalibratedMounting) -> str:
 
 
 def scale_advice(calibrated: CalibratedMounting) -> str:
-    """What a transform leaves out, and what to do about it, in one sentence."""
+    """Return a sentence on the scale error, which a transform cannot correct, and its remedy."""
     if not calibrated.model.scale_axes:
         return f"{calibrated.model.name} estimates no scale: a scale error of the DVL stays in"
     error = calibrated.scale_ahead
@@ -345,11 +335,8 @@ def scale_advice(calibrated: CalibratedMounting) -> str:
     )
 
 
-# ---------------------------------------------------------------------- robot_localization
-
-
 def fusion_file(calibrated: CalibratedMounting) -> str:
-    """Parameters for robot_localization and for our node beside it, as one ROS 2 parameter file."""
+    """Return one ROS 2 parameter file for robot_localization and for our node."""
     base, dvl, name = printable(calibrated.base_frame), printable(calibrated.dvl_frame), calibrated.model.name
     used = [index in (6, 7, 8) for index in range(15)]  # x y z, roll pitch yaw, vx vy vz, their rates, accelerations
     own = {
@@ -357,7 +344,7 @@ def fusion_file(calibrated: CalibratedMounting) -> str:
         "model": name,
         "initial_calibration": str(calibrated.path.resolve()),
     }
-    learns = "only while GNSS comes: in a dive it stays as it is" if calibrated.model.aided else "on in the dive"
+    learns = "only with GNSS; in a dive it does not change" if calibrated.model.aided else "on in the dive"
     return "\n".join(
         [
             *_comment(f"{_origin(calibrated)}: the DVL for robot_localization. Take A or B, never both."),
@@ -376,7 +363,7 @@ def fusion_file(calibrated: CalibratedMounting) -> str:
             "  ros__parameters:",
             *(f"    {key}: {as_yaml(value)}" for key, value in own.items()),
             *_comment(
-                f"B. The driver's own topic (a TwistWithCovarianceStamped), in frame {dvl}, turned by TF (URDF or "
+                f"B. The driver's own topic (a TwistWithCovarianceStamped), in frame {dvl}, rotated by TF (URDF or "
                 "static transform, calibrated), which has the lever arm, too. Our node does not run. Corrected in "
                 "misalignment only: "
                 f"{scale_advice(calibrated)}. The covariance is the driver's, without the calibration's. As above, but:"
@@ -392,9 +379,9 @@ def _comment(text: str) -> list[str]:
 
 
 def load_extrinsics(path: Path, name: str) -> Extrinsics:
-    """The selected model's calibration of a result file.
+    """Return the selected model's calibration in a result file, called `name`.
 
-    name: what it is called. Raises InputError for what is no result file, is damaged, or holds no sample.
+    Raises InputError if it is no result file, is damaged, or has no sample.
     """
     calibrated = load_calibrated_mounting(path)
     content, states = load_result(path, of_recording=True)
@@ -405,7 +392,7 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
         first_ns, last_ns = (0, 0) if used == 0 else map(int, span)
         none = np.zeros((model.n_state, N_AXES))
         rejected = rejection(content.get("verification", {}).get("findings", ()))
-        # of before it was kept: what a bias makes of two files is then as of two DVLs
+        # older files lack it: the effect of a bias is then treated as independent
         by_bias = np.array(content["models"][model.name].get("by_dvl_bias", none), dtype=float).reshape(none.shape)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error

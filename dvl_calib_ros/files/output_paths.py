@@ -1,4 +1,4 @@
-"""What is written is neither read by the same command nor written twice, whatever it is called."""
+"""Check that no output of a command is also its input or another output."""
 
 from __future__ import annotations
 
@@ -14,23 +14,22 @@ from pathlib import Path
 from ..disk.atomic import backups_of, own_stream
 from ..errors import InputError
 
-# What SQLite keeps beside a recording, and reads with it
+# files that SQLite keeps next to a recording
 _BESIDE = ("-wal", "-shm", "-journal")
 _RECORDED = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 
 
 def check_outputs(files: Mapping[str, Path], inputs: Iterable[Path], folders: Mapping[str, Path] | None = None) -> None:
-    """Raise InputError if an output, or the backup of what it replaces, is an input or another output.
+    """Raise InputError if an output, or its backup, is an input or another output.
 
-    Links of every kind are seen through, and folders that are mounted in two places. Nor may an output lie in a folder
-    that is read; a new folder may, in one that is no recording.
+    Links and multiple mounts of a folder are resolved. An output must not lie in an input folder; a new folder may, if
+    the input folder is no recording.
 
     Parameters
     ----------
-    files: Option -> file that is written.
+    files: Option -> file to write.
     inputs: Files and folders that are read.
-    folders: Option -> folder that is made.
-
+    folders: Option -> folder to create.
     """
     written = {option: _Written(path) for option, path in files.items()}
     written |= {option: _Written(path, is_folder=True) for option, path in (folders or {}).items()}
@@ -45,14 +44,14 @@ def check_outputs(files: Mapping[str, Path], inputs: Iterable[Path], folders: Ma
 
 @dataclass(frozen=True)
 class _Written:
-    """An output, and the places that change with it."""
+    """An output, and the other paths that change with it."""
 
     path: Path
     is_folder: bool = False
 
     @cached_property
     def places(self) -> list[str]:
-        """Full paths without links, of the output itself first."""
+        """Full paths without links, the output itself first."""
         stream = own_stream(self.path)
         if stream is not None:
             return [f"/proc/self/fd/{stream}"] if stream >= 0 else []
@@ -61,41 +60,41 @@ class _Written:
 
     @cached_property
     def files(self) -> set[_Identity]:
-        """Identities of what is in these places now."""
+        """Identities of the existing files at these paths."""
         return {identity for place in self.places if (identity := _identity(place)) is not None}
 
     def hits(self, path: Path) -> bool:
-        """Whether an input would be changed."""
+        """Return whether this output would change an input."""
         real = os.path.realpath(path)
         read = {os.path.realpath(f"{name}{end}") for name in (path, real) for end in ("", *_BESIDE)}
-        if not {_slot(name) for name in read}.isdisjoint(map(_slot, self.places)):
+        if not {_entry(name) for name in read}.isdisjoint(map(_entry, self.places)):
             return True
         if self.files and not self.files.isdisjoint(_identities(read)):
             return True
         return os.path.isdir(real) and any(self._is_in(place, real) for place in self.places[:1])
 
     def _is_in(self, place: str, folder: str) -> bool:
-        if _identity(folder) not in {_identity(above) for above in _above(place)}:
+        if _identity(folder) not in {_identity(above) for above in _parents(place)}:
             return False
         return not self.is_folder or os.path.lexists(place) or _is_recording(folder)
 
     def meets(self, other: _Written) -> bool:
-        """Whether both would change one file, or one be in the other.
+        """Return whether both would change one file, or one is inside the other.
 
-        Names that differ in case only are one to many file systems, and so are two forms of an accented letter.
+        Many file systems do not distinguish upper and lower case, or two forms of an accented letter.
         """
-        mine, others = ([_slot(_folded(place)) for place in each.places] for each in (self, other))
+        mine, others = ([_entry(_folded(place)) for place in each.places] for each in (self, other))
         if not set(mine).isdisjoint(others) or not self.files.isdisjoint(other.files):
             return True
-        below = [{_slot(_folded(above)) for above in _above(each.places[0])} for each in (self, other) if each.places]
+        below = [{_entry(_folded(up)) for up in _parents(each.places[0])} for each in (self, other) if each.places]
         return len(below) == 2 and (mine[0] in below[1] or others[0] in below[0])
 
 
 _Identity = tuple[int, int]
 
 
-def _slot(path: str) -> tuple[_Identity | str, str]:
-    """A name in its folder, whichever of the folder's names led there: mounted elsewhere it has another."""
+def _entry(path: str) -> tuple[_Identity | str, str]:
+    """Identify a name by its folder's identity, because a folder can be mounted at several paths."""
     folder, name = os.path.split(path)
     return _identity(folder) or folder, name
 
@@ -105,8 +104,8 @@ def _folded(path: str) -> str:
     return os.path.join(folder, unicodedata.normalize("NFC", name).casefold())
 
 
-def _above(path: str) -> Iterator[str]:
-    """The folders that a path lies in, the nearest first."""
+def _parents(path: str) -> Iterator[str]:
+    """Yield the folders above a path, the nearest first."""
     while (folder := os.path.dirname(path)) != path:
         yield folder
         path = folder
@@ -120,7 +119,7 @@ def _identity(path: str) -> _Identity | None:
 
 
 def _identities(paths: Iterable[str]) -> Iterator[_Identity]:
-    """Of files, and of folders and all that is in them, links followed to files and not to folders."""
+    """Yield the identities of files, and of folders with everything in them; links to folders are not followed."""
     for path in paths:
         inside = (os.path.join(folder, name) for folder, _, names in os.walk(path) for name in names)
         for each in (path, *inside):

@@ -21,10 +21,10 @@ from ..messages.drivers import TYPES_OF, may_be_recognised, velocity_type
 from ..messages.field_map import field_map
 
 NODE_NAME = "dvl_calibration"
-# rclpy's own parameters, which a file for the node may hold as well
+# rclpy's own parameters, which a file for the node may have
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides")
 
-# From this likeness on (1: the same), an unknown name that is set for all nodes is one of ours misspelt
+# from this similarity on (1: equal), an unknown name that is set for all nodes is a misspelt one of ours
 MISSPELT = 0.8
 
 
@@ -34,10 +34,10 @@ def load_parameters(
     defaults: Mapping[str, Any] | None = None,
     text: str | None = None,
 ) -> Parameters:
-    """Parameters of a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError.
+    """Load parameters from a ROS 2 parameter file, then ``name:=value`` overrides. Raises InputError.
 
-    defaults: values, other than the schema's own, of what neither sets. An override may give angles in degrees: 45deg.
-    text: what is to be read instead of what the file holds now.
+    defaults: values instead of the schema's defaults. An override may give angles in degrees: 45deg. text: content to
+    parse instead of the file's current content.
     """
     values = dict(defaults or {}) | ({} if path is None else _node_parameters(path, text))
     try:
@@ -58,23 +58,23 @@ def load_parameters(
 
 
 def given_parameters(path: Path | None, overrides: Sequence[str] = ()) -> frozenset[str]:
-    """Names of the parameters that a user has set: by an override, or in a file to another value than the default.
+    """Return the names of the parameters set by an override, or in a file to another value than the default.
 
-    A file that lists every parameter at its default, as the shipped one, has set none. Raises InputError.
+    A file that lists every parameter at its default, such as the shipped one, sets none. Raises InputError.
     """
     in_file = {} if path is None else changed_parameters(load_parameters(path))
     return frozenset({*in_file, *(_override(override)[0] for override in overrides)})
 
 
 def ros_override(text: str) -> str:
-    """An override in the form that ROS 2 takes, which knows no degrees. Raises InputError."""
+    """Return an override in ROS 2's syntax, which has no degrees. Raises InputError."""
     name, value = _override(text)
     written = text.partition(":=")[2]
     return f"{name}:={value}" if value != parse_scalar(written) and written else text
 
 
 def _override(text: str) -> tuple[str, Any]:
-    """Name and value of ``name:=value``. Raises InputError."""
+    """Return name and value of ``name:=value``. Raises InputError."""
     name, separator, written = text.partition(":=")
     if not separator:
         raise InputError(f"{text!r}: give parameters as name:=value")
@@ -88,7 +88,7 @@ _DEGREES = re.compile(r"([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?:deg|°)$")
 
 
 def _in_radians(value: Any) -> Any:
-    """Angles as written: 45deg becomes a number in radians, a text of several an array; the rest stays as it is."""
+    """Convert angles to radians: 45deg to a number, a text of several to a list; other values are unchanged."""
     if isinstance(value, str):
         parts = re.sub(r"\s+(?=deg|°)", "", value).replace(",", " ").split()
         return [_number_or_degrees(part) for part in parts] if len(parts) > 1 else _number_or_degrees(value)
@@ -110,24 +110,23 @@ def _node_parameters(path: Path, text: str | None = None) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for _, body in sections:
         values.update(body)
-    others = _of_others(sections)
+    others = _names_for_all_nodes(sections)
     return {name: value for name, value in values.items() if not is_ros_parameter(name) and name not in others}
 
 
 def names_of_others(path: Path, node: str) -> set[str]:
-    """What a ROS 2 parameter file sets for all nodes alike, and is no parameter of ours.
+    """Return the unknown parameters that a ROS 2 parameter file sets for all nodes.
 
     Parameters
     ----------
-    path: Of the file.
-    node: Full name of the running node, as in /auv/dvl_calibration.
+    path: The file.
+    node: Full name of the running node, such as /auv/dvl_calibration.
 
     Raises
     ------
-    InputError: If nothing in the file is for this node, which would run on its defaults then; if it is no such file.
-
+    InputError: If the file has nothing for this node, which would then use its defaults, or is no parameter file.
     """
-    return _of_others(_own_sections(path, node, lambda section: _matches(_tokens(section), _tokens(node))))
+    return _names_for_all_nodes(_own_sections(path, node, lambda section: _matches(_tokens(section), _tokens(node))))
 
 
 def _own_sections(
@@ -143,14 +142,14 @@ def _own_sections(
             raise InputError(f"{path}: ros__parameters of {name} is not a list of name: value")
     if not sections:
         raise InputError(f"{path}: no ros__parameters in it; put parameters under '/**:' and 'ros__parameters:'")
-    if not own:  # ROS would run with the defaults and say nothing
+    if not own:  # ROS would silently use the defaults
         others = ", ".join(name for name, _ in sections)
         raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; use '/**:' or the name")
     return [(name, _flat(body)) for name, body in own]
 
 
-def _of_others(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> set[str]:
-    """Unknown names that are only set for all nodes alike; what looks like one of ours misspelt is not among them."""
+def _names_for_all_nodes(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> set[str]:
+    """Return unknown names that are set for all nodes, except likely misspellings of ours."""
     for_all = {name for section, body in sections if "*" in _tokens(section)[-1] for name in body}
     ours = {name for section, body in sections if "*" not in _tokens(section)[-1] for name in body}
     return {
@@ -166,7 +165,7 @@ def _tokens(name: str) -> list[str]:
 
 
 def _matches(section: Sequence[str], node: Sequence[str]) -> bool:
-    """Whether a section's name is a node's, as rcl matches them: * is one token, ** any number."""
+    """Return whether a section's name matches a node's by rcl's rules: * is one token, ** any number."""
     if not section:
         return not node
     if section[0] == "**":
@@ -175,12 +174,12 @@ def _matches(section: Sequence[str], node: Sequence[str]) -> bool:
 
 
 def is_ros_parameter(name: str) -> bool:
-    """Whether a parameter is rclpy's own."""
+    """Return whether a parameter is rclpy's own."""
     return name.split(".")[0] in ROS_PARAMETERS
 
 
 def _sections(prefix: str, section: Any) -> list[tuple[str, Any]]:
-    """(node, parameters) pairs of a file, with namespaces written nested or as a path."""
+    """Return (node, parameters) pairs of a file, with namespaces written nested or as a path."""
     if not isinstance(section, dict):
         return []
     found = []
@@ -193,7 +192,7 @@ def _sections(prefix: str, section: Any) -> list[tuple[str, Any]]:
 
 
 def section_is_ours(node: str) -> bool:
-    """Whether a section's name (with wildcards * and **) can be this node's, in whatever namespace it runs."""
+    """Return whether a section's name (with wildcards * and **) can be this node's, in any namespace."""
     return fnmatch.fnmatchcase(NODE_NAME, node.rsplit("/", 1)[-1])
 
 
@@ -206,13 +205,13 @@ def _flat(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def changed_parameters(parameters: Parameters) -> dict[str, Any]:
-    """Name -> value of what is not at its default, as `Parameters.as_dict`."""
+    """Return name -> value of parameters not at their defaults, as `Parameters.as_dict`."""
     default = Parameters().as_dict()
     return {name: value for name, value in parameters.as_dict().items() if value != default[name]}
 
 
 def parameter_file_text() -> str:
-    """`config/calibration.yaml`: every parameter at its default, described."""
+    """Return `config/calibration.yaml`: every parameter at its default, with its description."""
     lines = [
         "# Every parameter of dvl_calib_ros at its default. An ordinary ROS 2 parameter file:",
         "#   ros2 run dvl_calib_ros calibration_node --ros-args --params-file calibration.yaml",
@@ -230,21 +229,20 @@ def parameter_file_text() -> str:
 
 
 def parameter_table() -> str:
-    """The documentation's table of parameters, in Markdown."""
-    lines = ["| parameter | default | unit, range | at run time | meaning |", "|---|---|---|---|---|"]
+    """Return the documentation's table of parameters, in Markdown."""
+    lines = ["| parameter | default | unit, range | meaning |", "|---|---|---|---|"]
     for name, spec in SCHEMA.items():
         about = " ".join(part for part in (spec.unit, ", ".join(spec.choices), _range(name)) if part)
-        lines.append(
-            f"| `{name}` | {_shown(spec.default)} | {about} | {'' if spec.read_only else 'yes'} | {spec.description} |"
-        )
+        at_run_time = "" if spec.read_only else " *"
+        lines.append(f"| `{name}`{at_run_time} | {_shown(spec.default)} | {about} | {spec.description} |")
     return "\n".join(lines) + "\n"
 
 
 def model_table() -> str:
-    """The documentation's table of models, in Markdown."""
-    lines = ["| model | states | assumes | is wrong |", "|---|---|---|---|"]
+    """Return the documentation's table of models, in Markdown."""
+    lines = ["| model | assumes | is wrong |", "|---|---|---|"]
     for model in MODELS.values():
-        lines.append(f"| {model.name} | {' '.join(model.state_names)} | {model.assumes} | {model.wrong_when} |")
+        lines.append(f"| {model.name} | {model.assumes} | {model.wrong_when} |")
     return "\n".join(lines) + "\n"
 
 
@@ -262,38 +260,38 @@ def _range(name: str) -> str:
 
 
 def as_yaml(value: Any) -> str:
-    """A value as YAML on one line; doubles keep a decimal point, without which ROS takes them for integers."""
+    """Format a value as YAML on one line; doubles keep a decimal point, because ROS distinguishes integers."""
     return str(yaml.safe_dump(value, default_flow_style=True, width=10_000)).removesuffix("...\n").strip()
 
 
 def with_parameters(path: Path, values: Mapping[str, Any]) -> bytes:
-    """The content of a parameter file, with these values for our node instead of, or beside, those that it has.
+    """Return the content of a parameter file with these values for our node added or replaced.
 
-    Raises InputError for what is no parameter file of ours, or cannot be edited in place.
+    Raises InputError if it is no parameter file of ours, or cannot be edited in place.
     """
     before = load_parameters(path)
     content = path.read_bytes()
     text = content.decode("utf-8")
-    sections = list(_own(compose_yaml(text), ""))
+    sections = list(_own_mappings(compose_yaml(text), ""))
     there = [(key.value, node) for section in sections for key, node in section.value]
     changes = [(*_span(node), as_yaml(values[name])) for name, node in there if name in values]
     new = {name: as_yaml(value) for name, value in values.items() if name not in dict(there)}
     if new:
-        changes.append(_added(text, sections[-1], new))
+        changes.append(_insertion(text, sections[-1], new))
     for start, end, value in sorted(changes, reverse=True):
         text = text[:start] + value + text[end:]
     try:
         found = load_parameters(path, text=text)
     except InputError:
         found = None
-    if found != before.replace(**values):  # by something that YAML can do and is not thought of here
+    if found != before.replace(**values):  # an unforeseen feature of YAML
         names = ", ".join(f"{name}: {as_yaml(value)}" for name, value in values.items())
         raise InputError(f"{path}: cannot be edited in place; write into it by hand: {names}")
     return text.encode()
 
 
-def _own(node: Any, prefix: str) -> Iterator[Any]:
-    """Mappings of parameters that are for our node, in the order of the file."""
+def _own_mappings(node: Any, prefix: str) -> Iterator[Any]:
+    """Yield the mappings of our node's parameters, in the order of the file."""
     if not isinstance(node, yaml.MappingNode):
         return
     for key, value in node.value:
@@ -301,17 +299,17 @@ def _own(node: Any, prefix: str) -> Iterator[Any]:
             if section_is_ours(prefix) and isinstance(value, yaml.MappingNode):
                 yield value
         else:
-            yield from _own(value, f"{prefix}/{str(key.value).strip('/')}" if prefix else str(key.value))
+            yield from _own_mappings(value, f"{prefix}/{str(key.value).strip('/')}" if prefix else str(key.value))
 
 
 def _span(node: Any) -> tuple[int, int]:
-    """Where a value stands; a list over several lines ends with its last item."""
+    """Return start and end of a value; a list over several lines ends with its last item."""
     last = node.value[-1] if isinstance(node, yaml.SequenceNode) and not node.flow_style and node.value else node
     return node.start_mark.index, last.end_mark.index
 
 
-def _added(text: str, section: Any, values: Mapping[str, str]) -> tuple[int, int, str]:
-    """What puts parameters in front of all others of a section."""
+def _insertion(text: str, section: Any, values: Mapping[str, str]) -> tuple[int, int, str]:
+    """Return an edit that inserts parameters at the start of a section."""
     entries = [f"{name}: {value}" for name, value in values.items()]
     if section.flow_style or not section.value:
         at = section.start_mark.index + 1
@@ -322,7 +320,7 @@ def _added(text: str, section: Any, values: Mapping[str, str]) -> tuple[int, int
 
 
 def new_file(parameters: Parameters, changed: Mapping[str, Any], says: str) -> bytes:
-    """A parameter file with what is not at its default. says: its first line, a comment."""
+    """Return a parameter file with the values that are not defaults. says: text of its first line, a comment."""
     default = Parameters().as_dict()
     values = {key: value for key, value in parameters.replace(**changed).as_dict().items() if value != default[key]}
     lines = [f"# {says}", "/**:", "  ros__parameters:"]

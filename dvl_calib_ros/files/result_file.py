@@ -1,4 +1,4 @@
-"""The result of a calibration as a YAML file: never lost to a worse one, never believed blindly when read."""
+"""The result of a calibration as a YAML file, protected against replacement by a worse one and against damage."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ from .urdf import origin_tag
 
 _ANY_FORMAT = "dvl_calib_ros result"
 FORMAT = f"{_ANY_FORMAT} 1"
-# The last entry of a result file, which its head announces: what of a copy was cut off would else go unseen
+# last entry of a result file, announced at its start, to detect a truncated copy
 _END = "complete"
 _PUBLISHER = "ros2 run tf2_ros static_transform_publisher"
 
 
 def estimate_document(estimate: Estimate) -> dict[str, Any]:
-    """One model's estimate as plain data; full precision, in the order of the state."""
+    """Return one model's estimate as plain data; full precision, in the order of the state."""
     return {
         "state_names": list(estimate.state_names),
         "state": estimate.state.tolist(),
@@ -75,11 +75,11 @@ def estimate_document(estimate: Estimate) -> dict[str, Any]:
 def result_document(
     result: Result, dvl_frame: str = "dvl_link", turned: bool = False, water: Water | None = None
 ) -> dict[str, Any]:
-    """A result as plain data for the result file, what a person looks for first and the matrices last.
+    """Return a result as plain data for the result file, the most important values first and the matrices last.
 
-    water: what is known of it. turned: the driver's data are forward-right-down and were turned. The mounting is that
-    of the forward-left-up axes, as mounting_rpy is; the transform is that of dvl_frame itself, for those who use the
-    driver's data as they come.
+    water: its properties, if known. turned: the driver's data are forward-right-down and were converted. The mounting
+    belongs to the forward-left-up axes, as mounting_rpy; the transform belongs to dvl_frame itself, for users of the
+    driver's unconverted data.
     """
     estimate = result.estimate
     parameters = result.parameters
@@ -139,7 +139,7 @@ def result_document(
 
 
 def days_document(result: Result) -> dict[str, Any]:
-    """What belongs to each day, in order, where there were several: the mounting holds the delay of the last."""
+    """Return the values per day, in order, if there are several: the mounting has the delay of the last day."""
     if not result.own_days:
         return {}
     return {
@@ -159,7 +159,7 @@ def days_document(result: Result) -> dict[str, Any]:
 
 
 def _in_words(found: Quantity) -> str:
-    unit = found.unit.strip().replace("°", "deg")  # ASCII, for the node prints a result that it cannot save
+    unit = found.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
     return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not shown by this data)")
 
 
@@ -174,61 +174,61 @@ def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
 
 
 def static_transform_arguments(position: Any, rotation: Array, parent: str, child: str) -> str:
-    """Arguments of tf2's static_transform_publisher: position (3,) m and rotation (3, 3) of child in parent."""
+    """Return arguments of tf2's static_transform_publisher: position (3,) m and rotation (3, 3) of child in parent."""
     values = (*position, *quaternion_from_rotation(rotation))
     numbers = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), values, strict=True)
     arguments = " ".join(f"--{name} {value:.9g}" for name, value in numbers)
-    parent, child = (shlex.quote(printable(name)) for name in (parent, child))  # a bag may name any frame
+    parent, child = (shlex.quote(printable(name)) for name in (parent, child))  # a bag may have any frame name
     frames = f"--frame-id {parent} --child-frame-id {child}"
     return f"{arguments} {frames}"
 
 
 def result_text(document: Mapping[str, Any]) -> str:
-    """A result document as YAML, a command or a row of a matrix on one line."""
-    dumper = yaml.CSafeDumper if yaml.__with_libyaml__ else yaml.SafeDumper  # the same in a quarter of the time
+    """Return a result document as YAML, with a command or a row of a matrix on one line."""
+    dumper = yaml.CSafeDumper if yaml.__with_libyaml__ else yaml.SafeDumper  # the same output, four times faster
     return str(yaml.dump(dict(document), Dumper=dumper, sort_keys=False, default_flow_style=None, width=1 << 20))
 
 
 def check_in_folder(path: Path, folder: Path) -> None:
     """Raise InputError unless a result file is a .yaml file in this folder.
 
-    For what is named at run time: whoever can set a parameter must not be able to write wherever the node can.
+    This is for names set at run time: permission to set a parameter must not include writing to any file.
     """
     if path.suffix != ".yaml" or Path(os.path.realpath(path)).parent != Path(os.path.realpath(folder)):
         raise InputError(f"{path}: at run time only a .yaml file in {folder} can be named; name others at the start")
 
 
 def save_result(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> None:
-    """Write a result as `save_bytes` does, unless it holds nothing and the file there holds something.
+    """Write a result atomically, unless it is empty and the existing file is not.
 
     Parameters
     ----------
-    path: Of the result file.
-    document: As of `result_document`.
-    n_backups: How many of the results before are kept: the one before, and the best and newest of those before it.
-        One that was continued, as by a save every minute, gives way to its continuation.
+    path: The result file.
+    document: From `result_document`.
+    n_backups: Number of previous results to keep: the last one, and the best and newest of those before it. A result
+        that
+        was continued, for example by a save every minute, is replaced by its continuation.
 
     Raises
     ------
-    KeptError: If no sample was used, and the file there is not known to be as empty.
+    KeptError: If no sample was used, and the existing file may have some.
     InputError: If it cannot be written.
-
     """
-    # os.path.exists: what cannot be asked, as on a disk that has gone, is for save_bytes to say
+    # os.path.exists: save_bytes reports an unreadable place, such as a disk that has gone
     if not document["used"] and os.path.exists(path) and own_stream(path) is None:
-        before = _Worth.of_file(path)
+        before = _ResultValue.of_file(path)
         if before is None or before.used:
             holds = "is no result file" if before is None else f"holds a result of {before.used} samples"
             raise KeptError(f"no sample was used, so there is nothing to save: {path}, which {holds}, is kept")
-    save_bytes(path, result_text(document).encode(), partial(_worth_keeping, _Worth.of(document), n_backups))
+    save_bytes(path, result_text(document).encode(), partial(_backups_to_keep, _ResultValue.of(document), n_backups))
 
 
 class KeptError(InputError):
-    """The result of before is kept: the newer is of no sample, or worse."""
+    """The previous result is kept, because the newer one is empty or worse."""
 
 
 def save_unless_worse(path: Path, document: Mapping[str, Any], n_backups: int = 1) -> None:
-    """Write a result as `save_result` does, but next to a better one of the same mounting. Raises KeptError then."""
+    """Write a result as `save_result`, or next to a better one of the same mounting. Raises KeptError then."""
     better = _better(path, document) if document["used"] and own_stream(path) is None else None
     if better is None:
         return save_result(path, document, n_backups)
@@ -241,8 +241,8 @@ def save_unless_worse(path: Path, document: Mapping[str, Any], n_backups: int = 
 def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the result in a file if it is of the same mounting and better; None otherwise.
 
-    Better is a better verdict. Of equal verdicts that of another run with the smaller σ, if the angles agree: of a DVL
-    that has moved the older σ says nothing.
+    Better means a better verdict or, for equal verdicts and consistent angles, a smaller σ in another run. If the DVL
+    has moved, the older σ does not count.
     """
     try:
         before: Any = load_yaml(path, "result file")
@@ -251,7 +251,7 @@ def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:
         p_old, p_new = (_covariance_of_angles(each) for each in (old, new))
         rotations = [rotation_from_rpy(each["corrected_rpy"]) for each in (old, new)]
         same = all(old[name] == new[name] for name in ("nominal_rpy", "frame_id", "child_frame_id"))
-        continued = _Worth.of(before).continued_by(_Worth.of(document))
+        continued = _ResultValue.of(before).continued_by(_ResultValue.of(document))
         both = np.flatnonzero((np.diag(p_old) > 0.0) & (np.diag(p_new) > 0.0))
         turn, p = turn_between(*rotations)[both], (p_old + p_new)[np.ix_(both, both)]
         moved = bool(len(both)) and chi2_sf(float(turn @ np.linalg.solve(p, turn)), len(both)) < MOVED
@@ -269,17 +269,17 @@ def _covariance_of_angles(mounting: Mapping[str, Any]) -> Array:
 
 
 def _spread(covariance: Array) -> tuple[int, float]:
-    """Return how many angles are not estimated, and the sum of the variances (rad²) of the others."""
+    """Return the number of angles that are not estimated, and the sum of variances (rad²) of the others."""
     variances = np.diag(covariance)
     return int((variances <= 0.0).sum()), float(variances[variances > 0.0].sum())
 
 
-# From the one that says least
+# from the least informative to the best
 _QUALITIES = ("collecting", "reject", "not verified", "marginal", "accept")
 
 
 def _quality(document: Mapping[str, Any]) -> str:
-    """Return the verdict that a result is worth: data that show no angle, and doubts that reject, go before its own."""
+    """Return the verdict of a result; no observable angle and rejecting warnings take precedence."""
     if document["convergence"] == Convergence.COLLECTING.value:
         return "collecting"
     if any(each["severity"] == Severity.REJECT.value for each in document.get("doubts", ())):
@@ -293,35 +293,35 @@ def _quality_in_words(document: Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
-class _Worth:
-    """What of a result tells how much would be lost with it. convergence: 0 collecting .. 2 fine."""
+class _ResultValue:
+    """Value of a result, to decide whether to keep it. convergence: 0 collecting .. 2 fine."""
 
     used: int
     convergence: int
     first_ns: int | None
 
     @staticmethod
-    def of(document: Mapping[str, Any]) -> _Worth:
+    def of(document: Mapping[str, Any]) -> _ResultValue:
         rank = [each.value for each in Convergence].index(document["convergence"])
-        return _Worth(int(document["used"]), rank, document["time_span"]["first_ns"])
+        return _ResultValue(int(document["used"]), rank, document["time_span"]["first_ns"])
 
     @staticmethod
-    def of_file(path: Path) -> _Worth | None:
-        """None for what is no result file, or a damaged one."""
+    def of_file(path: Path) -> _ResultValue | None:
+        """Return None if it is no result file, or a damaged one."""
         try:
             content: Any = load_yaml(path, "result file")
-            return _Worth.of(content) if content["format"] == FORMAT else None
+            return _ResultValue.of(content) if content["format"] == FORMAT else None
         except (InputError, OSError, KeyError, TypeError, ValueError, OverflowError):
             return None
 
-    def continued_by(self, other: _Worth) -> bool:
-        """Whether the other is of the same run, later on."""
+    def continued_by(self, other: _ResultValue) -> bool:
+        """Return whether the other is a later result of the same run."""
         return self.first_ns == other.first_ns and self.used <= other.used
 
 
-def _worth_keeping(new: _Worth, n_backups: int, before: Sequence[Path]) -> list[Path]:
-    """Of the files before, newest first, those to keep: the first, and then by convergence, the newest of equals."""
-    worth = {path: _Worth.of_file(path) for path in before}
+def _backups_to_keep(new: _ResultValue, n_backups: int, before: Sequence[Path]) -> list[Path]:
+    """Select the previous files, newest first, to keep: the first, then by convergence, newer ones first."""
+    worth = {path: _ResultValue.of_file(path) for path in before}
     kept: list[Path] = []
     for path in before:
         own = worth[path]
@@ -336,25 +336,25 @@ def _worth_keeping(new: _Worth, n_backups: int, before: Sequence[Path]) -> list[
 
 
 def load_initial_calibration(path: Path, mounting_rpy: Sequence[float] | None = None) -> dict[str, GaussianState]:
-    """States and covariances of a result file to begin with, by model name. Raises InputError naming what is wrong.
+    """Return states and covariances of a result file to start with, by model. Raises InputError for a faulty file.
 
-    What is not handed on (`Nuisance.handed_on`) is as not known. mounting_rpy: the nominal mounting
-    to go on with. The file's angles are relative to its own, which must be that.
+    States that do not carry over to another recording (`Nuisance.handed_on`) get their prior. mounting_rpy: the nominal
+    mounting to continue with; it must equal the file's, to which its angles are relative.
     """
     content, known = load_result(path, of_recording=True)
     _check_mounting(path, content, mounting_rpy)
-    return {name: _another_day(name, state) for name, state in known.items()}
+    return {name: _for_another_recording(name, state) for name, state in known.items()}
 
 
-def _another_day(name: str, state: GaussianState) -> GaussianState:
+def _for_another_recording(name: str, state: GaussianState) -> GaussianState:
     model = MODELS[name]
     return with_states_of(state, prior(model, Parameters()), model.not_handed_on)
 
 
 def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any], dict[str, GaussianState]]:
-    """A result file's document, and its states and covariances by model name. Raises InputError.
+    """Return a result file's document, and its states and covariances by model. Raises InputError.
 
-    of_recording: covariances of the recording, without what another day makes of them.
+    of_recording: covariances of the recording, without the variation between recordings.
     """
     content = load_yaml(path, "result file")
     known_as = content.get("format") if isinstance(content, dict) else None
@@ -365,7 +365,7 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
     models = content.get("models")
     if not isinstance(models, dict) or not models:
         raise InputError(f"{path}: damaged, it holds no models")
-    # of before the end was announced, the parameters are the last that is written
+    # older files do not announce the end; their last entry is the parameters
     if "parameters" not in content or ("ends_with" in content and content.get(_END) is not True):
         raise InputError(f"{path}: damaged, its end is missing")
     known = {
@@ -380,12 +380,12 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
 
 
 def _check_says_one_thing(path: Path, content: Mapping[str, Any]) -> None:
-    """Raise InputError if what stands in it twice differs: who changed one by hand does not know which is read."""
+    """Raise InputError if repeated values differ: a user who edits the file does not know which one is read."""
     try:
         selected = content["models"][content["model"]]
         places = [(name, content[name], selected[name]) for name in selected if name in content]
         places.append(("mounting", content["mounting"]["nominal_rpy"], content["parameters"]["mounting_rpy"]))
-    except (LookupError, TypeError):  # what is missing is missed by who reads it
+    except (LookupError, TypeError):  # the reader reports missing entries
         return
     for name, one, other in places:
         if one != other:
@@ -407,7 +407,7 @@ def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequen
 
 
 def _with_new_states(name: str, names: tuple[str, ...], x: Array, p: Array) -> tuple[tuple[str, ...], Array, Array]:
-    """States of a file of before its model got further nuisance states, with the prior of these; others as they are."""
+    """Add a model's newer nuisance states with their prior to an older file's states; return others unchanged."""
     model = MODELS[name]
     at = [index for index, each in enumerate(model.state_names) if each in names]
     ordered = names == tuple(model.state_names[index] for index in at) and len(names) < model.n_state
@@ -422,7 +422,7 @@ def _with_new_states(name: str, names: tuple[str, ...], x: Array, p: Array) -> t
 
 def _gaussian(where: str, name: str, saved: Any, of_recording: bool) -> GaussianState:
     published = _with_covariance(where, name, saved, "covariance")
-    if "covariance_of_recording" not in saved:  # of before the two were told apart
+    if "covariance_of_recording" not in saved:  # older files have only one covariance
         return published
     own = _with_covariance(where, name, saved, "covariance_of_recording")
     return own if of_recording else published
@@ -438,7 +438,7 @@ def _with_covariance(where: str, name: str, saved: Any, key: str) -> GaussianSta
         raise InputError(f"{where}: damaged ({type(error).__name__}: {error})") from error
     names, x, p = _with_new_states(name, names, x, p)
     if names != model.state_names or x.shape != (model.n_state,) or p.shape != (model.n_state, model.n_state):
-        raise InputError(f"{where}: states {names} are not those of the model, {model.state_names}")
+        raise InputError(f"{where}: states {names} are not the model's, {model.state_names}")
     if not np.isfinite(x).all() or not np.isfinite(p).all() or not np.allclose(p, p.T, rtol=1e-9, atol=0.0):
         raise InputError(f"{where}: state or covariance is not finite, or the covariance not symmetric")
     if np.linalg.eigvalsh(p)[0] <= 0.0:

@@ -1,4 +1,4 @@
-"""Mountings in a URDF: read from its fixed joints, and one joint's origin changed with every other byte kept."""
+"""Mountings in a URDF: read from its fixed joints; one joint's origin is changed and all other bytes are kept."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..calibration.numerics.frames import Array, rotation_from_rpy, rpy_from_rot
 from ..disk.text_files import read_file
 from ..errors import InputError
 
-# Those with meshes written out in them have some MB
+# files with embedded meshes have some MB
 LARGEST_FILE = 1 << 26
 
 
@@ -22,8 +22,8 @@ LARGEST_FILE = 1 << 26
 class Joint:
     """A joint of a URDF. rpy: rad about fixed axes; ``parent_from_child`` is its rotation.
 
-    tag: where its start tag is in the file, origin: where its origin's is (first byte, one past the last), None if it
-    has none.
+    tag: position of its start tag in the file. origin: position of its origin's (first byte, one past the last), None
+    if missing.
     """
 
     name: str
@@ -38,9 +38,10 @@ class Joint:
 
 @dataclass(frozen=True)
 class UrdfMounting:
-    """Where a URDF has the DVL: the fixed joints from the body to it, the last of which is its own.
+    """Mounting of the DVL in a URDF, by the fixed joints from the body to it.
 
-    rotation_body_from_dvl (3, 3), rotation_body_from_parent (3, 3): of the joint's parent. position: m, in the body.
+    joint: the last one, the DVL's own. rotation_body_from_dvl (3, 3), rotation_body_from_parent (3, 3): of the joint's
+    parent. position: m, in the body.
     """
 
     joint: Joint
@@ -51,7 +52,7 @@ class UrdfMounting:
 
 @dataclass(frozen=True)
 class Urdf:
-    """A URDF file. generated: xacro says in it that it is overwritten with the next run."""
+    """A URDF file. generated: whether xacro marked it as overwritten by its next run."""
 
     path: Path
     content: bytes
@@ -61,8 +62,8 @@ class Urdf:
     def mounting(self, base: str, dvl: str, joint: str | None = None) -> UrdfMounting:
         """Follow fixed joints from the DVL's link up to the body's. Raises InputError.
 
-        base, dvl: frame ids, with or without a namespace before the link's name. joint: the DVL's own, if it is not
-        the one above link `dvl`.
+        base, dvl: frame ids, with or without a namespace before the link's name. joint: the DVL's own, if it is not the
+        one above link `dvl`.
         """
         chain = [self._joint(joint) if joint is not None else self._above(dvl)]
         while not _is_link(chain[0].parent, base):
@@ -99,9 +100,9 @@ class Urdf:
         return "its fixed joints: " + (", ".join(each.name for each in self.joints if each.kind == "fixed") or "none")
 
     def moved(self, mounting: UrdfMounting, rotation_body_from_dvl: Array, position: Array | None = None) -> bytes:
-        """The file with the DVL's own joint so that the mounting is this (3, 3); all other bytes as they are.
+        """Return the file with the DVL's joint changed to give this mounting (3, 3); all other bytes are kept.
 
-        position: (3,) m in the body where the DVL is to be; None: its joint's xyz stays.
+        position: (3,) m of the DVL in the body; None keeps its joint's xyz.
         """
         joint, to_parent = mounting.joint, mounting.rotation_body_from_parent.T
         new = {"rpy": numbers(rpy_from_rotation(to_parent @ rotation_body_from_dvl)).encode()}
@@ -119,12 +120,12 @@ class Urdf:
 
 
 def numbers(values: Sequence[float] | Array) -> str:
-    """Numbers as in a URDF attribute: nine digits, no minus zero."""
+    """Format numbers for a URDF attribute: nine digits, no minus zero."""
     return " ".join(f"{float(value) + 0.0:.9g}" for value in values)
 
 
 def origin_tag(xyz: Sequence[float] | Array | None, rpy: Sequence[float] | Array) -> str:
-    """A joint's origin to paste: xyz (3,) m to four digits, none if unknown; rpy (3,) rad to a microradian."""
+    """Return a joint's origin to copy: xyz (3,) m to four digits, omitted if unknown; rpy (3,) rad to a microradian."""
     if xyz is None:
         return f'<origin rpy="{" ".join(f"{value + 0.0:.6f}" for value in rpy)}"/>'
     position = [float(f"{float(value):.4g}") for value in xyz]
@@ -132,7 +133,7 @@ def origin_tag(xyz: Sequence[float] | Array | None, rpy: Sequence[float] | Array
 
 
 def _is_link(link: str, frame: str) -> bool:
-    """Whether a frame id is a link's, with the namespace that robot_state_publisher may put before it."""
+    """Return whether a frame id is a link's, with an optional namespace from robot_state_publisher."""
     return link == frame or link == frame.rsplit("/", 1)[-1]
 
 
@@ -146,7 +147,7 @@ def _with_attribute(tag: bytes, name: str, text: bytes) -> bytes:
 
 
 def read_urdf(path: Path) -> Urdf:
-    """Read a URDF's joints. Raises InputError for what is none, or still holds xacro macros."""
+    """Read a URDF's joints. Raises InputError if it is none, or has xacro macros."""
     content = read_file(path, "URDF", LARGEST_FILE)
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(f"{path}: is UTF-16, which cannot be edited byte for byte; save it as UTF-8")
@@ -154,13 +155,13 @@ def read_urdf(path: Path) -> Urdf:
 
 
 def parse_urdf(path: Path, content: bytes) -> Urdf:
-    """As `read_urdf`, of what is in memory; path: what errors call it."""
+    """Parse a URDF in memory as `read_urdf`; path: name in errors."""
     return _UrdfReader(path, content).read()
 
 
 @dataclass
 class _UrdfReader:
-    """Walks through the elements; only joints directly under the robot count."""
+    """Walk through the elements of a URDF; only joints directly under the robot count."""
 
     path: Path
     content: bytes
@@ -178,7 +179,7 @@ class _UrdfReader:
         parser.CommentHandler = self._comment
         try:
             parser.Parse(self.content, True)
-        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two of its encoding
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the latter two are due to the encoding
             raise InputError(f"{self.path}: no URDF, not valid XML: {error}") from error
         return Urdf(self.path, self.content, tuple(self._found), self._generated)
 
@@ -209,7 +210,7 @@ class _UrdfReader:
         self._open.pop()
 
     def _span(self) -> tuple[int, int]:
-        """Bytes of the start tag that the parser is at."""
+        """Return the bytes of the parser's current start tag."""
         start = self._parser.CurrentByteIndex
         found = re.compile(rb"""<(?:[^"'>]|"[^"]*"|'[^']*')*>""").match(self.content, start)
         if found is None:

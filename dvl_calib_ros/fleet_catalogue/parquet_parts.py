@@ -1,8 +1,8 @@
-"""The catalogue on the disk: a Parquet file a recording, all of one schema, which readers take as one table.
+"""Files of the catalogue: one Parquet file per recording, all with one schema, which readers combine to a table.
 
-Each is written whole or not at all, under a name that follows from where the recording is: a run that is killed loses
-what it was at, and none has a row twice. What a run needs to go on is in the file's own metadata, together with a
-checksum of the whole file, which is compared before a parser sees any of it.
+Each file is written atomically, under a name derived from the recording's location: a killed run loses only the current
+recording, and no row is repeated. The file's metadata have the information to continue a run, and a checksum of the
+whole file, which is verified before parsing.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from ..disk.text_files import read_file
 from ..errors import InputError, as_cell
 from .recording_entry import Entry, Row
 
-# What is set aside lies in a folder of its own: readers take every file of rows/
+# faulty files are moved to their own folder, because readers read every file of rows/
 ROWS, PAGE, ASIDE = "rows", "index.html", "set_aside"
-# Version of the schema: part of what says whether a recording is done
+# version of the schema; a change makes all recordings due again
 SCHEMA = 4
 _KEY, _CHECKSUM_KEY = b"dvl_calib", b"dvl_calib checksum"
-# Before the checksum, in the file's metadata
+# precedes the checksum in the file's metadata
 _CHECKSUM = b"sha256 of this file with zeros here: "
 _ZEROS = b"0" * 64
 
 
 @dataclass(frozen=True)
 class CataloguePart:
-    """A recording in the catalogue. fingerprint: of recording, program and options; '' is to be done again."""
+    """A recording in the catalogue. fingerprint: of recording, program and options; '' means to be repeated."""
 
     recording: str
     vehicle: str
@@ -43,9 +43,9 @@ class CataloguePart:
 
 
 class Catalogue:
-    """A folder with ``rows/*.parquet``. Raises InputError where it cannot be written, or without pyarrow.
+    """A folder with ``rows/*.parquet``. Raises InputError if it cannot be written, or without pyarrow.
 
-    notes: of the files that `parts` has set aside, a sentence each.
+    notes: a sentence for each file that `parts` set aside.
     """
 
     def __init__(self, folder: Path):
@@ -88,17 +88,17 @@ class Catalogue:
         )
 
     def write(self, part: CataloguePart, entry: Entry) -> None:
-        """Put the rows of a recording in the place of those before."""
+        """Replace the rows of a recording."""
         self._save(part, [{"vehicle": part.vehicle, **_stamped(row)} for row in entry.rows])
 
     def rename(self, part: CataloguePart, vehicle: str) -> None:
-        """Give the rows of a recording another vehicle."""
+        """Change the vehicle in the rows of a recording."""
         rows = self.rows_of(part.recording)
         own = CataloguePart(part.recording, vehicle, part.fingerprint, part.extrinsics)
         self._save(own, [{**row, "vehicle": vehicle} for row in rows])
 
     def parts(self) -> Iterator[CataloguePart]:
-        """Yield each recording's part, and set aside what is none; a part of another schema is passed over.
+        """Yield each recording's part, and set faulty files aside; parts of another schema are skipped.
 
         Raises InputError if a file cannot be set aside.
         """
@@ -120,7 +120,7 @@ class Catalogue:
         return found
 
     def _part(self, path: Path) -> CataloguePart:
-        """Read what a file says of itself. Raises InputError if it is no part, damaged, or another's by its name."""
+        """Read a file's own description. Raises InputError if it is no part, damaged, or misnamed."""
         from pyarrow import parquet
 
         content = self._whole(path)
@@ -134,7 +134,7 @@ class Catalogue:
         return part
 
     def _whole(self, path: Path) -> bytes:
-        """Read a file. Raises InputError if any bit of it is not as it was written."""
+        """Read a file. Raises InputError if any bit has changed."""
         content = read_file(path, "part of a catalogue")
         if _CHECKSUM not in content or _with_checksum(content) != content:
             raise InputError(f"{path}: is damaged, or was not written by this version of dvl-calib fleet")
@@ -171,14 +171,15 @@ class Catalogue:
 
 
 def _with_checksum(content: bytes) -> bytes:
-    """Return a part with the checksum that it should have, in the place of the one that it has."""
-    at = content.rfind(_CHECKSUM) + len(_CHECKSUM)  # the last: metadata follow the rows, and the checksum all other
+    """Replace a part's checksum by the right one."""
+    # the last occurrence: metadata follow the rows, and the checksum the other metadata
+    at = content.rfind(_CHECKSUM) + len(_CHECKSUM)
     before, after = content[:at], content[at + len(_ZEROS) :]
     return before + hashlib.sha256(before + _ZEROS + after).hexdigest().encode() + after
 
 
 def _stamped(row: Row) -> Row:
-    """With times instead of stamps."""
+    """Convert stamps to times."""
     own = {name: value for name, value in row.items() if not name.endswith("_ns")}
     return own | {name: row.get(f"{name}_ns") for name in ("first", "last")}
 

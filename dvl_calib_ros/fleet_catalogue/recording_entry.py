@@ -1,4 +1,4 @@
-"""One recording of a fleet: calibrated as `replay` does it, and what the catalogue keeps of that."""
+"""One recording of a fleet: its calibration as by `replay`, and its entry in the catalogue."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from ..recordings.recording import open_recording
 from .recording_search import StoredRecording, as_text
 
 _UNITS = {"°": "deg"}
-# `Estimate.heading_deviation`, in degrees; the last by the hour
+# `Estimate.heading_deviation`, in degrees; the last per hour
 HEADING_ERRORS = ("heading_sin", "heading_cos", "heading_sin2", "heading_cos2", "heading_drift")
-# By what a recording differs from day to day, which recordings of one day share
+# variation between days, which recordings of one day share
 _DAY = ("day_std_heading", "day_std_scale")
 
 Row = dict[str, Any]
@@ -34,7 +34,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Task:
-    """A recording to calibrate, and with what."""
+    """A recording to calibrate, with parameters and named topics."""
 
     recording: StoredRecording
     parameters: Parameters
@@ -43,16 +43,16 @@ class Task:
 
 @dataclass(frozen=True)
 class Entry:
-    """What the catalogue keeps of a recording.
+    """Entry of a recording in the catalogue.
 
     Parameters
     ----------
     rows
-        One a parameter, without the vehicle; one alone, with ``error``, of a recording that could not be calibrated.
+        One per parameter, without the vehicle; a single one, with ``error``, if the calibration failed.
     extrinsics
-        For the comparison with others, plain data; None without.
+        Plain data for the comparison with others; None without.
     is_final
-        Whether the same recording would give the same again; not so where a machine failed.
+        Whether repeating it would give the same result; False if a machine failed.
     """
 
     rows: Sequence[Row]
@@ -62,7 +62,7 @@ class Entry:
 
 @memory_given_back()
 def entry_of(task: Task) -> Entry:
-    """Calibrate. Whatever goes wrong is the entry's error."""
+    """Calibrate with a recording. Any exception becomes the entry's error."""
     where = task.recording.name
     try:
         with task.recording.at_hand() as path:
@@ -75,7 +75,7 @@ def entry_of(task: Task) -> Entry:
 
 
 def failed(where: str, why: str, is_final: bool = True) -> Entry:
-    """Of a recording that could not be calibrated."""
+    """Return the entry of a recording that could not be calibrated."""
     return Entry([{"recording": where, "error": why}], None, is_final)
 
 
@@ -93,7 +93,7 @@ def _calibrated(task: Task, path: Any) -> Entry:
 
 
 def entry_of_replay(replayed: Replayed, where: str) -> Entry:
-    """Rows of a replay."""
+    """Return the rows of a replay."""
     result = replayed.result
     estimate, verification = result.estimate, result.verifications[result.selected]
     drift = replayed.navigation
@@ -123,12 +123,12 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
 def _day(stamp_ns: int) -> date | None:
     try:
         return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).date()
-    except (ValueError, OverflowError, OSError):  # a stamp that is no time
+    except (ValueError, OverflowError, OSError):  # an invalid time
         return None
 
 
 def _quantities(result: Result) -> list[Row]:
-    """Rows of mounting, scale and delay, with σ of the filter, of this recording, and of the next."""
+    """Return rows of mounting, scale and delay, with σ of the filter, of this recording, and of the next."""
     estimate = result.estimate
     claims = (estimate.filter_covariance, estimate.recording_covariance, estimate.covariance)
     by_claim = [
@@ -153,7 +153,7 @@ def _quantities(result: Result) -> list[Row]:
 
 
 def _heading(estimate: Estimate) -> list[Row]:
-    """Rows of how the heading deviates, where headings were compared."""
+    """Return rows of the heading deviation, if headings were compared."""
     if estimate.heading_deviation is None:
         return []
     value, std = estimate.heading_deviation.x, np.sqrt(np.diag(estimate.heading_deviation.p))
@@ -167,7 +167,7 @@ def _heading(estimate: Estimate) -> list[Row]:
 
 
 def _water(water: Water | None) -> list[Row]:
-    """Rows of the water, as far as it is known; of a range its middle and half."""
+    """Return rows of the known water properties; a range is given by its middle and half-width."""
     if water is None:
         return []
     known = [
@@ -186,13 +186,13 @@ def _water(water: Water | None) -> list[Row]:
 
 
 def _cause(replayed: Replayed) -> dict[str, str]:
-    """What the water says of the scale, by the name under which the catalogue keeps it."""
+    """Return the scale's explanation by the water, under its name in the catalogue."""
     cause = replayed.cause_of_scale
     return {} if cause is None else {"cause_of_scale": cause.sentence}
 
 
 def _without_day(replayed: Replayed) -> Replayed:
-    """The same with σ of this recording alone, for those of one day, which share what differs from day to day."""
+    """Return the replay with σ of this recording only, without the variation between days."""
     parameters = {**replayed.result.parameters, **dict.fromkeys(_DAY, 0.0)}
     return replace(replayed, result=replace(replayed.result, parameters=parameters))
 

@@ -1,7 +1,7 @@
-"""Recordings below folders and object stores: which files are one, and whose vehicle it is.
+"""Search for recordings below folders and object stores: their files and vehicles.
 
-A recording is what `replay` takes: a folder with metadata.yaml, a folder whose files are numbered by its own name, else
-each .mcap, .db3, .bag by itself. Object stores are read by fsspec; what is there is copied for the time it is read.
+A recording is an input of `replay`: a folder with metadata.yaml, a folder whose files have its own name and numbers,
+else each single .mcap, .db3, .bag. Object stores are read by fsspec; their files are copied while they are read.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from ..bags.files import STORAGE_SUFFIXES, storage_suffix
 from ..errors import InputError
 
 METADATA = "metadata.yaml"
-# Beside a database whose recorder died
+# next to a database whose recorder died
 _JOURNALS = ("-wal", "-journal")
-# By what an object store tells one version of a file from the next, the first that it has
+# fields by which object stores distinguish versions of a file; the first existing one is used
 _VERSIONS = ("ETag", "etag", "md5Hash", "mtime", "LastModified", "last_modified", "updated", "created")
 
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file of a recording. where: absolute path, or URL. stamp: changes when its content does (mtime, etag)."""
+    """A file of a recording. where: absolute path, or URL. stamp: changes with its content (mtime, etag)."""
 
     where: str
     size: int
@@ -38,7 +38,10 @@ class StoredFile:
 
 @dataclass(frozen=True)
 class StoredRecording:
-    """A recording below a place. where: absolute path or URL of the folder or the one file. inside: below the place."""
+    """A recording below a place.
+
+    where: absolute path or URL of the folder or the one file. inside: path below the place.
+    """
 
     where: str
     inside: str
@@ -47,16 +50,16 @@ class StoredRecording:
 
     @property
     def name(self) -> str:
-        """`where` as text: a name on the disk may be none."""
+        """`where` as printable text."""
         return as_text(self.where)
 
     @property
     def is_remote(self) -> bool:
-        """Whether it is copied to be read."""
+        """Whether it must be copied for reading."""
         return "://" in self.where
 
     def vehicle(self, pattern: re.Pattern[str] | None) -> str:
-        """Whose it is: what a pattern finds in its place, else the first folder below PLACE, else PLACE itself."""
+        """Return its vehicle: the pattern's match in its path, else the first folder below the place, or the place."""
         if pattern is not None:
             found = pattern.search(self.name)
             if found is None:
@@ -67,9 +70,9 @@ class StoredRecording:
 
     @contextmanager
     def at_hand(self) -> Iterator[Path]:
-        """Where it can be read, on this machine."""
+        """Yield a local path of the recording."""
         if not self.is_remote:
-            if not os.path.exists(self.where):  # of a worker elsewhere; nothing that is wrong with the recording
+            if not os.path.exists(self.where):  # missing on another worker's machine; the recording itself has no fault
                 raise FileNotFoundError(f"{self.where} is not there on {os.uname().nodename}")
             yield Path(self.where)
             return
@@ -85,12 +88,12 @@ class StoredRecording:
 
 
 def as_text(name: str) -> str:
-    """A name on the disk with what is no UTF-8 as escapes."""
+    """Return a file name with invalid UTF-8 as escapes."""
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def vehicle_pattern(text: str | None) -> re.Pattern[str] | None:
-    """What ``--vehicle-from`` gives. Raises InputError for what is no regular expression."""
+    """Compile ``--vehicle-from``. Raises InputError for an invalid regular expression."""
     if not text:
         return None
     try:
@@ -102,9 +105,9 @@ def vehicle_pattern(text: str | None) -> re.Pattern[str] | None:
 
 
 def recordings_in(places: Sequence[str]) -> tuple[list[StoredRecording], list[str]]:
-    """All recordings below places, each once, in order of their paths; and what could not be looked into.
+    """Return all recordings below places, each once, in order of their paths; and notes on unreadable files.
 
-    places: folders, files or URLs. Raises InputError for a place that is none, and if there is no recording at all.
+    places: folders, files or URLs. Raises InputError for an invalid place, and if there is no recording.
     """
     found: dict[str, StoredRecording] = {}
     unread: list[str] = []
@@ -122,7 +125,7 @@ def _is_of_a_recording(name: str) -> bool:
     return name == METADATA or storage_suffix(Path(plain)) in STORAGE_SUFFIXES
 
 
-# A place, and its files by their folders
+# a place, and its files by their folders
 _Files = tuple[str, dict[str, list[StoredFile]]]
 
 
@@ -141,7 +144,7 @@ def _local_files(place: str, unread: list[str]) -> _Files:
         onerror=lambda error: unread.append(f"{error.filename}: {error.strerror}; not looked into"),
     ):
         real = os.path.realpath(folder)
-        if real in seen:  # a link that leads back
+        if real in seen:  # a circular link
             folders.clear()
             continue
         seen.add(real)
@@ -150,7 +153,7 @@ def _local_files(place: str, unread: list[str]) -> _Files:
         for name in own:
             try:
                 files.setdefault(folder, []).append(_local_file(os.path.join(folder, name)))
-            except OSError as error:  # a link that leads nowhere
+            except OSError as error:  # a dangling link
                 unread.append(f"{os.path.join(folder, name)}: {error.strerror}; not read")
     return root, files
 
@@ -158,7 +161,7 @@ def _local_files(place: str, unread: list[str]) -> _Files:
 def _local_file(path: str) -> StoredFile:
     told = os.stat(path)
     if not stat.S_ISREG(told.st_mode):
-        raise OSError(errno.EINVAL, "is no file")  # a pipe would be waited for
+        raise OSError(errno.EINVAL, "is no file")  # a pipe would block
     return StoredFile(path, told.st_size, str(told.st_mtime_ns))
 
 
@@ -166,7 +169,7 @@ def _stored(place: str) -> _Files:
     store, root = _store(place)
     try:
         found: Mapping[str, Mapping[str, Any]] = store.find(root, detail=True)
-    except Exception as error:  # each store has errors of its own
+    except Exception as error:  # each store has its own errors
         raise InputError(
             f"{place}: cannot be listed ({type(error).__name__}: {error}); see to address and access"
         ) from error
@@ -183,14 +186,14 @@ def _stored(place: str) -> _Files:
 
 
 def _store(place: str) -> tuple[Any, str]:
-    """The store of a URL, and the path in it. Raises InputError."""
+    """Return the store of a URL, and the path in it. Raises InputError."""
     try:
         from fsspec.core import url_to_fs
     except ImportError as error:
         raise InputError(f"{place}: object stores need fsspec ({error}); pip install 'dvl_calib_ros[fleet]'") from error
     try:
         store, root = url_to_fs(place)
-    except (ImportError, ValueError) as error:  # fsspec says which package opens such a store
+    except (ImportError, ValueError) as error:  # fsspec's message names the missing package
         raise InputError(f"{place}: {error}") from error
     return store, root
 
@@ -199,7 +202,7 @@ def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterato
     bags: list[str] = []
     for folder, files in sorted(folders.items()):
         if any(folder.startswith(f"{bag}/") for bag in bags[-1:]):
-            continue  # a folder in a bag is none of its own
+            continue  # a folder inside a bag is part of it
         storage = [each for each in files if storage_suffix(Path(each.where)) in STORAGE_SUFFIXES]
         if not storage:
             continue
@@ -217,5 +220,5 @@ def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterato
 def _is_bag(folder: str, files: Sequence[StoredFile], storage: Sequence[StoredFile]) -> bool:
     if any(each.where.endswith(f"/{METADATA}") for each in files):
         return True
-    own = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # as rosbag2 numbers its files
+    own = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # rosbag2's numbering of files
     return all(own.match(each.where.rpartition("/")[2]) for each in storage)

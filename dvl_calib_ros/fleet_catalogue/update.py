@@ -1,4 +1,4 @@
-"""A fleet: every recording below some places calibrated once, into a catalogue that grows."""
+"""Calibration of every recording below some places into a growing catalogue."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from .recording_entry import Task, entry_of, failed
 from .recording_search import StoredRecording, as_text, recordings_in, vehicle_pattern
 from .vehicle_history import Catalogued, NeedsPerson, VehicleHistory, distinct, histories, need_person
 
-# Answers of a comparison, the worst first
+# answers of a comparison, the worst first
 WORDS = ("moved", "suspicious", "same")
 
 
 @dataclass(frozen=True, repr=False)
 class Fleet(Answering):
-    """What a catalogue holds after a run.
+    """Content of a catalogue after a run.
 
     Parameters
     ----------
     out
         Folder of the catalogue: ``rows/*.parquet``, ``index.html``.
     recordings
-        How many the catalogue holds.
+        Number of recordings in the catalogue.
     calibrated, unchanged
-        How many of them this run did, and found done.
+        Number of them that this run calibrated, and that were up to date.
     vehicles
-        Each with its calibrations by day, and where its mounting moved.
+        Vehicles with their calibrations by day, and the moves of the mounting.
     persons
-        Why recordings need a person, and which.
+        Recordings that need a person's decision, with the reasons.
     notes
-        What could not be looked into.
+        Unreadable places.
     """
 
     out: Path
@@ -54,17 +54,17 @@ class Fleet(Answering):
 
     @property
     def page(self) -> Path:
-        """The page."""
+        """Path of the page."""
         return self.out / PAGE
 
     @property
     def verdict(self) -> str:
-        """The answer, by the name that every result has it by."""
+        """The answer, under the name common to all results."""
         return self.word
 
     @property
     def word(self) -> str:
-        """The answer: whether the mounting of one moved."""
+        """The answer: whether any mounting moved."""
         words = [each.compared.word for each in self.vehicles if each.compared is not None]
         return next((word for word in WORDS if word in words), "not compared")
 
@@ -78,11 +78,11 @@ def run_fleet(
     vehicle_from: str | None = None,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> Fleet:
-    """Calibrate what is new or has changed, and read the catalogue. The page is not written.
+    """Calibrate new and changed recordings, and read the catalogue. The page is not written.
 
-    places: folders, files, URLs. given: what parameters and topics are named. vehicle_from: a regular expression; by
-    default the first folder below a place. Raises InputError for a place that is none, for a catalogue that cannot be
-    written, and for workers that cannot be had; what is done is kept.
+    places: folders, files, URLs. given: named parameters and topics. vehicle_from: a regular expression; by default the
+    first folder below a place. Raises InputError for an invalid place, a catalogue that cannot be written, and
+    unavailable workers; finished recordings are kept.
     """
     if parameters.initial_calibration:
         raise InputError("initial_calibration: recordings of a fleet are each calibrated by themselves; leave it out")
@@ -129,7 +129,7 @@ def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence
 
 
 def _check_reach(left: Sequence[StoredRecording], workers: Workers) -> None:
-    """Raise InputError for what other processes cannot see."""
+    """Raise InputError for files that other processes cannot read."""
     for each in left:
         if each.where.startswith("memory://") and (workers.dask or workers.jobs != 1):
             raise InputError(f"{each.where}: is in the memory of this process alone; read it with --jobs 1")
@@ -141,6 +141,6 @@ def _options(parameters: Parameters, given: Given) -> str:
 
 
 def _fingerprint(recording: StoredRecording, options: str) -> str:
-    """Changes when the recording, the program or the options do."""
+    """Return a text that changes with the recording, the program or the options."""
     files = [(as_text(each.where), each.size, each.stamp) for each in recording.files]
     return hashlib.sha256(json.dumps([options, files]).encode()).hexdigest()

@@ -1,7 +1,7 @@
-"""What a catalogue says: of each vehicle how its DVL sat day by day, and which recordings need a person.
+"""History of each vehicle's mounting by day, and recordings that need a person.
 
-Recordings of one day share what differs from day to day (`day_to_day_covariance`): they are averaged by their own σ,
-and that of the day is added once. A mounting that moves within a day parts the day.
+Recordings of one day share the variation between days (`day_to_day_covariance`): they are averaged by their own σ, and
+the day's σ is added once. A mounting that moves within a day splits the day.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ DAY_NS = 86_400_000_000_000
 
 @dataclass(frozen=True)
 class Catalogued:
-    """A recording as the catalogue has it. covariance_of_recording (8, 8): without what differs from day to day.
+    """A recording in the catalogue. covariance_of_recording (8, 8): without the variation between days.
 
-    cause_of_scale: what the water says of it, in a sentence, '' for nothing.
+    cause_of_scale: explanation of the scale by the water, in a sentence, or ''.
     """
 
     recording: str
@@ -40,7 +40,7 @@ class Catalogued:
 
     @staticmethod
     def of(recording: str, vehicle: str, rows: Sequence[Row], told: Mapping[str, Any] | None) -> Catalogued:
-        """From the plain data of a part."""
+        """Build from the plain data of a part."""
         if told is None:
             return Catalogued(recording, vehicle, tuple(rows))
         own = {field.name: told[field.name] for field in fields(Extrinsics) if field.name in told}
@@ -57,13 +57,16 @@ class Catalogued:
 
     @property
     def is_usable(self) -> bool:
-        """Whether its numbers and σ are to be believed."""
+        """Whether its values and σ are valid."""
         return self.extrinsics is not None and not self.extrinsics.rejected
 
 
 class CompassDeviation(NamedTuple):
-    """How a vehicle's heading deviates, degrees: coefficients (4,) of sine and cosine of the yaw and of twice that, σ
-    (4,), and of how many recordings."""
+    """Heading deviation of a vehicle, degrees.
+
+    value, std: coefficients (4,) of sine and cosine of the yaw and of twice the yaw, and their σ. recordings: their
+    number.
+    """
 
     value: Array
     std: Array
@@ -71,9 +74,10 @@ class CompassDeviation(NamedTuple):
 
 
 class WaterOfRecording(NamedTuple):
-    """first_ns: stamp of the recording's first sample. used: speed of sound that the DVL used, m/s, nan if not known.
+    """Water properties of a recording.
 
-    cause_of_scale: what the water says of the scale, in a sentence.
+    first_ns: stamp of the recording's first sample. used: speed of sound used by the DVL, m/s, nan if unknown.
+    cause_of_scale: explanation of the scale by the water, in a sentence.
     """
 
     first_ns: int
@@ -83,9 +87,9 @@ class WaterOfRecording(NamedTuple):
 
 @dataclass(frozen=True)
 class VehicleHistory:
-    """A vehicle. days: its calibrations by day. compared: None where there are less than two. heading: None without.
+    """A vehicle. days: its calibrations by day. compared: None with fewer than two. heading: None if unknown.
 
-    water: of its newest recording that tells of it.
+    water: of its newest recording that has it.
     """
 
     name: str
@@ -97,7 +101,7 @@ class VehicleHistory:
 
 
 class NeedsPerson(NamedTuple):
-    """Why recordings need a person, of the first in its words.
+    """A reason why recordings need a person, in the words for the first.
 
     code: of the reason of a verdict, or SAME_DATA; '' of an error.
     """
@@ -108,7 +112,7 @@ class NeedsPerson(NamedTuple):
 
 
 def histories(entries: Sequence[Catalogued]) -> list[VehicleHistory]:
-    """Of each vehicle, by name. entries: each recording once (`distinct`)."""
+    """Return the history of each vehicle, by name. entries: each recording once (`distinct`)."""
     by_vehicle: dict[str, list[Catalogued]] = defaultdict(list)
     for each in entries:
         by_vehicle[each.vehicle].append(each)
@@ -116,7 +120,7 @@ def histories(entries: Sequence[Catalogued]) -> list[VehicleHistory]:
 
 
 def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[NeedsPerson]]:
-    """Without those that hold the same data as another, which would confirm itself; and those."""
+    """Remove recordings with the same data as another, which would confirm itself; also return those."""
     first: dict[Any, Catalogued] = {}
     left, doubled = [], []
     for each in entries:
@@ -139,7 +143,7 @@ def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[Need
 
 
 def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
-    """Recordings that could not be calibrated, or whose calibration is rejected, by why; the most first."""
+    """Return recordings without a calibration or with a rejected one, by reason; the most frequent first."""
     groups: dict[tuple[str, str], list[Catalogued]] = defaultdict(list)
     for each in entries:
         row = each.rows[0]
@@ -156,7 +160,7 @@ def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
 
 def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
     usable = [each for each in entries if each.is_usable]
-    # what a model without GNSS assumes of currents is no measure of one with
+    # models without GNSS assume no current, so they are not compared with models with GNSS
     aided = [each for each in entries if each.extrinsics is not None and MODELS[each.extrinsics.model].aided]
     days = _days([each for each in aided if each.is_usable] or usable)
     rejected = [
@@ -171,7 +175,7 @@ def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
 def _compared(several: Sequence[Extrinsics]) -> Comparison | None:
     try:
         return compare(several) if len(several) > 1 else None
-    except InputError:  # nothing that two of them have shown
+    except InputError:  # no quantity is observable in two of them
         return None
 
 
@@ -183,12 +187,12 @@ def _days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
     found = []
     for _, own in sorted(by_day.items()):
         own.sort(key=lambda each: each[0].first_ns)
-        found += [_of_day(part) for part in _parted(own)]
+        found += [_of_day(part) for part in _split_at_moves(own)]
     return found
 
 
-def _parted(own: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:
-    """Recordings of one day, between those where the mounting moved."""
+def _split_at_moves(own: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, Array]]]:
+    """Split the recordings of one day where the mounting moved."""
     compared = _compared([each for each, _ in own])
     starts = [] if compared is None else [change.first_after.name for change in compared.moved]
     parts: list[list[tuple[Extrinsics, Array]]] = [[]]
@@ -200,7 +204,7 @@ def _parted(own: list[tuple[Extrinsics, Array]]) -> list[list[tuple[Extrinsics, 
 
 
 def _of_day(own: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
-    """All of a day as one, with what differs from day to day once."""
+    """Average a day's recordings, adding the variation between days once."""
     of_days = [each.covariance - alone for each, alone in own]
     together = fused([replace(each, covariance=alone) for each, alone in own])
     covariance = together.covariance + max(of_days, key=np.trace)
@@ -209,7 +213,7 @@ def _of_day(own: Sequence[tuple[Extrinsics, Array]]) -> Extrinsics:
 
 
 def _water(entries: Sequence[Catalogued]) -> WaterOfRecording | None:
-    """Of the newest that tells of it."""
+    """Return the water properties of the newest recording that has them."""
     found = []
     for each in entries:
         if each.extrinsics is not None and each.cause_of_scale:
@@ -219,7 +223,7 @@ def _water(entries: Sequence[Catalogued]) -> WaterOfRecording | None:
 
 
 def _heading(entries: Sequence[Catalogued]) -> CompassDeviation | None:
-    """Of all recordings, weighted; None where no heading was compared."""
+    """Return the weighted mean over all recordings; None if no heading was compared."""
     names = HEADING_ERRORS[:4]
     values, stds = [], []
     for each in entries:

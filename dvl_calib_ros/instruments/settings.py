@@ -1,7 +1,7 @@
-"""A saved calibration as the settings of the instrument itself, or of the autopilot that reads it.
+"""Conversion of a saved calibration to settings of the instrument itself, or of the autopilot that reads it.
 
-What is set takes the error out at its source, so the mounting that URDF and parameters tell stays what it was, but for
-what the instrument cannot be told. Settings are what the documents say that each entry names.
+The settings correct the error at its source, so the mounting in URDF and parameters stays unchanged, except for errors
+that the instrument has no setting for. Each entry names the document that its settings follow.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from ..errors import InputError, printable
 from ..files.mounting import POSITION_UNKNOWN, CalibratedMounting
 from ..files.urdf import numbers
 
-# An angle that stays is worth a word from here on, rad.
+# smallest remaining angle that is reported, rad
 SAID_FROM = math.radians(0.05)
-# An autopilot's orientation is a quarter turn; so far from one (rad) it is none.
+# an autopilot's orientation is a multiple of a quarter turn, within this tolerance (rad)
 QUARTER, NEAR_QUARTER = 0.5 * math.pi, math.radians(20.0)
-# Where a value comes from that nobody told.
+# origin of a setting that was not given
 AS_DELIVERED, AS_RECORDED = "as delivered", "as recorded"
 SPEED_OF_SOUND = "speed_of_sound"
-# A speed of sound (m/s) that is told may be rounded.
+# tolerance for a given speed of sound (m/s), which may be rounded
 SAME_SPEED = 1.0
-# Delays that an autopilot can be told.
+# range of an autopilot's delay, ms
 DELAY_MS = (0, 250)
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One value of an instrument. now: None where that is not known; now_by: by what it is, where nobody said it."""
+    """One setting of an instrument. now: None if unknown. now_by: origin of a value that was not given."""
 
     name: str
     now: float | None
@@ -49,13 +49,13 @@ class Setting:
     now_by: str = ""
 
     def __str__(self) -> str:
-        before = "not told" if self.now is None else f"{self.now:g}" + (f" ({self.now_by})" if self.now_by else "")
+        before = "unknown" if self.now is None else f"{self.now:g}" + (f" ({self.now_by})" if self.now_by else "")
         return f"{self.name}: {before} -> {self.new:g} {self.unit}".rstrip()
 
 
 @dataclass(frozen=True)
 class InstrumentSettings:
-    """What to set. text: as it is typed, sent, or loaded from a file. notes: what it leaves, in sentences."""
+    """Settings of an instrument. text: to type, send, or load from a file. notes: remaining errors, in sentences."""
 
     instrument: str
     document: str
@@ -65,7 +65,7 @@ class InstrumentSettings:
 
 
 class Range(NamedTuple):
-    """What a setting holds, and what it is delivered with; None where that differs."""
+    """Range of a setting and its factory value; None if that varies."""
 
     least: float
     most: float
@@ -74,8 +74,10 @@ class Range(NamedTuple):
 
 @dataclass(frozen=True)
 class Instrument:
-    """A kind of instrument. document: the one that it follows. ranges: of its settings. settings: by a calibration and
-    what it is set to now, as far as that is known."""
+    """A kind of instrument. document: its source. ranges: of its settings.
+
+    settings: function from a calibration and the current settings, as far as known, to new settings, text and notes.
+    """
 
     document: str
     ranges: Mapping[str, Range]
@@ -85,10 +87,10 @@ class Instrument:
 def instrument_settings(
     calibrated: CalibratedMounting, name: str, now: Mapping[str, float] | None = None, force: bool = False
 ) -> InstrumentSettings:
-    """What to set, so that the data come out corrected; `now`: what it was set to when the data were recorded.
+    """Return the settings that correct the data; `now`: settings when the data were recorded.
 
-    Raises InputError for another instrument or setting, what it cannot be set to, or a calibration that is rejected,
-    unless force is set.
+    Raises InputError for an unknown instrument or setting, a value out of range, or a rejected calibration, unless
+    force is set.
     """
     if name not in INSTRUMENTS:
         raise InputError(f"instrument {name!r} is not known; one of {', '.join(INSTRUMENTS)}")
@@ -100,11 +102,11 @@ def instrument_settings(
         holds = instrument.ranges[key]
         if not holds.least <= value <= holds.most:
             raise InputError(
-                f"{name}: {key}={value:g} cannot have been set, it holds {holds.least:g} to {holds.most:g}; give what "
-                "it was set to when the data were recorded"
+                f"{name}: {key}={value:g} is out of range, {holds.least:g} to {holds.most:g}; give the "
+                "setting when the data were recorded"
             )
     delivered = {key: holds.delivered for key, holds in instrument.ranges.items() if holds.delivered is not None}
-    recorded = _recorded(calibrated, instrument, told)
+    recorded = _recorded_sound(calibrated, instrument, told)
     settings, text, notes = instrument.settings(calibrated, {**delivered, **recorded, **told})
     if calibrated.cause_of_scale is not None:
         notes.append(printable(calibrated.cause_of_scale.sentence))
@@ -112,16 +114,18 @@ def instrument_settings(
         holds = instrument.ranges[setting.name]
         if not holds.least <= setting.new <= holds.most:
             raise InputError(
-                f"{setting.name} would be {setting.new:g}, and may be {holds.least:g} to {holds.most:g}; is what it is "
-                "set to now right?"
+                f"{setting.name} would be {setting.new:g}, out of range {holds.least:g} to {holds.most:g}; is the "
+                "current setting right?"
             )
     origins = {**dict.fromkeys(delivered, AS_DELIVERED), **dict.fromkeys(recorded, AS_RECORDED)}
     marked = [replace(each, now_by="" if each.name in told else origins.get(each.name, "")) for each in settings]
     return InstrumentSettings(name, instrument.document, tuple(marked), text, tuple(notes))
 
 
-def _recorded(calibrated: CalibratedMounting, instrument: Instrument, told: Mapping[str, float]) -> dict[str, float]:
-    """The speed of sound that the DVL used when the data were recorded. Raises InputError where another was told."""
+def _recorded_sound(
+    calibrated: CalibratedMounting, instrument: Instrument, told: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the speed of sound used in the recording. Raises InputError if another was given."""
     used = math.nan if calibrated.water is None else calibrated.water.used
     holds = instrument.ranges.get(SPEED_OF_SOUND)
     if holds is None or not holds.least <= used <= holds.most:
@@ -138,13 +142,13 @@ def _water_linked(calibrated: CalibratedMounting, now: Mapping[str, float]) -> t
     offset, swing = _heading(calibrated, now["mounting_rotation_offset"])
     turned = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
     sound, of_sound = _speed_of_sound(calibrated, now.get(SPEED_OF_SOUND))
-    settings, notes = [turned, *sound], [*_left(calibrated, swing), *_delay(calibrated), *of_sound]
+    settings, notes = [turned, *sound], [*_residual_notes(calibrated, swing), *_delay(calibrated), *of_sound]
     command = {"command": "set_config", "parameters": {each.name: each.new for each in settings}}
     return settings, json.dumps(command) + "\n", notes
 
 
 def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[list[Setting], list[str]]:
-    """What takes the scale out; of a DVL whose setting is not known the water's own, where the recording has that."""
+    """Return the speed of sound that corrects the scale; for an unknown setting the water's own, if recorded."""
     factor, scale = calibrated.speed_of_sound_factor, f"{100.0 * calibrated.scale_ahead:+.2f} %"
     if calibrated.model.scale_axes and now is not None:
         new = round(factor * now, 2)
@@ -156,15 +160,15 @@ def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[
         why = (
             "for the calibration holds no scale"
             if now is not None
-            else f"for what the DVL used is not known; if it is, say so (--now {SPEED_OF_SOUND}=1500)"
+            else f"because the DVL's setting is unknown; if you know it, give --now {SPEED_OF_SOUND}=1500"
         )
-        said = f"{SPEED_OF_SOUND}: that of the water, ±{half:.1f} m/s, {why}"
+        said = f"{SPEED_OF_SOUND}: the water's, ±{half:.1f} m/s, {why}"
         return [Setting(SPEED_OF_SOUND, now, round(middle, 1), "m/s")], [said]
     if not calibrated.model.scale_axes:
         return [], []
     said = (
-        f"{SPEED_OF_SOUND}: times {factor:.5f}; say what it was set to (--now {SPEED_OF_SOUND}=1500), for m/s. That is "
-        "what a wrong speed of sound looks like: set the water's temperature and salinity right first"
+        f"{SPEED_OF_SOUND}: times {factor:.5f}; give its setting (--now {SPEED_OF_SOUND}=1500), for m/s. A wrong "
+        "speed of sound causes this: correct the settings of temperature and salinity first"
     )
     return [], [said]
 
@@ -173,7 +177,7 @@ def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple
     heading, swing = _heading(calibrated, now["heading"])
     settings = [Setting("heading", now["heading"], round(math.remainder(heading, 360.0), 2), "°")]
     lines = [f"SET-SENSOR-ORIENTATION {now['roll']:g}, {now['pitch']:g}, {settings[0].new:g}"]
-    notes = [*_left(calibrated, swing), *_delay(calibrated)]
+    notes = [*_residual_notes(calibrated, swing), *_delay(calibrated)]
     if calibrated.model.scale_axes:
         new = round(calibrated.speed_of_sound_factor * now["velocity_adjustment"], 5)
         settings.append(Setting("velocity_adjustment", now["velocity_adjustment"], new))
@@ -198,7 +202,7 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tupl
     off = math.remainder(clockwise - quarters * QUARTER, 2.0 * math.pi)
     if abs(off) > NEAR_QUARTER:
         raise InputError(
-            f"ardupilot: the DVL is turned by {math.degrees(clockwise):+.1f}° (clockwise), and VISO_ORIENT holds "
+            f"ardupilot: the DVL is rotated by {math.degrees(clockwise):+.1f}° (clockwise), and VISO_ORIENT has only "
             "quarter turns; set the rest in the DVL itself (--instrument waterlinked or cerulean)"
         )
     settings.append(Setting("VISO_ORIENT", now.get("VISO_ORIENT"), float(quarters % 4 * 2)))
@@ -221,26 +225,29 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tupl
 
 
 def _heading(calibrated: CalibratedMounting, now_deg: float) -> tuple[float, Array]:
-    """Clockwise angle, degrees, from the vehicle's forward axis to the DVL's that takes out what was found beside the
-    mounting that was told, and the rotation (3, 3) that stays behind it, in forward-right-down axes."""
+    """Return the clockwise angle, degrees, to set, and the remaining rotation (3, 3), forward-right-down.
+
+    The angle is from the vehicle's forward axis to the DVL's, and corrects the error found relative to the configured
+    mounting.
+    """
     told = calibrated.parameters.rotation_dvl_from_body
     found = told @ calibrated.rotation_body_from_dvl
     if not _is_down(calibrated):
         found = FLU_FROM_FRD @ found @ FLU_FROM_FRD
     whole = found @ rotation_from_rpy(np.array([0.0, 0.0, math.radians(now_deg)]))
     *_, z, w = quaternion_from_rotation(whole)
-    angle = 2.0 * math.atan2(z, w)  # of turns, the one about the DVL's z axis: what is left is about a level one
+    angle = 2.0 * math.atan2(z, w)  # the rotation about the DVL's z axis; the rest is about a horizontal one
     return math.degrees(angle), whole @ rotation_from_rpy(np.array([0.0, 0.0, -angle]))
 
 
 def _is_down(calibrated: CalibratedMounting) -> bool:
-    """Whether the axes that are calibrated are the DVL's own, forward-right-down, as it looks down."""
+    """Return whether the calibrated axes are a downward-looking DVL's own, forward-right-down."""
     return bool(calibrated.parameters.rotation_dvl_from_body[2, 2] < 0.0)
 
 
-def _left(calibrated: CalibratedMounting, swing: Array) -> list[str]:
+def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
     roll_pitch = np.abs(rpy_from_rotation(swing)[:2])
-    said = ["URDF and parameters stay as they are: do not write this result into them as well"]
+    said = ["URDF and parameters stay unchanged: do not write this result into them as well"]
     if roll_pitch.max() <= SAID_FROM:
         return said
     axes = swing if _is_down(calibrated) else FLU_FROM_FRD @ swing @ FLU_FROM_FRD

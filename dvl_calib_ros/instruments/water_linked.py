@@ -1,4 +1,4 @@
-"""The configuration of a Water Linked DVL over TCP, asked for and set as its protocol says (get_config, set_config)."""
+"""Configuration of a Water Linked DVL over TCP by its protocol (get_config, set_config)."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ from .settings import Setting
 
 PORT = 16171
 ADDRESS = re.compile(r"(?:\[(?P<ipv6>[0-9A-Fa-f:.%\w]+)\]|(?P<host>[^:\[\]]+))(?::(?P<port>\d{1,5}))?", re.ASCII)
-# A DVL that has not answered for so long, s, is none; a line of its reports is no longer than this, bytes.
+# a DVL without an answer within this time, s, is not there; a longer line, bytes, is no report
 PATIENCE_S, LONGEST_LINE = 10.0, 1 << 20
-# Of what it says why it refuses, characters are shown.
+# characters shown of the reason for a refusal
 LONGEST_REASON = 200
-# It is set with two digits; firmware before 2.2.1, with whole degrees and m/s, is told to be set by hand.
+# Resolution of a setting: two decimals. Firmware before 2.2.1 has whole degrees and m/s, and must be set by hand.
 AS_SET = 0.0051
 
 
 def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) -> bool:
-    """Set what is new, and read it back; nothing if dry_run. Whether it was set so already.
+    """Send new settings and read them back; send nothing if dry_run. Return whether they were already set.
 
-    address: HOST or HOST:PORT, an IPv6 address in brackets. Raises InputError where nothing answers, it refuses, keeps
-    something else, or is not set to what it was when the data were recorded: what was found is relative to that.
+    address: HOST or HOST:PORT, an IPv6 address in brackets. Raises InputError if there is no answer or a refusal, or if
+    another value is read back. Also if the current settings are not the recording's: the calibration is relative to
+    these.
     """
     parts = ADDRESS.fullmatch(address)
     port = int(parts["port"] or PORT) if parts is not None else 0
@@ -43,7 +44,7 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
                 if each.now is None or not _is(before, each.name, each.now):
                     raise InputError(
                         f"{address}: {each.name} is {_held(before, each.name)}, and was {each.now} when the "
-                        "data were recorded (--now), which is what the calibration is relative to; record anew, or set "
+                        "data were recorded (--now), which the calibration is relative to; record again, or set "
                         "it yourself"
                     )
             if dry_run:
@@ -57,8 +58,8 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
         why = error.strerror or "no answer"
         if is_sent:
             raise InputError(
-                f"{address}: {why} after set_config was sent, so the DVL may be set or not; give the same line again, "
-                "which reads what it is set to first"
+                f"{address}: {why} after set_config was sent, so the DVL may be set or not; repeat the command, "
+                "which first reads the current settings"
             ) from error
         raise InputError(f"{address}: {why}; is the DVL on, and the address right?") from error
     for each in settings:
@@ -71,7 +72,7 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
 
 
 def _held(config: Any, name: str) -> float | str:
-    """Return the number that a DVL holds under a name."""
+    """Return the number that a DVL has under a name."""
     held = config.get(name) if isinstance(config, dict) else None
     return held if isinstance(held, float) else "no number"
 
@@ -82,19 +83,19 @@ def _is(config: Any, name: str, value: float) -> bool:
 
 
 class _Dvl:
-    """A connection, over which reports come between the answers."""
+    """A connection on which reports come between the answers."""
 
     def __init__(self, connection: socket.socket, address: str) -> None:
         self._connection, self._address, self._pending = connection, address, b""
 
     def ask(self, command: dict[str, Any]) -> Any:
-        """The result of a command. Raises InputError where it is refused, OSError where no answer comes."""
+        """Return the result of a command. Raises InputError if it is refused, OSError if no answer comes."""
         self._connection.sendall(json.dumps(command).encode() + b"\n")
         until = time.monotonic() + PATIENCE_S
         while True:
             line = self._line(until)
             try:
-                answer = json.loads(line, parse_int=float)  # an int may be too large for one
+                answer = json.loads(line, parse_int=float)  # as float, because an integer may be too long to parse
             except (ValueError, RecursionError):
                 continue
             if not isinstance(answer, dict) or answer.get("response_to") != command["command"]:

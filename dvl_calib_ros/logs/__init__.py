@@ -1,1 +1,1 @@
-"""Logs of instruments and autopilots, and trajectories as CSV or NPY, read as samples."""
+"""Readers of logs of instruments and autopilots, and of trajectories as CSV or NPY."""

@@ -1,9 +1,9 @@
 """Logs of ArduPilot: DataFlash (.BIN) of the autopilot and telemetry (.tlog) of a ground station.
 
-Both hold what the autopilot got of the DVL (VISO, VISION_POSITION_DELTA: how far it moved, forward-right-down), what
-the GNSS receiver said (GPS, GPS_RAW_INT; not what the autopilot's filter makes of it, which took the DVL in) and its
-attitude (ATT, ATTITUDE). Names and units are those of ArduPilot's log messages and of MAVLink's common messages. They
-are read by pymavlink. Telemetry is stamped as it arrived.
+Both have the autopilot's inputs from the DVL (VISO, VISION_POSITION_DELTA: displacement, forward-right-down) and the
+GNSS receiver (GPS, GPS_RAW_INT; not the output of the autopilot's filter, which uses the DVL), and its attitude (ATT,
+ATTITUDE). Names and units follow ArduPilot's log messages and MAVLink's common messages. pymavlink reads the files.
+Telemetry is stamped on arrival.
 """
 
 from __future__ import annotations
@@ -24,27 +24,27 @@ from ..calibration.numerics.samples import DvlSample, ReferenceSample, VelocityF
 from ..errors import InputError
 from .dvl_log import DvlLog, imu_samples
 
-# A 3-D fix.
+# a 3-D fix
 _FIX = 3
-# An interval of more is no s, but µs: ArduPilot's own messages say both.
+# longer intervals are in µs: ArduPilot's own messages use both units
 _LONGEST_S = 5.0
 
 
 def read_ardupilot_log(path: Path) -> DvlLog:
-    """Read a log of either kind. Raises InputError where pymavlink is not installed, or the log has no DVL."""
+    """Read a log of either kind. Raises InputError if pymavlink is not installed, or the log has no DVL."""
     try:
         from pymavlink import mavutil
     except ImportError as error:
         raise InputError(f"{path}: is read by pymavlink; pip install 'dvl_calib_ros[ardupilot]'") from error
-    read = _Read()
+    read = _VehicleMessages()
     wanted = list(_TAKERS)
     try:
-        with _unheard():
+        with _silenced():
             log = mavutil.mavlink_connection(str(path), notimestamps=False)
             with closing(log):
                 while (message := log.recv_match(type=wanted)) is not None:
                     read.take(message)
-    except Exception as error:  # what a damaged log makes pymavlink raise has no common class
+    except Exception as error:  # pymavlink's errors on damaged logs have no common class
         if not read.moved:
             raise InputError(f"{path}: cannot be read as a log of ArduPilot ({error})") from error
         read.left_out["behind damage"] += 1
@@ -52,8 +52,8 @@ def read_ardupilot_log(path: Path) -> DvlLog:
 
 
 @contextmanager
-def _unheard() -> Iterator[None]:
-    """Nothing that is printed within is seen: pymavlink, and its indexer in C, print a line for each damaged byte."""
+def _silenced() -> Iterator[None]:
+    """Discard printed output: pymavlink, and its indexer in C, print a line for each damaged byte."""
     kept = os.dup(2)
     with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         sys.stderr.flush()
@@ -65,7 +65,7 @@ def _unheard() -> Iterator[None]:
             os.close(kept)
 
 
-class _Read:
+class _VehicleMessages:
     """Messages of one vehicle so far."""
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ class _Read:
         self._vehicle: int | None = None
 
     def take(self, message: Any) -> None:
-        """One message; another vehicle's is left out."""
+        """Add a message, unless it is another vehicle's."""
         source = getattr(message, "get_srcSystem", lambda: 0)()
         if self._vehicle is None:
             self._vehicle = source
@@ -93,7 +93,7 @@ class _Read:
         if not (is_good and seconds > 0.0 and np.isfinite(metres).all()):
             self.left_out["without bottom lock"] += 1
             return
-        # the mean over the interval, so of its middle
+        # the mean over the interval belongs to its middle
         self.moved.append((stamp_ns - round(0.5e9 * seconds), (metres / seconds).tolist()))
 
     def viso(self, stamp_ns: int, m: Any) -> None:
@@ -111,7 +111,7 @@ class _Read:
         if m.vel == 65535 or m.cog == 65535:
             self.left_out["without a velocity of GNSS"] += 1
             return
-        self._fix(stamp_ns, m.fix_type, 0.01 * m.vel, 0.01 * m.cog, 0.0)  # no vertical: exactly 0 says so
+        self._fix(stamp_ns, m.fix_type, 0.01 * m.vel, 0.01 * m.cog, 0.0)  # no vertical velocity, marked by exactly 0
 
     def _fix(self, stamp_ns: int, status: int, speed: float, course_deg: float, down: float) -> None:
         if status < _FIX or not math.isfinite(speed + course_deg + down):
@@ -127,7 +127,7 @@ class _Read:
         self.turned.append((stamp_ns, [m.roll, m.pitch, m.yaw]))
 
     def finished(self) -> DvlLog:
-        """Samples in order of time."""
+        """Return the samples in order of time."""
         samples = [DvlSample(at, _tuple(FLU_FROM_FRD @ np.array(each)), None) for at, each in self.moved]
         references = [ReferenceSample(at, _tuple(each), None, VelocityFrame.NED) for at, each in _in_order(self.fixes)]
         turned = _in_order(self.turned)
@@ -145,10 +145,10 @@ def _tuple(values: Any) -> tuple[float, float, float]:
 
 
 _TAKERS = {
-    "VISO": _Read.viso,
-    "VISION_POSITION_DELTA": _Read.vision_position_delta,
-    "GPS": _Read.gps,
-    "GPS_RAW_INT": _Read.gps_raw_int,
-    "ATT": _Read.att,
-    "ATTITUDE": _Read.attitude,
+    "VISO": _VehicleMessages.viso,
+    "VISION_POSITION_DELTA": _VehicleMessages.vision_position_delta,
+    "GPS": _VehicleMessages.gps,
+    "GPS_RAW_INT": _VehicleMessages.gps_raw_int,
+    "ATT": _VehicleMessages.att,
+    "ATTITUDE": _VehicleMessages.attitude,
 }

@@ -1,7 +1,8 @@
-"""Text tables of any layout, read by a map of their columns: time=NAME,vx=NAME,vy=NAME,vz=NAME,valid=NAME.
+"""Text tables of any layout, read by a map of their columns.
 
-A column is named as its header is, or by its number from 1. Time is in seconds, in ISO 8601, or a time of day with its
-date (``time=Date+Time``). Separators are found: comma, semicolon, tab.
+The map is time=NAME,vx=NAME,vy=NAME,vz=NAME,valid=NAME. A column is given by its name in the header or by its number
+from 1. Time is in seconds, in ISO 8601, or a time of day with its date (``time=Date+Time``). The separator (comma,
+semicolon, tab) is detected.
 """
 
 from __future__ import annotations
@@ -24,10 +25,10 @@ from .dvl_log import DvlLog
 
 _NEEDED, _KEYS = ("time", "vx", "vy", "vz"), ("time", "vx", "vy", "vz", "valid")
 _SEPARATORS = ",;\t"
-# Numbers from here on are seconds since 1970 (2001); below they count from a start.
+# from here on numbers are seconds since 1970 (this is 2001); smaller ones count from a start
 _SINCE_1970_S = 1e9
 _FALSE = ("", "0", "false", "f", "no", "invalid", "v", "nan")
-# Of a date and a time of day, as loggers write them
+# formats of loggers for a date and a time of day
 _FORMATS = ("%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S", "%d.%m.%Y %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S")
 
 
@@ -46,7 +47,7 @@ def column_map(text: str) -> Mapping[str, str]:
 def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float) -> DvlLog:
     """Read the velocities of a table. Raises InputError naming file and column.
 
-    text: the map. start_ns: of time 0. rotation: (3, 3) to forward-left-up. std: m/s; 0: covariance not given.
+    text: the map. start_ns: stamp of time 0. rotation: (3, 3) to forward-left-up. std: m/s; 0: covariance not given.
     """
     names = column_map(text)
     try:
@@ -84,7 +85,7 @@ def _shown(row: Sequence[str]) -> str:
 
 
 def _is_header(rows: Sequence[Sequence[str]], place: int) -> bool:
-    """Return whether the first row has no number at a place."""
+    """Return whether the first row has no number in a column."""
     try:
         return bool(rows) and math.isnan(float(rows[0][place]))
     except (ValueError, IndexError):
@@ -92,7 +93,7 @@ def _is_header(rows: Sequence[Sequence[str]], place: int) -> bool:
 
 
 def _place(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
-    """Return where a column is, by its name, that without its unit, or its number. Raises InputError."""
+    """Return the index of a column by its name, its name without the unit, or its number. Raises InputError."""
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     wanted = name.strip().lower()
     for each in (header, [cell.partition("(")[0].partition("[")[0].strip() for cell in header]):
@@ -104,7 +105,7 @@ def _place(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
 
 
 def _stamp_ns(text: str, start_ns: int) -> int:
-    """Return a time as a stamp. Raises ValueError for what is none."""
+    """Convert a time to a stamp. Raises ValueError if it is invalid."""
     try:
         seconds = float(text)
     except ValueError:
@@ -120,6 +121,6 @@ def _moment(text: str) -> datetime:
             return datetime.strptime(text, form)
         except ValueError:
             continue
-    # as Python 3.10 reads it: six digits of a second
+    # Python 3.10 needs six digits of a second
     text = re.sub(r"\.(\d+)", lambda found: f".{found[1][:6]:0<6}", text.replace("Z", "+00:00"))
     return datetime.fromisoformat(text)

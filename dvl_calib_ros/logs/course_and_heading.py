@@ -1,7 +1,7 @@
-"""Course and speed over ground, positions, headings of a compass: horizontal recordings, by their columns' names.
+"""Course and speed over ground, positions, and compass headings, read by the columns' names.
 
-A receiver's course and speed have no vertical: it is written as exactly 0, which marks an axis as not measured. Units
-stand in a column's name (`_deg`, `[rad]`, `_mps`, `knots`); without one they are SI and radians.
+A receiver's course and speed have no vertical component: it is set to exactly 0, which marks an axis as not measured.
+Units are in a column's name (`_deg`, `[rad]`, `_mps`, `knots`); the default is SI and radians.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from .csv_columns import cells, numbers_of, stamps_ns
 from .dvl_log import imu_samples
 from .nmea import KNOT
 
-# Units that a column's name may hold, with what takes them to SI
+# units in column names, with their factors to SI
 _UNITS = {"deg": math.pi / 180.0, "rad": 1.0, "mps": 1.0, "m/s": 1.0, "knots": KNOT, "kn": KNOT, "km/h": 1.0 / 3.6}
 
 
 def names_columns(path: Path, *wanted: str) -> bool:
-    """Whether a file is a CSV with a header that names columns of all these words."""
+    """Return whether a file is a CSV with a header that has columns for all these words."""
     if not path.is_file() or path.suffix == ".npy":
         return False
     header = _header(path)
@@ -34,7 +34,7 @@ def names_columns(path: Path, *wanted: str) -> bool:
 
 
 def read_course(path: Path, start_ns: int, std: float, notes: list[str]) -> list[ReferenceSample]:
-    """Speed m/s and course (from true north, clockwise) as velocities in ENU without a vertical. Raises InputError."""
+    """Read speed m/s and course (from true north, clockwise) as horizontal velocities in ENU. Raises InputError."""
     time, values = _named(path, ("speed", "course"), notes)
     velocities = over_ground(*values.T).tolist()
     covariance = np.eye(3) * std**2 if std else None
@@ -45,7 +45,7 @@ def read_course(path: Path, start_ns: int, std: float, notes: list[str]) -> list
 
 
 def read_positions(path: Path, start_ns: int, notes: list[str]) -> list[SatelliteFix]:
-    """Latitude and longitude. Raises InputError."""
+    """Read latitude and longitude. Raises InputError."""
     time, values = _named(path, ("latitude", "longitude"), notes)
     rows = np.degrees(values).tolist()
     return [
@@ -55,7 +55,7 @@ def read_positions(path: Path, start_ns: int, notes: list[str]) -> list[Satellit
 
 
 def read_heading(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
-    """Headings (from true north, clockwise), with pitch and roll of a forward-right-down body where there are such."""
+    """Read headings (from true north, clockwise), with pitch and roll of a forward-right-down body if present."""
     header = _header(path)
     tilt = [name for name in ("pitch", "roll") if any(name in _words(cell) for cell in header)]
     time, values = _named(path, ("heading", *tilt), notes)
@@ -76,7 +76,7 @@ def _words(cell: str) -> set[str]:
 
 
 def _named(path: Path, names: Sequence[str], notes: list[str]) -> tuple[Array, Array]:
-    """Time (N,) s and columns (N, k) in SI, those with a finite number everywhere."""
+    """Return time (N,) s and columns (N, k) in SI, without rows that have a missing number."""
     (header, *rows), left_out = cells(path)
     notes += left_out
     at = [next(i for i, cell in enumerate(header) if name in _words(cell)) for name in names]

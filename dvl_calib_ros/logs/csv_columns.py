@@ -14,17 +14,17 @@ from ..calibration.numerics.frames import Array
 from ..errors import InputError
 
 N_COLUMNS = 4
-# What is written in a cell where there is no value, beside nan
+# cells that mean a missing value, in addition to nan
 NO_VALUE = ("", "na", "n/a", "null", "none", "-")
 EXPECTED = "time and three values, separated by commas, with decimal points"
-# How much of a bad row is shown, characters
+# number of characters shown of a bad row
 SHOWN = 200
 
 
 def cells(path: Path) -> tuple[list[list[str]], list[str]]:
-    """Rows of a CSV file that are not empty, and what is said of the file. Raises InputError."""
+    """Return the non-empty rows of a CSV file, and notes on the file. Raises InputError."""
     try:
-        text = path.read_text(encoding="utf-8-sig").rstrip("\0")  # what a power cut leaves may end in zeros
+        text = path.read_text(encoding="utf-8-sig").rstrip("\0")  # a file cut by a power failure may end in zeros
         rows = [row for row in csv.reader(io.StringIO(text)) if row]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as CSV ({error}); save it as such, in UTF-8") from error
@@ -35,7 +35,7 @@ def cells(path: Path) -> tuple[list[list[str]], list[str]]:
 
 
 def numbers_of(path: Path, rows: Sequence[Sequence[str]], at: Sequence[int], n_columns: int) -> Array:
-    """Columns `at` of rows (N, k), nan where there is no value. Raises InputError naming file and row."""
+    """Return columns `at` of rows (N, k), nan for missing values. Raises InputError naming file and row."""
     values = []
     for number, row in enumerate(rows, start=1):
         if len(row) != n_columns:
@@ -50,7 +50,7 @@ def numbers_of(path: Path, rows: Sequence[Sequence[str]], at: Sequence[int], n_c
 
 
 def _number(text: str) -> float:
-    """Raises ValueError for what is none, also for 1_0, which Python takes for ten."""
+    """Parse a number. Raises ValueError if invalid, also for 1_0, which Python reads as ten."""
     if "_" in text:
         raise ValueError
     return float(text)
@@ -65,7 +65,7 @@ def _is_number(text: str) -> bool:
 
 
 def stamps_ns(path: Path, time: Array, start_ns: int) -> list[int]:
-    """Times (N,) s of a file from a start, as integer nanoseconds. Raises InputError for what no stamp can hold."""
+    """Convert times (N,) s after a start to integer nanoseconds. Raises InputError if a stamp cannot represent them."""
     stamps = [start_ns + round(float(t) * 1e9) for t in time]
     if stamps[0] < 0 or stamps[-1] >= 2**31 * 1_000_000_000:
         raise InputError(

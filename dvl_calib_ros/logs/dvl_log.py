@@ -1,4 +1,4 @@
-"""A DVL's log as samples, with attitudes and the angular velocity that they imply."""
+"""Content of a DVL's log: samples, attitudes, and angular velocities derived from them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..messages.encode import WaterReading
 
 
 def imu_samples(stamps_ns: Sequence[int], rpy: Array) -> list[ImuSample]:
-    """Roll, pitch, yaw (N, 3) rad of a forward-right-down body in north-east-down, at increasing stamps."""
+    """Convert roll, pitch, yaw (N, 3) rad of a forward-right-down body in north-east-down, at increasing stamps."""
     rotations = attitude_enu_flu_from_ned_frd(rpy)
     time = 1e-9 * (np.array(stamps_ns, dtype=np.int64) - (stamps_ns[0] if len(stamps_ns) else 0))
     rates = angular_velocities(time, rotations).tolist()
@@ -25,10 +25,10 @@ def imu_samples(stamps_ns: Sequence[int], rpy: Array) -> list[ImuSample]:
 
 
 def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
-    """Angular velocity (N, 3) rad/s in the body frame of a run of attitudes (N, 3, 3) at times (N,) s.
+    """Return the angular velocity (N, 3) rad/s in the body frame from attitudes (N, 3, 3) at times (N,) s.
 
-    That of a smooth curve through them, at the times themselves: the mean rate from each to the next is half an
-    interval late, which at 1 Hz costs a lever arm of 2 m 3 cm/s in turns.
+    It is the derivative of a smooth curve at the times themselves. A difference of successive attitudes would be
+    delayed by half an interval: at 1 Hz with a lever arm of 2 m, an error of 3 cm/s in turns.
     """
     from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -39,10 +39,10 @@ def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
 
 
 class DvlLog(NamedTuple):
-    """DVL samples (forward-left-up) in order of time, and how many reports gave none, by reason.
+    """DVL samples (forward-left-up) in order of time, and the number of unusable reports by reason.
 
-    references, attitudes, waters: what else the log holds. notes: in sentences, what to know of it.
-    nominal_yaw: rad, of the DVL in the body (forward-left-up), as configured in the instrument.
+    references, attitudes, waters: other samples in the log. notes: remarks in sentences. nominal_yaw: rad, of the DVL
+    in the body (forward-left-up), as configured in the instrument.
     """
 
     samples: list[DvlSample]

@@ -1,14 +1,14 @@
-"""Logs of DVLs as the instruments write them: Water Linked's JSON reports and Teledyne RDI's PD0 ensembles.
+"""Logs of DVLs in the instruments' own formats: Water Linked's JSON reports and Teledyne RDI's PD0 ensembles.
 
-Those of Nortek are in `nortek_logs`, those in text in `text_logs`, those of ArduPilot, which hold DVL, GNSS and
-attitude of one vehicle, in `ardupilot_logs`.
+`nortek_logs` has Nortek's, `text_logs` the text formats, and `ardupilot_logs` those of ArduPilot, which have DVL, GNSS
+and attitude of one vehicle.
 
 Water Linked: docs.waterlinked.com/dvl/dvl-json-protocol, reports of type velocity, axes forward-right-down, stamped by
 time_of_validity (µs since 1970). RDI: "WorkHorse Commands and Output Data Format" and Pathfinder guide, bottom track of
-PD0 (x starboard, y forward, z up), which is the bottom's motion past the DVL: its sign is turned. Velocities are those
-in instrument axes (y along beam 3): beams are resolved, and ship or earth axes are turned back. The attitude, where
-there is no other, is that of its own sensors. EA is how far clockwise of the ship's centre line beam 3 is, and headings
-are the ship's ("WorkHorse Commands and Output Data Format", EA): it is the nominal yaw.
+PD0 (x starboard, y forward, z up). It is the bottom's motion relative to the DVL, so its sign is inverted. Velocities
+are returned in instrument axes (y along beam 3): beam velocities are converted, ship and earth axes rotated back. By
+default the attitude comes from the DVL's own sensors. EA is the angle of beam 3 clockwise from the ship's centre line,
+and headings are the ship's (same document, EA): EA is the nominal yaw.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ from .text_logs import is_pd6, is_sentences, read_pd6, read_sentences
 
 PD0_START = b"\x7f\x7f"
 _DATAFLASH_START, _MAVLINK_STARTS = b"\xa3\x95", (b"\xfe", b"\xfd")
-# Of a file so much is looked at to tell what it is.
+# number of bytes that identify a file's kind
 _SNIFFED = 65536
 _FIXED_LEADER, _VARIABLE_LEADER, _BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
 _AXES = ("beam", "instrument", "ship", "earth")
-# Of the beams with the vertical, degrees, by the fixed leader's bits; of others it is said elsewhere in it
+# beam angles from the vertical, degrees, by bits of the fixed leader; other angles have their own field there
 _BEAM_ANGLES = {0: 15, 1: 20, 2: 30}
-# Bits of EZ: what comes from a sensor
+# bits of EZ: values that come from a sensor
 _TEMPERATURE_SENSOR, _CONDUCTIVITY_SENSOR = 1, 2
-# A velocity of a beam or axis that could not be measured, mm/s
+# velocity of a beam or axis that was not measured, mm/s
 _BAD_VELOCITY = -32768
 # forward-left-up from RDI's starboard, forward, up
 _FLU_FROM_RDI: Array = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def is_dvl_log(path: Path) -> bool:
-    """Whether a file looks like a log of an instrument, by its content. Raises InputError if it cannot be read."""
+    """Return whether a file's content looks like an instrument's log. Raises InputError if it cannot be read."""
     try:
         with path.open("rb") as file:
             start = file.read(_SNIFFED)
@@ -62,17 +62,17 @@ def is_dvl_log(path: Path) -> bool:
 
 
 def _is_ardupilot_log(path: Path, start: bytes) -> bool:
-    """By its first bytes; a telemetry log, whose messages have 8 bytes of time before, by its name as well."""
+    """Check the first bytes; a telemetry log has 8 bytes of time before each message, so its name counts as well."""
     is_telemetry = path.suffix.lower() == ".tlog" and start[8:9] in _MAVLINK_STARTS
     return is_telemetry or start.startswith(_DATAFLASH_START)
 
 
 def read_dvl_log(path: Path) -> DvlLog:
-    """Read a log of any kind. Raises InputError for what is none, or holds no velocity that can be used."""
+    """Read a log of any kind. Raises InputError if it is none, or has no usable velocity."""
     with path.open("rb") as file:
         start = file.read(_SNIFFED)
     if _is_ardupilot_log(path, start):
-        from .ardupilot_logs import read_ardupilot_log  # which gives this module's log
+        from .ardupilot_logs import read_ardupilot_log  # imports this module
 
         log = read_ardupilot_log(path)
     else:
@@ -91,15 +91,9 @@ def read_dvl_log(path: Path) -> DvlLog:
     return log._replace(samples=in_order, left_out=+log.left_out)
 
 
-# ---------------------------------------------------------------------- Nortek
-
-
 def _read_nortek(_: Path, content: bytes) -> DvlLog:
     samples, left_out, waters = read_nortek_log(content)
     return DvlLog(samples, left_out, waters=waters)
-
-
-# ---------------------------------------------------------------------- Water Linked
 
 
 def _holds_json(content: bytes) -> bool:
@@ -110,12 +104,12 @@ def _read_json(path: Path, content: bytes) -> DvlLog:
     samples: list[DvlSample] = []
     left_out: Counter[str] = Counter()
     for line in content.decode("utf-8", "replace").splitlines():
-        start = line.find("{")  # a logger may write its own time before
+        start = line.find("{")  # a logger may prepend its own time
         if start < 0:
             continue
         try:
             report = json.loads(line[start:])
-        except (ValueError, RecursionError):  # no JSON, or a number of thousands of digits
+        except (ValueError, RecursionError):  # no JSON, or a number with thousands of digits
             left_out["not valid JSON"] += 1
             continue
         if isinstance(report, dict) and "vx" in report:
@@ -147,11 +141,8 @@ def _json_sample(path: Path, report: dict[str, Any], left_out: Counter[str]) -> 
     return DvlSample(stamp_ns, (x, y, z), FLU_FROM_FRD @ covariance @ FLU_FROM_FRD)
 
 
-# ---------------------------------------------------------------------- RDI
-
-
 def _next_ensemble(content: bytes, start: int) -> tuple[int, int] | None:
-    """Where the next whole ensemble begins and ends, its checksum right; None if there is none."""
+    """Return start and end of the next whole ensemble with a valid checksum; None if there is none."""
     while (at := content.find(PD0_START, start)) >= 0:
         if at + 6 <= len(content):
             (length,) = struct.unpack_from("<H", content, at + 2)
@@ -165,7 +156,7 @@ def _next_ensemble(content: bytes, start: int) -> tuple[int, int] | None:
 
 
 def _ensembles(content: bytes) -> Iterator[list[tuple[int, bytes]]]:
-    """ID and data of all that is in each whole ensemble."""
+    """Yield ID and data of all parts of each whole ensemble."""
     start = 0
     while (found := _next_ensemble(content, start)) is not None:
         at, start = found
@@ -219,27 +210,30 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
 def _pd0_attitudes(
     path: Path, attitudes: dict[int, tuple[float, float, float]], nmea: Nmea
 ) -> tuple[list[int], Array, tuple[str, ...]]:
-    """Stamps, roll, pitch, heading (N, 3) rad, and where they come from."""
+    """Return stamps, roll, pitch, heading (N, 3) rad, and notes on their source."""
     own = sorted(attitudes)
     rpy = np.array([attitudes[at] for at in own]).reshape(-1, 3)
     stamps, headings = nmea.headings()
     if stamps and own:
         at = np.array(stamps, dtype=np.int64) - own[0]
         tilts = [np.interp(at, np.array(own, dtype=np.int64) - own[0], rpy[:, place]) for place in (0, 1)]
-        note = f"{path}: the heading is that of its HDT sentences, pitch and roll are the DVL's own"
+        note = f"{path}: the heading is from its HDT sentences, pitch and roll are the DVL's own"
         return stamps, np.column_stack([*tilts, headings]), (note,)
-    if not len(rpy) or not np.ptp(rpy, axis=0).any():  # no sensor: what was typed in, or 0
+    if not len(rpy) or not np.ptp(rpy, axis=0).any():  # no sensor: a constant setting
         return [], rpy[:0], ()
     note = (
-        f"{path}: heading, pitch and roll are those of the DVL's own sensors, the heading magnetic but for what "
-        "was set (EB); give --attitude for another's"
+        f"{path}: heading, pitch and roll are from the DVL's own sensors; the heading is magnetic except for the "
+        "setting EB; give --attitude for another source"
     )
     return own, rpy, (note,)
 
 
 def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float] | None:
-    """Roll, pitch, heading, rad; None where the ensemble ends before. Pitch of a sensor that tilts with the DVL:
-    tan P = tan T1 · cos T2 (RDI, "ADCP Coordinate Transformation", 2008, eq. 19)."""
+    """Return roll, pitch, heading, rad; None if the ensemble is too short.
+
+    Pitch of a sensor that tilts with the DVL: tan P = tan T1 · cos T2 (RDI, "ADCP Coordinate Transformation", 2008, eq.
+    19).
+    """
     try:
         heading, tilt_1, tilt_2 = struct.unpack_from("<H2h", data[_VARIABLE_LEADER], 18)
     except struct.error:
@@ -250,13 +244,13 @@ def _pd0_attitude(data: dict[int, bytes]) -> tuple[float, float, float] | None:
 
 
 def _pd0_alignment(data: dict[int, bytes]) -> float:
-    """Return EA, rad: how far clockwise of the ship's centre line beam 3 is."""
+    """Return EA, rad: the angle of beam 3 clockwise from the ship's centre line."""
     (hundredths,) = struct.unpack_from("<h", data[_FIXED_LEADER], 26)
     return math.radians(0.01 * hundredths)
 
 
 def _ship_attitudes(rpy: Array, alignment: float) -> Array:
-    """Return the ship's roll, pitch and heading (N, 3), rad, by its own heading and the tilts of the instrument."""
+    """Return the ship's roll, pitch and heading (N, 3), rad, from its heading and the instrument's tilts."""
     from scipy.spatial.transform import Rotation
 
     instrument = Rotation.from_euler("ZYX", rpy[:, ::-1] + [alignment, 0.0, 0.0])
@@ -265,8 +259,10 @@ def _ship_attitudes(rpy: Array, alignment: float) -> Array:
 
 
 def _pd0_water(stamp_ns: int, data: dict[int, bytes]) -> WaterReading | None:
-    """The speed of sound (EC) that velocities were counted with; temperature and salinity where sensors measured them
-    (EZ's bits), for what was typed in says nothing of the water."""
+    """Return the speed of sound used for the velocities (EC), and measured temperature and salinity.
+
+    By EZ's bits, a temperature or salinity that was only configured is omitted.
+    """
     try:
         fixed, variable = data[_FIXED_LEADER], data[_VARIABLE_LEADER]
         (used,) = struct.unpack_from("<H", variable, 14)
@@ -286,7 +282,7 @@ def _pd0_water(stamp_ns: int, data: dict[int, bytes]) -> WaterReading | None:
 
 def _pd0_stamp(data: dict[int, bytes]) -> int:
     year, month, day, hour, minute, second, hundredths = data[_VARIABLE_LEADER][4:11]
-    # RDI's year has two digits; no DVL of before 2000 writes these
+    # RDI's year has two digits; no DVL before 2000 has this format
     at = datetime(2000 + year, month, day, hour, minute, second, tzinfo=timezone.utc)
     return int(at.timestamp()) * 1_000_000_000 + hundredths * 10_000_000
 
@@ -318,7 +314,7 @@ def _pd0_sample(path: Path, stamp_ns: int, data: dict[int, bytes], left_out: Cou
 
 
 def _instrument_from_beams(fixed: bytes) -> Array:
-    """(3, 4), of four beams 90° apart (RDI, "ADCP Coordinate Transformation", 2008, eq. 2 to 4)."""
+    """Return (3, 4) for four beams 90° apart (RDI, "ADCP Coordinate Transformation", 2008, eq. 2 to 4)."""
     angle = math.radians(_BEAM_ANGLES.get(fixed[5] & 3, fixed[58] if len(fixed) > 58 else 0))
     convex = 1.0 if fixed[4] & 8 else -1.0
     a, b = convex / (2.0 * math.sin(angle)), 1.0 / (4.0 * math.cos(angle))
@@ -326,8 +322,10 @@ def _instrument_from_beams(fixed: bytes) -> Array:
 
 
 def _turned_by(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
-    """Return the rotation (3, 3) by which the instrument turned its velocities: by beam 3's heading, and by its tilts
-    where it was set to (the same, eq. 18). Its transpose undoes that whatever the heading is worth."""
+    """Return the rotation (3, 3) that the instrument applied: by beam 3's heading and, if set, by its tilts.
+
+    (Same document, eq. 18.) Its transpose undoes it, whatever the accuracy of the heading.
+    """
     if not fixed[25] & 4:
         roll = pitch = 0.0
     sh, ch, sp, cp, sr, cr = (
@@ -342,7 +340,7 @@ def _turned_by(roll: float, pitch: float, heading: float, fixed: bytes) -> Array
     )
 
 
-# What a file may hold: how to tell, and the reader. Of several the first is read.
+# content kinds: test and reader; the first that matches is used
 _KINDS: dict[str, tuple[Callable[[bytes], bool], Callable[[Path, bytes], DvlLog]]] = {
     "Nortek's records": (is_nortek_log, _read_nortek),
     "Water Linked's reports": (_holds_json, _read_json),

@@ -1,6 +1,6 @@
-"""Velocities of a GNSS receiver's NMEA 0183 sentences: RMC, which has time, date, speed and course.
+"""Velocities from a GNSS receiver's NMEA 0183 RMC sentences, which have time, date, speed and course.
 
-Lines may have anything before the sentence, as loggers write it; a sentence whose checksum is wrong is left out.
+Loggers may prepend any text to a sentence; a sentence with a wrong checksum is skipped.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from ..errors import InputError
 _RMC = re.compile(rb"\$(\w{2}RMC,[^*\r\n]*)\*([0-9A-Fa-f]{2})")
 _SNIFFED = 65536
 KNOT = 1852.0 / 3600.0
-# Slower than this, m/s, a receiver gives no course, and none matters.
+# a slower receiver gives no course, which does not matter, m/s
 STANDING = 0.05
 
 
 def is_nmea(path: Path) -> bool:
-    """Whether RMC sentences are in the beginning of a file."""
-    if not path.is_file():  # a pipe would be waited for
+    """Return whether the beginning of a file has RMC sentences."""
+    if not path.is_file():  # a pipe would block
         return False
     try:
         with path.open("rb") as file:
             return _RMC.search(file.read(_SNIFFED)) is not None
     except OSError:
-        return False  # said by who reads it
+        return False  # the reader reports the error
 
 
 def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
-    """Velocities in ENU without a vertical (exactly 0), stamped by UTC; std (m/s) 0: covariance not given.
+    """Read horizontal velocities in ENU (vertical exactly 0), stamped by UTC; std (m/s) 0: covariance not given.
 
-    notes: gets what is left out. Raises InputError if there is none that can be used.
+    notes: receives remarks on skipped data. Raises InputError if there is no usable sentence.
     """
     covariance = np.eye(3) * std**2 if std else None
     found: dict[int, ReferenceSample] = {}
@@ -69,7 +69,7 @@ def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
 
 
 def xor(text: bytes) -> int:
-    """A sentence's checksum: of all between $ and *."""
+    """Return a sentence's checksum: of the bytes between $ and *."""
     value = 0
     for byte in text:
         value ^= byte

@@ -1,7 +1,7 @@
-"""Logs of Nortek's DVLs (DVL 300 to 1000; .ad2cp, or what came over a port): bottom track of data format 21.
+"""Logs of Nortek's DVLs (DVL 300 to 1000; .ad2cp or captured from a port): bottom track of data format 21.
 
-Nortek, "DVL Integrator's Guide": records with the ID 1Bh, X forward, Y to starboard, Z down, m/s, stamped by the
-trigger; the bottom's echo comes the time DT1 later. Two pairs of beams measure Z each.
+Nortek, "DVL Integrator's Guide": records with the ID 1Bh, X forward, Y starboard, Z down, m/s, stamped at the trigger;
+the bottom echo comes the time DT1 later. Two pairs of beams measure Z separately.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ _HEADER = struct.Struct("<BBBBHHH")
 _CHECKSUM_START = 0xB58C
 # version, offset of data, serial, date and time, 100 µs, beams, error, status, sound speed, temperature, pressure
 _LEADER = struct.Struct("<BBI6BHHII3f")
-# Of six times four values by beam, then X, Y, Z1, Z2 of velocity, figure of merit, DT1
+# six quantities by beam; then X, Y, Z1, Z2 of velocity, figure of merit, DT1
 _BY_BEAM, _BY_AXIS = struct.Struct("<24f"), struct.Struct("<12f")
-# Bits of the status: velocities of X, Y, Z1, Z2 are valid
+# status bits for valid velocities of X, Y, Z1, Z2
 _VALID = (1 << 12, 1 << 13, 1 << 14, 1 << 15)
-# A velocity that could not be measured, m/s, and more than any
+# a velocity that was not measured, m/s; upper limit of DT1, s
 _BAD_VELOCITY, _LONGEST_DT_S = -32.0, 1.0
 
 
 def is_nortek_log(start: bytes) -> bool:
-    """Whether a record of bottom track begins in the first bytes of a file."""
+    """Return whether a record of bottom track begins in the first bytes of a file."""
     return any(True for _ in _records(start))
 
 
 def read_nortek_log(content: bytes) -> tuple[list[DvlSample], Counter[str], list[WaterReading]]:
-    """Samples (forward-left-up), how many records gave none, by reason, and what they say of the water."""
+    """Return samples (forward-left-up), the number of unusable records by reason, and water properties."""
     samples: list[DvlSample] = []
     waters: list[WaterReading] = []
     left_out: Counter[str] = Counter()
@@ -61,7 +61,7 @@ def read_nortek_log(content: bytes) -> tuple[list[DvlSample], Counter[str], list
 
 
 def _records(content: bytes) -> Iterator[bytes | None]:
-    """Data of each record of bottom track whose header is whole; None where they are damaged or cut off."""
+    """Yield the data of each bottom-track record with a sound header; None if damaged or cut off."""
     start = 0
     while (at := content.find(_SYNC, start)) >= 0:
         start = at + 1
@@ -81,7 +81,7 @@ def _records(content: bytes) -> Iterator[bytes | None]:
 
 
 def _sum(data: bytes) -> int:
-    """Nortek's checksum: of words of 16 bits, a last byte being the upper one of its word."""
+    """Return Nortek's checksum: of 16-bit words; a last single byte is the upper one of its word."""
     even = data[: len(data) & ~1]
     total = _CHECKSUM_START + sum(struct.unpack(f"<{len(even) // 2}H", even))
     return (total + (data[-1] << 8 if len(data) % 2 else 0)) & 0xFFFF
@@ -94,7 +94,7 @@ def _sample(data: bytes) -> DvlSample | None:
     valid = np.array([bool(status & bit) for bit in _VALID]) & np.isfinite(velocity) & (velocity > _BAD_VELOCITY)
     if not (valid[0] and valid[1] and valid[2:].any()):
         return None
-    # as C's struct tm has them: years since 1900, months from 0
+    # as in C's struct tm: years since 1900, months from 0
     at = datetime(1900 + year, month + 1, day, hour, minute, second, tzinfo=timezone.utc)
     dt = float(late[:2].mean())
     stamp_ns = int(at.timestamp()) * 1_000_000_000 + fraction * 100_000

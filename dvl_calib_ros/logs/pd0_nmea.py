@@ -1,8 +1,8 @@
-"""What WinRiver II and RDI's own receivers put into PD0 ensembles of NMEA: VTG, GGA and HDT, data ID 2022h.
+"""NMEA sentences in PD0 ensembles by WinRiver II or RDI's receivers: VTG, GGA and HDT, data ID 2022h.
 
 Text: "RiverPro and RioPro ADCP Guide" (Teledyne RDI, 2017), table 42; binary: "WinRiver II User's Guide", General NMEA
-Data Format. A sentence's time is that of its ensemble and how long before or after it was received. Which of the two
-the difference means is not said: the one by which sentences come more evenly.
+Data Format. The time of a sentence is the ensemble's plus or minus a time difference. The sign is undocumented, so the
+one with more even intervals is used.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from ..messages.positions import FixDifference
 from .nmea import KNOT, STANDING, xor
 
 GENERAL_NMEA = 0x2022
-_HEAD = struct.Struct("<HHHd")  # data ID, specific ID, size of the message, difference of time
+_HEAD = struct.Struct("<HHHd")  # data ID, specific ID, size of the message, time difference
 _GGA, _VTG, _HDT = "GGA", "VTG", "HDT"
 _KINDS = {
     4: _GGA, 5: _VTG, 100: _GGA, 101: _VTG, 103: _HDT, 104: _GGA, 105: _VTG, 107: _HDT, 204: _GGA, 205: _VTG, 207: _HDT
 }  # fmt: skip
-# Of binary messages: what follows a header of 10 characters (IDs below 104) or 7
+# binary messages: content after a header of 10 characters (IDs below 104) or 7
 _BINARY = {_GGA: struct.Struct("<10sdcdcB"), _VTG: struct.Struct("<fcfcf"), _HDT: struct.Struct("<d")}
 _SENTENCE = re.compile(rb"\$\w{2}(GGA|VTG|HDT),([^*\r\n\0]*)(?:\*([0-9A-Fa-f]{2}))?")
 
 
 class Nmea:
-    """The NMEA of a file so far. left_out: sentences that gave nothing, by reason."""
+    """NMEA of a file so far. left_out: unusable sentences by reason."""
 
     def __init__(self) -> None:
         self.left_out: Counter[str] = Counter()
         self._found: dict[str, list[tuple[int, float, list[float]]]] = defaultdict(list)
 
     def take(self, stamp_ns: int, data: bytes) -> None:
-        """One message of an ensemble of this time."""
+        """Add a message of an ensemble with this stamp."""
         try:
             _, specific, size, delta = _HEAD.unpack_from(data)
             kind = _KINDS.get(specific)
@@ -55,7 +55,7 @@ class Nmea:
             self.left_out["with NMEA that is damaged or empty"] += 1
 
     def references(self) -> list[ReferenceSample]:
-        """Horizontal velocities: of VTG, else of the differences of GGA's positions."""
+        """Return horizontal velocities: from VTG, else from differences of GGA's positions."""
         if self._found[_VTG]:
             stamps, values = self._in_order(_VTG)
             velocities = over_ground(values[:, 0], values[:, 1])
@@ -67,7 +67,7 @@ class Nmea:
         ]
 
     def headings(self) -> tuple[list[int], Array]:
-        """Stamps and headings (N,) rad, from true north, clockwise."""
+        """Return stamps and headings (N,) rad, from true north, clockwise."""
         stamps, values = self._in_order(_HDT)
         return stamps, values[:, 0]
 
@@ -88,7 +88,7 @@ def _unevenness(stamps: np.ndarray) -> float:
 
 
 def _values(kind: str, specific: int, body: bytes) -> list[float]:
-    """Speed m/s, course rad of VTG; latitude, longitude (degrees) of GGA; heading rad of HDT. Raises ValueError."""
+    """Return speed m/s, course rad (VTG); latitude, longitude, degrees (GGA); heading rad (HDT). Raises ValueError."""
     text = body.rstrip(b"\0\r\n ")
     sentence = _SENTENCE.match(text) if text.isascii() and b"\0" not in text else None
     if sentence is not None:
@@ -120,7 +120,7 @@ def _of_text(kind: str, sentence: re.Match[bytes]) -> list[float]:
 
 
 def _degrees(text: str) -> float:
-    """NMEA's degrees and minutes (dddmm.mm) as degrees."""
+    """Convert NMEA's degrees and minutes (dddmm.mm) to degrees."""
     whole, minutes = divmod(float(text), 100.0)
     return whole + minutes / 60.0
 
@@ -138,7 +138,7 @@ def _position(latitude: float, south: bytes, longitude: float, west: bytes, qual
 
 
 def _differences(stamps: Sequence[int], positions: Array) -> tuple[list[int], Array]:
-    """Velocities of the differences of positions (N, 2): stamps, (M, 3)."""
+    """Return stamps and velocities (M, 3) from differences of positions (N, 2)."""
     difference = FixDifference()
     each = (
         difference(at, latitude, longitude, 0.0, None)

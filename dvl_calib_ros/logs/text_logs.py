@@ -1,9 +1,9 @@
-"""What DVLs write as text: Teledyne's PD6, Nortek's PNORBT and Cerulean's DVPDL sentences.
+"""Text formats of DVLs: Teledyne's PD6, Nortek's PNORBT and Cerulean's DVPDL sentences.
 
 PD6 (Pathfinder and Wayfinder guides): ``:TS`` time, ``:SA`` pitch, roll, heading, ``:BI`` the instrument's motion over
 the bottom in mm/s, starboard, forward, up. PNORBT (Nortek, "DVL Integrator's Guide"): forward, starboard, down, stamped
-by a beam's sentence before or by themselves. DVPDL (Cerulean, DVL-75 and Tracker 650): displacement forward, starboard,
-down over an interval, stamped since boot, which becomes time since 1970.
+by a preceding beam's sentence or by themselves. DVPDL (Cerulean, DVL-75 and Tracker 650): displacement forward,
+starboard, down over an interval, stamped since boot, which is converted to time since 1970.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from .nmea import xor
 _SECOND_NS = 1_000_000_000
 _SENTENCE = re.compile(rb"\$((?:PNORBT|DVPDL)[^*\r\n]*)\*([0-9A-Fa-f]{2})")
 _PD6 = re.compile(rb":(TS|SA|BI),([^:\r\n]*)")
-# Fields of the sentences with a velocity
+# sentences with a velocity or its stamp
 _BEAM_TIME, _VELOCITY, _STAMPED, _DISPLACEMENT = "PNORBT1", "PNORBT4", "PNORBT7", "DVPDL"
-_FASTEST_MPS = 30.0  # instruments write ±32.767 where there is no bottom
+_FASTEST_MPS = 30.0  # instruments write ±32.767 without bottom lock
 
 
 def is_pd6(content: bytes) -> bool:
@@ -39,7 +39,7 @@ def is_sentences(content: bytes) -> bool:
 
 
 def read_pd6(path: Path, content: bytes) -> DvlLog:
-    """Read PD6; heading, pitch and roll are those of the DVL's own sensors."""
+    """Read PD6, with heading, pitch and roll from the DVL's own sensors."""
     samples: list[DvlSample] = []
     attitudes: dict[int, tuple[float, ...]] = {}
     left_out: Counter[str] = Counter()
@@ -51,7 +51,7 @@ def read_pd6(path: Path, content: bytes) -> DvlLog:
             if kind == b"TS":
                 at = datetime.strptime(fields[0][:12], "%y%m%d%H%M%S").replace(tzinfo=timezone.utc)
                 stamp_ns = int(at.timestamp()) * _SECOND_NS + int(fields[0][12:14]) * 10_000_000
-                if tilt is not None:  # which comes before its time
+                if tilt is not None:  # the tilt precedes its time
                     attitudes[stamp_ns] = tilt
             elif kind == b"SA":
                 pitch, roll, heading = (math.radians(float(field)) for field in fields[:3])
@@ -63,13 +63,13 @@ def read_pd6(path: Path, content: bytes) -> DvlLog:
             left_out["damaged"] += 1
     stamps = sorted(attitudes)
     rpy = np.array([attitudes[at] for at in stamps]).reshape(-1, 3)
-    note = f"{path}: heading, pitch and roll are those of the DVL's own sensors; give --attitude for another's"
+    note = f"{path}: heading, pitch and roll are from the DVL's own sensors; give --attitude for another source"
     own = imu_samples(stamps, rpy) if len(rpy) and np.ptp(rpy, axis=0).any() else []
     return DvlLog(samples, left_out, (), own, (note,) if own else ())
 
 
 def read_sentences(_: Path, content: bytes) -> DvlLog:
-    """Read sentences of Nortek or Cerulean; those with a wrong checksum are left out."""
+    """Read sentences of Nortek or Cerulean; those with a wrong checksum are skipped."""
     samples: list[DvlSample] = []
     left_out: Counter[str] = Counter()
     beam_ns = 0
@@ -93,7 +93,7 @@ def read_sentences(_: Path, content: bytes) -> DvlLog:
             elif name == _DISPLACEMENT:
                 seconds = 1e-6 * float(fields[1])
                 x, y, z = (float(field) / seconds for field in fields[5:8])
-                # over the interval that ends there
+                # over the interval that ends at the stamp
                 middle_ns = round(1e3 * float(fields[0]) - 0.5e9 * seconds)
                 _add(samples, left_out, _SECOND_NS + middle_ns, (x, -y, -z), float(fields[8]) > 0.0)
         except (ValueError, KeyError, IndexError, ZeroDivisionError):
@@ -108,7 +108,7 @@ def _add(
     velocity: tuple[float, float, float],
     is_valid: bool = True,
 ) -> None:
-    """Take a velocity (forward-left-up, m/s), or count why there is none."""
+    """Add a velocity (forward-left-up, m/s), or count the reason why it is invalid."""
     if not is_valid or not max(map(abs, velocity)) < _FASTEST_MPS:
         left_out["without bottom lock"] += 1
     elif stamp_ns <= 0:

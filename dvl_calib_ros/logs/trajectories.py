@@ -1,7 +1,6 @@
-"""Trajectories as CSV or NPY: a time column and three of values.
+"""Trajectories as CSV or NPY: a column of time and three of values.
 
-Columns are told by their order, and where there is a header checked by its units (``Time [s]`` and m/s or rad) and by
-the axes it names.
+Columns are identified by their order. A header is checked for the units (``Time [s]`` and m/s or rad) and the axes.
 """
 
 from __future__ import annotations
@@ -26,14 +25,14 @@ from .csv_columns import EXPECTED, N_COLUMNS, SHOWN, _is_number, cells, numbers_
 from .dvl_log import DvlLog, imu_samples
 from .dvl_logs import is_dvl_log, read_dvl_log
 
-FRAMES = ("frd", "flu", "enu", "ned")  # those of a body first
+FRAMES = ("frd", "flu", "enu", "ned")  # the body's frames first
 SUFFIXES = ("csv", "npy")
-# Words of a header that tell which of the three values a column holds
+# words of a header that identify the axis of each of the three values
 AXIS_NAMES = ({"x", "vx", "surge", "roll"}, {"y", "vy", "sway", "pitch"}, {"z", "vz", "heave", "yaw"})
 
 
 class TimedRows(NamedTuple):
-    """Time (N,) s, values (N, 3), and in a sentence each what of the file is not among them."""
+    """Time (N,) s, values (N, 3), and one sentence per omission from the file."""
 
     time: Array
     values: Array
@@ -41,10 +40,10 @@ class TimedRows(NamedTuple):
 
 
 def read_columns(path: Path, unit: str) -> TimedRows:
-    """Rows of a CSV or NPY file, values in `unit`. Raises InputError naming file and row.
+    """Read rows of a CSV or NPY file, values in `unit`. Raises InputError naming file and row.
 
-    Left out, and said, are rows without a finite number in every column, as an invalid sample of a bag is, and of a
-    CSV file a last line without its end: its last number may be cut off.
+    Rows without a finite number in every column are omitted with a note, like invalid samples of a bag; so is an
+    unfinished last line of a CSV file, whose last number may be cut off.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -68,12 +67,12 @@ def read_columns(path: Path, unit: str) -> TimedRows:
 def _read_npy(path: Path) -> Array:
     try:
         return np.asarray(np.load(path, allow_pickle=False), dtype=float)
-    except Exception as error:  # damaged files raise all sorts of things, MemoryError among them
+    except Exception as error:  # damaged files raise many types, MemoryError among them
         raise InputError(f"{path}: not a NumPy array file of numbers ({error})") from error
 
 
 def _read_csv(path: Path, unit: str) -> tuple[Array, list[str]]:
-    """Rows of numbers, NaN where there is none, and what is said of the file."""
+    """Return rows of numbers, nan if missing, and notes on the file."""
     rows, left_out = cells(path)
     if rows and not _is_number(rows[0][0]):
         _check_header(path, rows.pop(0), unit)
@@ -102,14 +101,14 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
 
 
 def body_from(frame: str) -> Array:
-    """(3, 3) that takes vectors of a trajectory's body frame (flu or frd) to forward-left-up."""
+    """Return (3, 3) from a trajectory's body frame (flu or frd) to forward-left-up."""
     return FLU_FROM_FRD if frame == "frd" else np.eye(3)
 
 
 def read_dvl(path: Path, start_ns: int, frame: str, std: float, notes: list[str]) -> list[DvlSample]:
-    """Velocities in `frame` (flu, frd) as DVL samples in forward-left-up; std (m/s) 0: covariance not given.
+    """Read velocities in `frame` (flu, frd) as DVL samples in forward-left-up; std (m/s) 0: covariance not given.
 
-    notes: gets what is left out of the file, here and in the other readers.
+    notes: receives remarks on omitted data, here and in the other readers.
     """
     time, velocity, left_out = read_columns(path, "m/s")
     notes += left_out
@@ -122,7 +121,7 @@ def read_dvl(path: Path, start_ns: int, frame: str, std: float, notes: list[str]
 
 
 def read_reference(path: Path, start_ns: int, frame: str, std: float, notes: list[str]) -> list[ReferenceSample]:
-    """Reference velocities, in the body (frame flu, frd) or the earth (enu, ned)."""
+    """Read reference velocities, in the body (frame flu, frd) or the earth (enu, ned)."""
     time, velocity, left_out = read_columns(path, "m/s")
     notes += left_out
     covariance = np.eye(3) * std**2 if std else None
@@ -135,9 +134,9 @@ def read_reference(path: Path, start_ns: int, frame: str, std: float, notes: lis
 
 
 def read_attitude(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
-    """Roll, pitch, yaw of a forward-right-down body in north-east-down, with the angular velocity they imply.
+    """Read roll, pitch, yaw of a forward-right-down body in north-east-down, and derive the angular velocity.
 
-    The angular velocity is that of a smooth curve through the attitudes.
+    The angular velocity is the derivative of a smooth curve through the attitudes.
     """
     time, rpy, left_out = read_columns(path, "rad")
     notes += left_out
@@ -146,7 +145,7 @@ def read_attitude(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """How recordings become bags: frames (flu, frd; enu, ned for GNSS), covariances to write (m/s, 0: not given).
+    """Options of an import: frames (flu, frd; enu, ned for GNSS), covariances to write (m/s, 0: not given).
 
     start: stamp of time 0, s since 1970. columns: of the DVL's file, by `column_map`. Raises InputError.
     """
@@ -179,9 +178,9 @@ class ImportOptions:
 
 
 class Imported(NamedTuple):
-    """What became of a recording. counts: topic -> number of messages, and of reports that gave none, by reason.
+    """Result of an import. counts: number of messages by topic, and of unusable reports by reason.
 
-    notes: in sentences, what of its files was left out.
+    notes: sentences on omitted data.
     """
 
     counts: dict[str, int]
@@ -191,7 +190,7 @@ class Imported(NamedTuple):
 def import_files(
     dvl: Path, gnss: Path | None, attitude: Path | None, output: Path, options: ImportOptions
 ) -> dict[Path, Imported]:
-    """Write one recording to a new bag, or of a folder each to one in `output`. Raises InputError."""
+    """Write one recording to a new bag, or each of a folder to its own bag in `output`. Raises InputError."""
     if not dvl.is_dir():
         return {output: import_recording(dvl, gnss, attitude, output, options)}
     if gnss is not None or attitude is not None:
@@ -234,7 +233,7 @@ def import_recording(
 
 
 def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[ReferenceSample]:
-    from .course_and_heading import names_columns, read_course  # which reads by this module's functions
+    from .course_and_heading import names_columns, read_course  # imports this module
     from .nmea import is_nmea, read_rmc
 
     if is_nmea(path):

@@ -1,1 +1,1 @@
-"""ROS messages to samples; rclpy's objects and rosbags' alike."""
+"""Conversion of ROS messages to samples, for the message objects of rclpy and rosbags."""

@@ -1,7 +1,7 @@
-"""ROS messages to samples, for rclpy's message objects and for rosbags' alike: only their fields are looked at.
+"""Decoding of ROS messages to samples, for the message objects of rclpy and rosbags: only fields are accessed.
 
-The one place where messages become samples, one by one here and as columns in `columns`: frames and stamps are checked,
-and the rules of the message types, which are in `drivers`. What becomes of a sample is not known here.
+All decoding is here (individual messages) and in `columns` (arrays). It checks frames and stamps, and applies the rules
+of the message types in `drivers`.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from ..verdict.reasons import Reason, finding
 from .drivers import NOT_MEASURED, VelocityType, velocity_type
 from .positions import FixDifference, Place, PositionType, matrix_of
 
-# Under which messages are counted that no sensor can mean, and those in another frame
+# counters of physically impossible messages, and of messages in another frame
 INVALID, WRONG_FRAME = "invalid", "wrong_frame"
-# Positions without a fix, and those that have none a window before them
+# counters of positions without a fix, and without a fix one window earlier
 NO_FIX, FIRST_FIX = "no_fix", "first_fix"
-# How the covariance begins of what an IMU does not measure
+# first covariance element of a quantity that an IMU does not measure
 NO_DATA = -1.0
-# Of parameter restamp: every message
+# value of parameter restamp for every message
 RESTAMP_ALL = "log"
-# Different frame_ids of the reference that are remembered.
+# limit of remembered frame_ids of the reference
 MAX_FRAMES = 64
-# What is kept of a name that garbage may make megabytes long: results and messages repeat it.
+# limit of a stored frame_id: garbage may make it megabytes long, and results and messages repeat it
 LONGEST_FRAME_ID = 255
 
 EARTH_FRAMES = {
@@ -59,28 +59,28 @@ class Axes(NamedTuple):
 
 
 AS_SENT = Axes((0, 1, 2), (1.0, 1.0, 1.0))
-# Forward-right-down to forward-left-up, or the other way; north-west-up to east-north-up.
+# forward-right-down to forward-left-up and back; north-west-up to east-north-up
 HALF_TURN, QUARTER_TURN = Axes((0, 1, 2), (1.0, -1.0, -1.0)), Axes((1, 0, 2), (-1.0, 1.0, 1.0))
 
 
 class DeclaredFrame(NamedTuple):
-    """A frame of reference velocities: as the core reads it, and the axes that its messages are turned by before."""
+    """A frame of reference velocities: the core's frame, and the axes from which messages are converted to it."""
 
     frame: VelocityFrame
     axes: Axes = AS_SENT
 
     @property
     def points_down(self) -> bool:
-        """Whether it is of the body, forward-right-down."""
+        """Whether this is the body frame, forward-right-down."""
         return self.axes is HALF_TURN
 
     @property
     def name(self) -> str:
-        """As parameter gnss_frame has it."""
+        """Value of parameter gnss_frame."""
         return {HALF_TURN: FRD, QUARTER_TURN: NWU}.get(self.axes, self.frame.value)
 
     def in_base(self, parameters: Parameters) -> DeclaredFrame:
-        """Return the frame as it is to be read: of a z-down base_frame, its own axes need no turn."""
+        """Return the frame to use: with a z-down base_frame, its own axes need no conversion."""
         return DeclaredFrame(self.frame) if parameters.is_z_down and self.points_down else self
 
 
@@ -93,19 +93,19 @@ DECLARED_FRAMES = {
         DeclaredFrame(VelocityFrame.ENU, QUARTER_TURN),
     )
 }
-# by the end of a frame's name
+# by suffix of a frame's name
 _SUFFIXES = {"enu": "enu", "ned": "ned", "nwu": NWU, "flu": "body", "frd": FRD}
 
 
 def frame_name(frame_id: str) -> str:
-    """A frame_id as it is kept, with its end left out where it is of no use as a name."""
+    """Return a frame_id, shortened if it is too long to be a name."""
     return frame_id if len(frame_id) <= LONGEST_FRAME_ID else f"{frame_id[: LONGEST_FRAME_ID - 1]}…"
 
 
 def frame_named(frame_id: str, base_frames: Collection[str]) -> DeclaredFrame | None:
-    """The frame of velocities whose messages carry this frame_id; None if that says nothing."""
+    """Return the frame of velocities with this frame_id; None if unknown."""
     name = frame_id.strip("/")
-    link = name.rpartition("/")[2]  # below a namespace
+    link = name.rpartition("/")[2]  # without the namespace
     if link in {base.strip("/").rpartition("/")[2] for base in base_frames}:
         return DeclaredFrame(VelocityFrame.BODY)
     if name.lower() in EARTH_FRAMES:
@@ -115,27 +115,27 @@ def frame_named(frame_id: str, base_frames: Collection[str]) -> DeclaredFrame | 
 
 
 def heading_variance(covariance: Any) -> float:
-    """Variance of an IMU's orientation about z, rad², by its covariance (9,); nan where that says nothing."""
+    """Return the variance of an IMU's orientation about z, rad², from its covariance (9,); nan if not given."""
     given = covariance[0] != NO_DATA and covariance[8] > 0.0
     return float(covariance[8]) if given else math.nan
 
 
 def stamp_ns(stamp: Any) -> int:
-    """builtin_interfaces/Time -> integer nanoseconds."""
+    """Convert builtin_interfaces/Time to integer nanoseconds."""
     return stamp.sec * 1_000_000_000 + stamp.nanosec
 
 
 class Refusal(NamedTuple):
-    """A message that is no sample. reason: under which it is counted."""
+    """A message that is no sample. reason: name of its counter."""
 
     reason: str
 
 
 class LinearCovariance:
-    """Takes the (3, 3) of the linear velocity out of covariances of messages: of it alone, or of a twist.
+    """Extractor of the linear velocity's covariance (3, 3) from that of a velocity or a twist.
 
-    Most drivers send the same covariance with every message; it stays the same object then, and what is made of it
-    need not be made again. axes: that they are turned by.
+    Most drivers send the same covariance with every message; the same array is then returned again, so that results
+    computed from it can be reused. axes: conversion to apply.
     """
 
     def __init__(self, axes: Axes = AS_SENT) -> None:
@@ -144,7 +144,7 @@ class LinearCovariance:
         self._axes = axes
 
     def __call__(self, covariance: Any) -> Array | None:
-        """(9,) or (36,) -> (3, 3); None -> None. Raises ValueError for any other size."""
+        """Convert (9,) or (36,) to (3, 3); None to None. Raises ValueError for any other size."""
         if covariance is None:
             return None
         array = np.asarray(covariance, dtype=float)
@@ -157,12 +157,12 @@ class LinearCovariance:
 
 
 OnFix = Callable[[int, Array, Array], None]
-# what a message of another layout than its type's makes the readers raise
+# exceptions of the readers for a message with an unexpected layout
 UNREADABLE = (AttributeError, TypeError, ValueError, IndexError, OverflowError)
 
 
 class _VelocityReader:
-    """Reads the velocity and its covariance from messages of one type. axes: as in `LinearCovariance`."""
+    """Reader of the velocity and its covariance from messages of one type. axes: as in `LinearCovariance`."""
 
     def __init__(self, kind: VelocityType, axes: Axes) -> None:
         self._velocity, self._given, self._lacks = kind.velocity, kind.covariance, kind.lacks_covariance
@@ -180,9 +180,9 @@ class _VelocityReader:
 
 
 def turns_dvl(kind: VelocityType, frame_id: str, parameters: Parameters) -> bool:
-    """Return whether velocities of a DVL are turned about x by 180°, from their own axes to those of base_frame.
+    """Return whether a DVL's velocities must be rotated by 180° about x, from their own axes to those of base_frame.
 
-    A z-down vehicle's DVL is z down as well, unless its frame_id says otherwise.
+    A z-down vehicle's DVL is z down as well, unless its frame_id ends in _flu.
     """
     if parameters.dvl_axes != FROM_MESSAGE:
         return parameters.dvl_axes != parameters.base_axes
@@ -192,13 +192,12 @@ def turns_dvl(kind: VelocityType, frame_id: str, parameters: Parameters) -> bool
 
 
 class MessageDecoder:
-    """Makes samples of messages of the types that parameters dvl_type and gnss_type name, and of sensor_msgs/Imu.
+    """Decoder of messages of the types in parameters dvl_type and gnss_type, and of sensor_msgs/Imu.
 
-    `problems` keeps the latest finding of each kind; on_problem is told in words when one is new. on_fix is told of
-    every position: stamp, place (3,) m in ENU from the first, and its variances (3,) m², nan where not known. What is
-    remembered of the messages before are their frames: the DVL's first is its own. adapted: by the node's topic what
-    messages go through before. Raises InputError for a type that is
-    none.
+    `problems` has the latest finding of each kind; on_problem receives the text of each new one. on_fix receives every
+    position: stamp, position (3,) m in ENU from the first, and its variances (3,) m², nan if unknown. The decoder
+    remembers only frames of earlier messages: the DVL's first frame is the DVL's own. adapted: by the node's topic, a
+    conversion to apply first. Raises InputError for an unknown type.
     """
 
     def __init__(self, parameters: Parameters, on_problem: Callable[[str], None] = lambda _: None) -> None:
@@ -213,7 +212,7 @@ class MessageDecoder:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the problems and the frames seen."""
+        """Forget problems and frames."""
         self.problems: dict[str, Reason] = {}
         self.zero_stamps = 0
         self.dvl_frame: str | None = self.parameters.dvl_frame or None
@@ -223,8 +222,6 @@ class MessageDecoder:
         position = self.reference_type.position
         self._fixes = FixDifference(self.parameters.position_window, None if position is None else position.between)
         self._origin: Place | None = None
-
-    # ------------------------------------------------------------------ one by one
 
     def dvl(self, message: Any, received_ns: int) -> DvlSample | Refusal:
         """Decode a message of dvl_type."""
@@ -264,7 +261,7 @@ class MessageDecoder:
     def _difference(
         self, kind: PositionType, message: Any, stamp_ns: int, frame: VelocityFrame
     ) -> ReferenceSample | Refusal:
-        """The velocity between a position and the one a window before; the position itself goes to `on_fix`."""
+        """Return the velocity between a position and the one a window earlier; the position itself goes to `on_fix`."""
         if not kind.is_valid(message):
             return Refusal(NO_FIX)
         place, given = kind.place(message), kind.covariance(message)
@@ -277,9 +274,9 @@ class MessageDecoder:
         return ReferenceSample(found.stamp_ns, found.velocity, found.covariance, frame)
 
     def imu(self, message: Any, received_ns: int) -> ImuSample | Refusal:
-        """Decode a sensor_msgs/Imu. A covariance that starts with -1 says that there is no such data.
+        """Decode a sensor_msgs/Imu. A covariance that starts with -1 means that the quantity is missing.
 
-        The sample is the body's, in ENU, as parameters imu_rpy and imu_frame turn it.
+        The sample describes the body, in ENU, converted by parameters imu_rpy and imu_frame.
         """
         try:
             self.note_imu_frame(message.header.frame_id)
@@ -294,7 +291,7 @@ class MessageDecoder:
         return self.imu_alignment.sample(sample)
 
     def undecodable(self, stream: Stream, reason: str) -> Refusal:
-        """Take note of a message that could not be decoded at all."""
+        """Note a message that could not be decoded."""
         self._problem(f"{stream.value} undecodable", finding("MESSAGE_UNDECODABLE", stream=stream.value, reason=reason))
         return Refusal(INVALID)
 
@@ -305,15 +302,13 @@ class MessageDecoder:
         self.note_zero_stamps(stream, 1)
         return received_ns
 
-    # ------------------------------------------------------------------ what is asked of frames and stamps
-
     def note_zero_stamps(self, stream: Stream, count: int) -> None:
-        """Take note of messages without a stamp, for which the time of reception is used."""
+        """Note messages without a stamp, for which the time of reception is used."""
         self.zero_stamps += count
         self._problem(f"{stream.value} stamp", finding("STAMP_MISSING", stream=stream.value))
 
     def accepts_dvl_frame(self, frame_id: str) -> bool:
-        """Whether messages of this frame are the DVL's; the first that may be is taken for its own."""
+        """Return whether this frame is the DVL's. The first possible frame becomes the DVL's own."""
         frame_id = frame_name(frame_id)
         if frame_id == self.dvl_frame:
             return True
@@ -330,29 +325,29 @@ class MessageDecoder:
 
     @property
     def turns_dvl(self) -> bool:
-        """Whether the DVL's data are turned about x by 180°, to the axes of base_frame."""
+        """Whether the DVL's data are rotated by 180° about x, to the axes of base_frame."""
         return turns_dvl(self.dvl_type, self.dvl_frame or "", self.parameters)
 
     def note_axes(self) -> None:
-        """Ask about a DVL whose data are turned upside down, and its mounting as well; its frame is known by now."""
+        """Report a DVL with both its data and its mounting upside down; its frame must be known."""
         if self.turns_dvl and self.parameters.rotation_dvl_from_body[2, 2] < 0.0:
             self._problem("dvl axes", finding("DVL_TURNED_TWICE", frame_id=self.dvl_frame))
 
     @property
     def frame_of_reference(self) -> VelocityFrame | None:
-        """Frame of the reference's messages, of the first that were taken; None before."""
+        """Frame of the first accepted reference message; None before."""
         return next((said.frame for said in self._reference_frames.values() if said is not None), None)
 
     @property
     def frame_ids(self) -> tuple[str, str, str]:
-        """frame_id of the DVL's, the reference's and the IMU's messages, '' where none has come."""
+        """frame_id of the DVL's, the reference's and the IMU's messages, '' before the first."""
         return self.dvl_frame or "", next(iter(self._reference_frames), ""), self._imu_frame or ""
 
     def reference_frame(self, frame_id: str) -> DeclaredFrame | None:
-        """The frame of reference messages with this frame_id; None if it says nothing."""
+        """Return the frame of reference messages with this frame_id; None if unknown."""
         frame_id = frame_name(frame_id)
         if frame_id not in self._reference_frames:
-            if len(self._reference_frames) == MAX_FRAMES:  # garbage, ever new
+            if len(self._reference_frames) == MAX_FRAMES:  # garbage with ever new names
                 self._reference_frames.clear()
             self._reference_frames[frame_id] = self._frame_named(frame_id)
         return self._reference_frames[frame_id]
@@ -371,7 +366,7 @@ class MessageDecoder:
         return frame.in_base(p)
 
     def note_imu_frame(self, frame_id: str) -> None:
-        """Take note of the frame of IMU messages."""
+        """Note the frame of IMU messages."""
         frame_id = frame_name(frame_id)
         if frame_id == self._imu_frame:
             return
@@ -383,14 +378,14 @@ class MessageDecoder:
     def _problem(self, kind: str, found: Reason) -> None:
         is_new = kind not in self.problems
         self.problems[kind] = found
-        if is_new:  # two frames in turn, or ever new garbage, must not be told of at every message
+        if is_new:  # alternating frames or ever new garbage must not be reported with every message
             self._on_problem(str(found))
 
 
 def _east_north_up(
     kind: PositionType, origin: Place, place: Place, covariance: Any, frame: VelocityFrame
 ) -> tuple[Array, Array]:
-    """A position (3,) m from the origin, and its variances (3,) m², nan where not known."""
+    """Return a position (3,) m from the origin, and its variances (3,) m², nan if unknown."""
     away, matrix = np.array(kind.between(origin, place)), matrix_of(covariance)
     variance = np.full(3, math.nan) if matrix is None else np.diag(matrix).copy()
     if frame is VelocityFrame.NED:

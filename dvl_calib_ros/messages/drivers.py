@@ -1,8 +1,8 @@
-"""The message types that velocities are read from.
+"""Message types from which velocities are read.
 
-A driver is one entry in `VELOCITY_TYPES`; bags, the node, and the documentation's table go by it. The rules follow the
-definitions and what the drivers do with them: the Water Linked driver (waterlinked_dvl, marine_acoustic_msgs/Dvl) and
-dvl-a50 (dvl_msgs/DVL), which both hand on the sensor's JSON reports (docs.waterlinked.com/dvl/dvl-json-protocol).
+Each driver is an entry in `VELOCITY_TYPES`, used by bags, the node, and the documentation's table. The rules follow the
+message definitions and the drivers' behaviour: the Water Linked driver (waterlinked_dvl, marine_acoustic_msgs/Dvl) and
+dvl-a50 (dvl_msgs/DVL), which both forward the sensor's JSON reports (docs.waterlinked.com/dvl/dvl-json-protocol).
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from ..errors import InputError
 from ..verdict.reasons import Reason, finding
 from .positions import POSE, SATELLITES, PositionType
 
-# Its clock counts microseconds, since boot where nothing synchronises it: then its stamps are none.
+# PX4's clock counts microseconds; without synchronisation since boot, and then stamps are invalid
 MICROSECOND_NS, SINCE_BOOT_US = 1000, 10**15
-# By `velocity_frame`: north-east-down, and the body's forward-right-down. FRD of the world points anywhere.
+# by `velocity_frame`: north-east-down, and the body's forward-right-down; the heading of FRD in the world is arbitrary
 FRAMES = {1: "ned", 3: "base_link_frd"}
 
 
 def of_vehicle_odometry(message: Any) -> SimpleNamespace:
-    """A px4_msgs/VehicleOdometry as a stamped twist: header, velocity, covariance (9,), twist with the turn rates."""
+    """Convert a px4_msgs/VehicleOdometry to a stamped twist: header, velocity, covariance (9,), turn rates."""
     at_us = int(message.timestamp_sample or message.timestamp)
     seconds, nanoseconds = divmod(at_us * MICROSECOND_NS if at_us >= SINCE_BOOT_US else 0, 1_000_000_000)
     variance = np.asarray(message.velocity_variance, dtype=float)
@@ -54,18 +54,18 @@ IMU_TYPE = "sensor_msgs/msg/Imu"
 BOTTOM_TRACK, WATER_TRACK = 1, 2
 # coordinate_mode of ds_sensor_msgs/Dvl for the instrument's own axes
 DS_INSTRUMENT = 1
-# Variance (m/s)² of an axis that is not measured: nothing can be learnt from it
+# variance (m/s)² of an axis that is not measured: it has no information
 NOT_MEASURED = 1e6
-# a velocity in three axes takes as many beams
+# smallest number of beams for a velocity in three axes
 ENOUGH_BEAMS = 3
 _LARGEST = sys.float_info.max
 
 
 class Rule(NamedTuple):
-    """When a message's velocity is not to be believed, however plausible it looks.
+    """A condition under which a message's velocity is invalid, even if plausible.
 
-    counter: under which such messages are counted. says: what is wrong with them, in words. broken: by a message, or by
-    each of many as columns, so it is written with operators for both. remedy: what to do.
+    counter: name of the counter of such messages. says: the fault. broken: the test, for a message or for columns of
+    many, so it uses operators valid for both. remedy: what to do.
     """
 
     counter: str
@@ -75,7 +75,7 @@ class Rule(NamedTuple):
 
     @property
     def in_words(self) -> str:
-        """What is wrong, for a terminal."""
+        """The fault as text for a terminal."""
         return self.says.replace("`", "")
 
 
@@ -83,16 +83,15 @@ class Rule(NamedTuple):
 class VelocityType:
     """One message type.
 
-    velocity: message -> something with x, y, z, m/s. covariance: message -> of that velocity, row-major, 9 numbers or
-    36 of a twist, (m/s)²; None where it gives none. lacks_covariance: message -> whether what is there is none.
-    frame_id: message -> frame of the velocity. is_read_in_columns: whether these are written for columns of messages as
-    well, which takes a type without lists. points_down: its axes
-    are forward-right-down unless its frame says otherwise. rules: of a DVL, the first that is broken counts.
-    is_reference, is_dvl: whether velocities of the reference and of DVLs come in this type. position: how positions are
-    read, of which velocities are made (positions.py), None of a type of velocities. reference_frame: the axes of a
-    reference in this type, whatever its frame_id says, None if that says it. adapted: a message without header as all
-    else reads it; None: as it is. definitions: for bags that embed none, the versions of it that are about. install:
-    how to get its package, where ROS does not bring it.
+    velocity: message -> object with x, y, z, m/s. covariance: message -> covariance of that velocity, row-major, 9
+    numbers or 36 of a twist, (m/s)²; None if not given. lacks_covariance: message -> whether the field is a
+    placeholder. frame_id: message -> frame of the velocity. is_read_in_columns: whether these functions also work on
+    columns of messages, which needs a type without lists. points_down: forward-right-down unless the frame's name says
+    otherwise. rules: of a DVL; the first broken one counts. is_reference, is_dvl: whether references and DVLs use this
+    type. position: how to read positions (positions.py), None for a type of velocities. reference_frame: axes of a
+    reference in this type regardless of frame_id; None to use frame_id. adapted: conversion of a message without
+    header; None if not needed. definitions: versions of the definition, for bags without. install: how to get the
+    package, if ROS does not have it.
     """
 
     name: str
@@ -115,19 +114,19 @@ class VelocityType:
     install: str = ""
 
     def is_turned(self, frame_id: str) -> bool:
-        """Whether velocities in this frame are forward-right-down: by the end of its name, else by the type's axes."""
+        """Return whether velocities in this frame are forward-right-down: by the frame's suffix, else by the type."""
         suffix = frame_id.lower().rpartition("_")[2]
         return suffix == "frd" or (self.points_down and suffix != "flu")
 
     def broken_rule(self, message: Any, parameters: Parameters) -> Rule | None:
-        """The first rule that a message breaks."""
+        """Return the first rule that a message breaks."""
         for rule in self.rules:
             if rule.broken(message, parameters):
                 return rule
         return None
 
     def advice(self, counts: Mapping[str, int]) -> list[Reason]:
-        """What is wrong with the messages that were not used for breaking rules; from `Calibrator.counts` of dvl."""
+        """Return findings on the messages refused by rules; counts: `Calibrator.counts` of the DVL."""
         return [
             finding("DVL_REFUSED", count=counts[rule.counter], reason=rule.in_words, remedy=rule.remedy)
             for rule in self.rules
@@ -140,7 +139,7 @@ def _zero_velocity(read: Callable[[Any], Any]) -> Rule:
         velocity = read(message)
         return (velocity.x == 0.0) & (velocity.y == 0.0) & (velocity.z == 0.0)
 
-    # no sensor measures exactly nothing on three axes, but drivers send it for want of a measurement
+    # no sensor measures exactly zero on three axes, but drivers send it without a measurement
     return Rule("zero_velocity", "exactly zero on all three axes", broken, "check bottom lock, and the driver")
 
 
@@ -157,13 +156,13 @@ def _has_no_altitude(message: Any) -> Any:
 
 
 def _has_no_range(message: Any) -> Any:
-    """Whether fewer beams than a velocity takes have a range; Gazebo's bridge never fills in the altitude."""
+    """Return whether too few beams for a velocity have a range; Gazebo's bridge never fills in the altitude."""
     ranges = np.asarray(message.range, dtype=float)
     with_range = (ranges > 0.0) & (ranges <= _LARGEST)
     return (message.beam_ranges_valid == 0) | (with_range.sum(axis=-1) < ENOUGH_BEAMS)
 
 
-# the sensor sends altitude -1 without bottom lock; 0 is what a driver leaves that does not fill it
+# without bottom lock the sensor sends altitude -1; 0 means that the driver does not fill it
 _NO_BOTTOM = Rule(
     "no_bottom",
     "`altitude` is negative or not finite",
@@ -179,7 +178,7 @@ _NO_BOTTOM_NOR_RANGES = Rule(
 
 
 def _is_outside(value: Any, least: float, most: float) -> Any:
-    """Whether a value, or each of many, is not within bounds; nan is not."""
+    """Return whether a value, or each of many, is out of bounds or nan."""
     return (value < least) | (value > most) | (value != value)
 
 
@@ -189,9 +188,10 @@ def _few_beams_listed(message: Any, _: Parameters) -> bool:
 
 
 def _dvl_msgs_covariance(message: Any) -> Any:
-    """The covariance where this version of the message has one, else fom²: fom is the worst axis' standard deviation.
+    """Return the covariance, or fom² for versions of the message without covariance.
 
-    (Water Linked: fom is calculated from the covariance. On their examples it is the root of its largest eigenvalue.)
+    fom is the worst axis' standard deviation. (Water Linked: fom is calculated from the covariance. In their examples
+    it is the root of the largest eigenvalue.)
     """
     covariance = getattr(message, "covariance", ())
     if len(covariance):
@@ -200,7 +200,7 @@ def _dvl_msgs_covariance(message: Any) -> Any:
 
 
 class _Velocity(NamedTuple):
-    """Of a message that has no vector. m/s."""
+    """Velocity of a message without a vector, m/s."""
 
     x: float
     y: float
@@ -208,13 +208,13 @@ class _Velocity(NamedTuple):
 
 
 def _course_and_speed(message: Any) -> _Velocity:
-    """East, north, up from the course over ground (degrees from north), the speed and the climb."""
+    """Return east, north, up from course over ground (degrees from north), speed and climb."""
     course = math.radians(message.track)
     return _Velocity(message.speed * math.sin(course), message.speed * math.cos(course), message.climb)
 
 
 def _speed_covariance(message: Any) -> Any:
-    """From what the receiver claims for 95 per cent, which is twice the standard deviation."""
+    """Return the covariance from the receiver's 95 per cent errors, which are twice the standard deviation."""
     across, up = 0.5 * message.err_speed, 0.5 * message.err_climb
     if not across > 0.0:
         return None
@@ -222,7 +222,7 @@ def _speed_covariance(message: Any) -> Any:
 
 
 def _no_velocity(message: Any) -> Any:
-    raise ValueError("a position is no velocity")  # MessageDecoder makes one of two
+    raise ValueError("a position is no velocity")  # MessageDecoder computes a velocity from two positions
 
 
 _LINEAR, _TWIST_LINEAR, _VELOCITY = attrgetter("twist.linear"), attrgetter("twist.twist.linear"), attrgetter("velocity")
@@ -271,7 +271,7 @@ def _dvl_msgs_definition(covariance: str = "", beams: str = "DVLBeam[]", times: 
 
 _TIMES = "int64 time_of_validity\nint64 time_of_transmission\n"
 
-# What drivers of one family of messages have in common
+# rules shared by several message types
 _WATER_TRACK = Rule(
     "water_track",
     "`velocity_mode` is water track",
@@ -320,7 +320,7 @@ _TYPES: dict[str, VelocityType] = {
             velocity=_TWIST_LINEAR,
             covariance=attrgetter("twist.covariance"),
             covariance_says="`twist.covariance`; zero: not given, negative: invalid",
-            frame_id=attrgetter("child_frame_id"),  # the header's is that of the pose
+            frame_id=attrgetter("child_frame_id"),  # header.frame_id is the pose's
             frame_says="`child_frame_id`",
             rules=(_zero_velocity(_TWIST_LINEAR),),
             is_reference=True,
@@ -332,7 +332,7 @@ _TYPES: dict[str, VelocityType] = {
             covariance=attrgetter("velocity_covar"),
             lacks_covariance=lambda message: np.asarray(message.velocity_covar)[..., 0] == -1.0,
             covariance_says="`velocity_covar`; -1 or zero: not given",
-            points_down=True,  # the definition: z in the direction the DVL points, x forward
+            points_down=True,  # definition: z in the direction the DVL points, x forward
             rules=(
                 _WATER_TRACK,
                 Rule(
@@ -341,7 +341,7 @@ _TYPES: dict[str, VelocityType] = {
                     lambda message, _: message.velocity_mode != BOTTOM_TRACK,
                     "let the driver fill velocity_mode (DVL_MODE_BOTTOM is 1)",
                 ),
-                _flagged("beam_velocities_valid"),  # where Water Linked's drivers put the sensor's velocity_valid
+                _flagged("beam_velocities_valid"),  # Water Linked's drivers copy the sensor's velocity_valid here
                 _FEW_BEAMS,
                 _NO_BOTTOM_NOR_RANGES,
                 _zero_velocity(_VELOCITY),
@@ -356,7 +356,7 @@ _TYPES: dict[str, VelocityType] = {
             covariance=_dvl_msgs_covariance,
             is_read_in_columns=False,
             covariance_says="`covariance` where the version has it, else `fom`²",
-            points_down=True,  # the sensor's axes (docs.waterlinked.com/dvl/axes), handed on as they are
+            points_down=True,  # the sensor's axes (docs.waterlinked.com/dvl/axes), forwarded unchanged
             rules=(
                 _flagged("velocity_valid"),
                 Rule(
@@ -413,7 +413,7 @@ _TYPES: dict[str, VelocityType] = {
                 _WATER_TRACK,
                 Rule(
                     "other_axes",
-                    "`coordinate_mode` is not that of the instrument",
+                    "`coordinate_mode` is not the instrument's",
                     lambda message, _: message.coordinate_mode != DS_INSTRUMENT,
                     "let the driver send velocities in the instrument's axes (DVL_COORD_INSTRUMENT is 1)",
                 ),
@@ -485,8 +485,8 @@ _TYPES: dict[str, VelocityType] = {
     )
 }
 _WRITTEN = tuple(_TYPES.values())
-VELOCITY_TYPES: Mapping[str, VelocityType] = _TYPES  # grows by those that are recognised (type_recognition.py)
-# for bags that do not say how messages are laid out
+VELOCITY_TYPES: Mapping[str, VelocityType] = _TYPES  # extended by recognised types (type_recognition.py)
+# for bags without message definitions
 KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
     name: each.definitions for name, each in VELOCITY_TYPES.items() if each.definitions
 }
@@ -494,12 +494,12 @@ _DVLS = {name: each for name, each in _TYPES.items() if each.is_dvl}
 _REFERENCES = {name: each for name, each in _TYPES.items() if each.is_reference}
 DVL_TYPES: Mapping[str, VelocityType] = _DVLS
 REFERENCE_TYPES: Mapping[str, VelocityType] = _REFERENCES
-# what the parameters of these names may name
+# allowed values of these parameters
 TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": DVL_TYPES, "gnss_type": REFERENCE_TYPES}
 
 
 def add_type(name: str, like: str) -> VelocityType:
-    """A type of another name that is read as one that is known; known by its name from here on."""
+    """Add a type of another name that is read like a known one."""
     package = name.partition("/")[0]
     same = VELOCITY_TYPES[like]
     install = f"build {package} in your workspace"
@@ -507,7 +507,7 @@ def add_type(name: str, like: str) -> VelocityType:
 
 
 def register(added: VelocityType) -> VelocityType:
-    """Make a type known by its name."""
+    """Add a type."""
     for types, belongs in ((_TYPES, True), (_DVLS, added.is_dvl), (_REFERENCES, added.is_reference)):
         if belongs:
             types[added.name] = added
@@ -515,18 +515,18 @@ def register(added: VelocityType) -> VelocityType:
 
 
 def forget(name: str) -> None:
-    """Make a type that was registered unknown again."""
+    """Remove a type that was added."""
     for types in (_TYPES, _DVLS, _REFERENCES):
         types.pop(name, None)
 
 
 def may_be_recognised(name: str) -> bool:
-    """Whether a type that nobody knows may yet be a DVL's, once its fields are seen."""
+    """Return whether an unknown type may be a DVL's, to be decided by its fields."""
     return re.fullmatch(r"[A-Za-z]\w*/(msg/)?(DVL|Dvl)", name, re.ASCII) is not None
 
 
 def velocity_type(parameter: str, name: str) -> VelocityType:
-    """The type that parameter dvl_type or gnss_type names, as package/msg/Name or package/Name. Raises InputError."""
+    """Return the type in parameter dvl_type or gnss_type (package/msg/Name or package/Name). Raises InputError."""
     types = TYPES_OF[parameter]
     package, _, rest = name.partition("/")
     found = types.get(f"{package}/msg/{rest.removeprefix('msg/')}")
@@ -536,7 +536,7 @@ def velocity_type(parameter: str, name: str) -> VelocityType:
 
 
 def driver_table() -> str:
-    """The documentation's table of message types, in Markdown."""
+    """Return the documentation's table of message types, in Markdown."""
     lines = ["| type | sent by | frame, axes | covariance | not used, and counted as |", "|---|---|---|---|---|"]
     for each in _WRITTEN:
         axes = "forward-right-down" if each.points_down else "forward-left-up" if each.is_dvl else "of the reference"

@@ -1,4 +1,4 @@
-"""Samples to ROS messages, in bags."""
+"""Conversion of samples to ROS messages in bags."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FRAME_IDS = {VelocityFrame.ENU: "map", VelocityFrame.NED: "ned", VelocityFrame.B
 
 
 class SatelliteFix(NamedTuple):
-    """A position of a receiver, degrees; its height is not known."""
+    """A receiver's position, degrees, without height."""
 
     stamp_ns: int
     latitude_deg: float
@@ -29,8 +29,10 @@ class SatelliteFix(NamedTuple):
 
 
 class WaterReading(NamedTuple):
-    """What a DVL says of its water. speed_of_sound: m/s, that it counts with. temperature: °C; salinity: PSU; nan where
-    no sensor measures it."""
+    """A DVL's water properties.
+
+    speed_of_sound: m/s, as used by the DVL. temperature: °C. salinity: PSU. nan if not measured.
+    """
 
     stamp_ns: int
     speed_of_sound: float
@@ -38,22 +40,22 @@ class WaterReading(NamedTuple):
     salinity: float
 
 
-# A joint whose origin has no xyz says how the DVL is turned, and not where it sits.
+# a joint whose origin has no xyz defines the DVL's orientation but not its position
 _TURNED = (
     '<robot name="dvl"><link name="base_link"/><link name="dvl_link"/><joint name="dvl_joint" type="fixed">'
     '<parent link="base_link"/><child link="dvl_link"/><origin rpy="0 0 {yaw:.6f}"/></joint></robot>'
 )
-# What is written of each second is enough of what changes slowly
+# one reading per second is enough for slow changes
 _WATER_EVERY_NS = 1_000_000_000
 
 
 class SampleWriter:
-    """Writes samples to a bag, log time is the stamp."""
+    """Writer of samples to a bag; the log time is the stamp."""
 
     def __init__(self, bag: BagWriter) -> None:
         self._bag = bag
         self._types: Any = bag.typestore.types
-        # what no message has anything of its own in is made once
+        # constant parts of messages are created once
         self._still = self._types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
         self._exact, self._unknown = np.zeros(9), np.array([-1.0, *[0.0] * 8])
 
@@ -92,7 +94,7 @@ class SampleWriter:
         self._bag.message(topic, FIX_TYPE, fix.stamp_ns, message)
 
     def imu(self, topic: str, sample: ImuSample, frame_id: str = "base_link") -> None:
-        """Write attitude and angular velocity as Imu, with covariance -1 where there is none."""
+        """Write attitude and angular velocity as Imu, with covariance -1 for missing ones."""
         quaternion, vector = self._types["geometry_msgs/msg/Quaternion"], self._types["geometry_msgs/msg/Vector3"]
         message = self._types[IMU_TYPE](
             header=self._header(sample.stamp_ns, frame_id),
@@ -111,7 +113,7 @@ class SampleWriter:
         self._bag.message("robot_description", STRING_TYPE, stamp_ns, message)
 
     def water(self, readings: Iterable[WaterReading]) -> int:
-        """Write what a DVL says of its water, at most one reading a second; how many were written."""
+        """Write a DVL's water readings, at most one per second. Return their number."""
         types, last_ns, written = self._types, 0, 0
         for each in readings:
             if written and abs(each.stamp_ns - last_ns) < _WATER_EVERY_NS:

@@ -1,7 +1,7 @@
-"""DVL messages of unlisted types, read by a map of fields (parameter dvl_fields).
+"""Reading of unlisted DVL message types by a map of fields (parameter dvl_fields).
 
 A map is ``velocity=vel.x,vel.y,vel.z,valid=lock``: keys, each with paths of fields. ``beams=LIST,DIRECTION,VELOCITY``,
-of which the last two are fields of the list's elements, gives the velocity by least squares.
+the last two being fields of the list's elements, gives the velocity by least squares.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from .drivers import CHECK_LOCK, ENOUGH_BEAMS, IMU_TYPE, VELOCITY_TYPES, Rule, V
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
-# Kinds of fields as rosbags numbers them (`rosbags.interfaces.Nodetype`), which a ROS machine need not have.
+# rosbags' numbers of field kinds (`rosbags.interfaces.Nodetype`); a ROS machine need not have rosbags
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
-# Keys of a map, and how many paths each may have
+# keys of a map, and allowed numbers of paths for each
 _KEYS: Mapping[str, tuple[int, ...]] = {
     "velocity": (1, 3), "beams": (3,), "valid": (1, 2, 3, 4), "variance": (1, 3), "stamp": (1,), "frame": (1,)
 }  # fmt: skip
 _WRITTEN = frozenset({*VELOCITY_TYPES, IMU_TYPE})
-# Of a type so many fields are named in an error.
+# limit of fields named in an error
 _NAMED = 30
-# Types that are known by a map, and the map
+# types registered by a map, and their maps
 _MAPPED: dict[str, str] = {}
 FieldMap = Mapping[str, tuple[str, ...]]
 
@@ -59,19 +59,19 @@ def field_map(text: str) -> FieldMap:
 
 
 def may_be_mapped(msgtype: str) -> bool:
-    """Return whether a map may say how messages of a type are read: of those that are listed it does not."""
+    """Return whether a map may apply to a type: listed types have their own reader."""
     return msgtype not in _WRITTEN
 
 
 def forget_mapped(text: str) -> None:
-    """Forget the types that are known by another map than this, '' for none."""
+    """Remove the types registered by another map than this, '' for none."""
     for name in [name for name, known in _MAPPED.items() if known != text]:
         forget(name)
         del _MAPPED[name]
 
 
 def mapped_type(name: str, text: str) -> VelocityType:
-    """Return the type of this name as a map reads it, known until one is opened by another. Raises InputError."""
+    """Register and return the type of this name as read by a map, until `forget_mapped`. Raises InputError."""
     fields = field_map(text)
     _MAPPED[name] = text
     return register(
@@ -89,7 +89,7 @@ def mapped_type(name: str, text: str) -> VelocityType:
 
 
 def _reader(fields: FieldMap) -> Callable[[Any], Any]:
-    """Return the function that gives a message the names that a type's are read by."""
+    """Return a function that gives a message the attribute names of the map's keys."""
     getters = {key: tuple(map(attrgetter, paths)) for key, paths in fields.items() if key != "beams"}
 
     def read(key: str, message: Any) -> list[Any]:
@@ -99,7 +99,7 @@ def _reader(fields: FieldMap) -> Callable[[Any], Any]:
         header = getattr(message, "header", None)
         stamp = _stamp(read("stamp", message) or ([header.stamp] if header is not None else [0.0]))
         frame = read("frame", message) or ([header.frame_id] if header is not None else [""])
-        velocity = _of_beams(fields["beams"], message) if "beams" in fields else _three(read("velocity", message))
+        velocity = _of_beams(fields["beams"], message) if "beams" in fields else _xyz(read("velocity", message))
         variance = read("variance", message)
         return SimpleNamespace(
             header=SimpleNamespace(stamp=stamp, frame_id=str(frame[0])),
@@ -111,8 +111,8 @@ def _reader(fields: FieldMap) -> Callable[[Any], Any]:
     return adapted
 
 
-def _three(values: Sequence[Any]) -> list[float]:
-    """Return three numbers, of a vector, an array, or one by one; nan where there are not three."""
+def _xyz(values: Sequence[Any]) -> list[float]:
+    """Return three numbers of a vector, an array, or separate fields; nan if there are not three."""
     if len(values) == 1:
         [vector] = values
         values = (vector.x, vector.y, vector.z) if hasattr(vector, "x") else vector
@@ -120,9 +120,9 @@ def _three(values: Sequence[Any]) -> list[float]:
 
 
 def _of_beams(paths: Sequence[str], message: Any) -> list[float]:
-    """Return the velocity whose parts along the beams' directions are those measured; nan of fewer than three."""
+    """Return the least-squares velocity from beam directions and velocities; nan from fewer than three."""
     beams, direction, speed = map(attrgetter, paths)
-    rows = [(*_three([direction(beam)]), float(speed(beam))) for beam in beams(message)]
+    rows = [(*_xyz([direction(beam)]), float(speed(beam))) for beam in beams(message)]
     table = np.array([row for row in rows if all(map(math.isfinite, row))]).reshape(-1, 4)
     if np.linalg.matrix_rank(table[:, :3]) < ENOUGH_BEAMS:
         return [math.nan] * 3
@@ -130,9 +130,9 @@ def _of_beams(paths: Sequence[str], message: Any) -> list[float]:
 
 
 def _covariance(values: Sequence[Any]) -> Array | None:
-    """Return (3, 3) (m/s)² of one variance, one of each axis, or of a covariance of 9 numbers or of a twist's 36."""
+    """Return (3, 3) (m/s)² from one variance, one per axis, a covariance of 9 numbers or a twist's of 36."""
     if hasattr(values[0], "x"):
-        values = _three(values)
+        values = _xyz(values)
     flat = np.concatenate([np.ravel(np.asarray(value, dtype=float)) for value in values])
     if flat.size in (9, 36):
         side = math.isqrt(flat.size)
@@ -141,7 +141,7 @@ def _covariance(values: Sequence[Any]) -> Array | None:
 
 
 def _stamp(values: Sequence[Any]) -> Any:
-    """Return a stamp as a header has it, of one or of seconds since 1970."""
+    """Return a stamp like a header's, from a stamp or from seconds since 1970."""
     [stamp] = values
     if hasattr(stamp, "sec"):
         return stamp
@@ -149,10 +149,8 @@ def _stamp(values: Sequence[Any]) -> Any:
     return SimpleNamespace(sec=seconds, nanosec=nanoseconds)
 
 
-# ---------------------------------------------------------------------- the fields of a type
-
 Description = Any
-"""What rosbags says of a field: its kind, then a type's name, a base type, or what an array is of."""
+"""rosbags' description of a field: its kind, then a type's name, a base type, or an array's element."""
 
 
 class _Fields(NamedTuple):
@@ -161,13 +159,13 @@ class _Fields(NamedTuple):
     store: Typestore
 
     def of(self, description: Description) -> dict[str, Description]:
-        """Return the fields of a message by name, none of what is no message."""
+        """Return a message's fields by name; empty for other descriptions."""
         kind, what = description
         known = self.store.fielddefs.get(what) if kind == NAME else None
         return {} if known is None else dict(known[1])
 
     def at(self, description: Description, path: str) -> Description | None:
-        """Return what lies at a path below a message; None if nothing does."""
+        """Return the description at a path below a message; None if it does not exist."""
         for step in path.split("."):
             description = self.of(description).get(step)
             if description is None:
@@ -175,7 +173,7 @@ class _Fields(NamedTuple):
         return description
 
     def walk(self, description: Description, prefix: str = "") -> Iterator[tuple[str, Description]]:
-        """Yield the paths below a message, and what lies there, all but those of its header."""
+        """Yield all paths below a message except the header's, with their descriptions."""
         for name, each in self.of(description).items():
             if prefix or name != "header":
                 yield prefix + name, each
@@ -194,14 +192,14 @@ class _Fields(NamedTuple):
         return "w" not in fields and all(name in fields and self.is_number(fields[name]) for name in "xyz")
 
     def element(self, description: Description) -> Description | None:
-        """Return what messages a list is of; None of what is no list of messages."""
+        """Return the element type of a list of messages; None for other descriptions."""
         kind, what = description
         is_list = kind in (ARRAY, SEQUENCE) and what[0][0] == NAME
         return what[0] if is_list else None
 
 
 def misfit(text: str, store: Typestore, msgtype: str) -> str:
-    """Return in words which field of a map a type does not have, or of another kind; '' if the map fits."""
+    """Return an error text on the first unsuitable path of a map; '' if the map fits."""
     fields, whole = _Fields(store), (NAME, msgtype)
     for key, paths in field_map(text).items():
         within: Description | None = whole
@@ -223,7 +221,7 @@ def misfit(text: str, store: Typestore, msgtype: str) -> str:
 
 
 def _fits(fields: _Fields, key: str, found: Description, count: int) -> tuple[bool, str]:
-    """Return whether a field is of the kind that a key takes, and which kind that is."""
+    """Return whether a field's kind is allowed for a key, and the name of the allowed kind."""
     if key == "frame":
         return found == (BASE, ("string", 0)), "text"
     if key == "stamp":
@@ -246,7 +244,7 @@ def _listed(fields: _Fields, description: Description) -> str:
 
 
 def suggested(store: Typestore, msgtype: str) -> str:
-    """Return the map that reads what looks like a velocity in a type; '' if nothing does."""
+    """Return a map for the likely velocity in a type; '' if there is none."""
     fields = _Fields(store)
     below = dict(fields.walk((NAME, msgtype)))
     found = next(_velocities(fields, below), "")
@@ -259,7 +257,7 @@ def suggested(store: Typestore, msgtype: str) -> str:
 
 
 def _velocities(fields: _Fields, below: Mapping[str, Description]) -> Iterator[str]:
-    """Yield maps of what may be a velocity, the likeliest first."""
+    """Yield maps of possible velocities, the most likely first."""
     named = {path: each for path, each in below.items() if re.search(r"vel|linear|(^|_|\.)v[xyz]$", path, re.I)}
     yield from (f"velocity={path}" for path, each in named.items() if _is_three(fields, each))
     for path, each in named.items():

@@ -1,4 +1,4 @@
-"""Live ROS messages: fed to a calibrator one by one, and kept for one that begins anew."""
+"""Feeding of live ROS messages to a calibrator, and their storage for a restart."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ AnySample = TypeVar("AnySample", DvlSample, ReferenceSample, ImuSample)
 
 
 class MessageFeed:
-    """Feeds a calibrator, which counts, with the samples that messages are, or why they are none.
+    """Feeds a calibrator with decoded samples and refusals, which it counts.
 
-    decoder: what makes them samples; on_problem is told of its problems when they are new. kept: for `begin_again`.
-    Raises InputError for message types that are none.
+    decoder: the message decoder. on_problem: receives the text of its new problems. kept: messages for `begin_again`.
+    Raises InputError for unknown message types.
     """
 
     def __init__(self, calibrator: Calibrator, on_problem: Callable[[str], None] = lambda _: None) -> None:
@@ -46,7 +46,7 @@ class MessageFeed:
         self._fixes: list[tuple[int, Array, Array]] = []
 
     def begin_again(self, calibrator: Calibrator) -> None:
-        """Feed another calibrator from here on, and what is kept first."""
+        """Continue with another calibrator, which first receives the kept messages."""
         self.calibrator = calibrator
         self.decoder.parameters = calibrator.parameters
         streams = self.kept.streams
@@ -56,26 +56,26 @@ class MessageFeed:
             calibrator.feed(streams)
 
     def forget(self) -> None:
-        """Forget what came so far."""
+        """Forget the messages received so far."""
         self.decoder.forget()
         self.kept = KeptMessages()
         self._fixes.clear()
 
     def dvl(self, message: Any, received_ns: int) -> DvlSample | None:
-        """Feed a message of dvl_type; the sample as `Calibrator.feed_dvl` gives it back."""
-        sample = self._taken(Stream.DVL, self.decoder.dvl(message, received_ns))
+        """Feed a message of dvl_type. Return the sample as `Calibrator.feed_dvl` does."""
+        sample = self._sample_or_count(Stream.DVL, self.decoder.dvl(message, received_ns))
         return None if sample is None else self.calibrator.feed_dvl(sample)
 
     def reference(self, message: Any, received_ns: int) -> ReferenceSample | None:
-        """Feed a message of gnss_type with the reference velocity; the sample, or None if refused."""
-        sample = self._taken(Stream.REFERENCE, self.decoder.reference(message, received_ns))
+        """Feed a message of gnss_type with the reference velocity. Return the sample, or None if refused."""
+        sample = self._sample_or_count(Stream.REFERENCE, self.decoder.reference(message, received_ns))
         if sample is not None:
             self.calibrator.feed_reference(sample)
         return sample
 
     def imu(self, message: Any, received_ns: int) -> ImuSample | None:
-        """Feed a sensor_msgs/Imu; the sample, or None if refused."""
-        sample = self._taken(Stream.IMU, self.decoder.imu(message, received_ns))
+        """Feed a sensor_msgs/Imu. Return the sample, or None if refused."""
+        sample = self._sample_or_count(Stream.IMU, self.decoder.imu(message, received_ns))
         if sample is not None:
             self.calibrator.feed_imu(sample)
         return sample
@@ -87,8 +87,8 @@ class MessageFeed:
             self._fixes.clear()
         self.calibrator.feed_fix(stamp_ns, position, variance)
 
-    def _taken(self, stream: Stream, decoded: AnySample | Refusal) -> AnySample | None:
-        """A message's sample; None for one that is refused, which is counted."""
+    def _sample_or_count(self, stream: Stream, decoded: AnySample | Refusal) -> AnySample | None:
+        """Return a message's sample, or None after counting a refusal."""
         if isinstance(decoded, Refusal):
             self.kept.add(stream, decoded.reason)
             self.calibrator.refuse(stream.value, decoded.reason)
@@ -97,20 +97,20 @@ class MessageFeed:
         return decoded
 
     def undecodable(self, stream: str, reason: str) -> None:
-        """Count a message that could not be decoded at all."""
+        """Count a message that could not be decoded."""
         self.calibrator.refuse(stream, self.decoder.undecodable(Stream(stream), reason).reason)
 
 
-# Messages of all streams, of 140 bytes: an IMU at 100 Hz for a quarter of an hour.
+# largest number of kept messages, 140 bytes each: an IMU at 100 Hz for a quarter of an hour
 MOST = 100_000
 _NOT_GIVEN = (float("nan"),) * 4
 _CODES = {stream: code for code, stream in enumerate(Stream)}
 
 
 class KeptMessages(RowTable):
-    """All so far in the order in which they came, or none once they are more than `MOST`.
+    """All messages so far in order of arrival, or none after more than `MOST`.
 
-    The room for `MOST` is taken at once: a node's memory must not grow with what it hears.
+    The memory is allocated at the start, so that a node's memory does not grow with the messages received.
     """
 
     LAYOUT: ClassVar = {
@@ -132,12 +132,12 @@ class KeptMessages(RowTable):
 
     def __init__(self) -> None:
         super().__init__()
-        self.reserve(int(FULL * MOST))  # as nothing is given up at the start, all of the room is filled
+        self.reserve(int(FULL * MOST))  # no row is ever dropped, so the whole capacity of MOST rows is used
         self._reasons: list[str] = []
         self._is_kept = True
 
     def add(self, stream: Stream, decoded: Sample | str) -> None:
-        """Keep the sample that a message is, or why it is none."""
+        """Keep a message's sample, or the reason for its refusal."""
         if not self._is_kept:
             return
         if self.size == MOST:
@@ -164,19 +164,19 @@ class KeptMessages(RowTable):
             self.frames[at] = FRAME_CODES[decoded.frame]
 
     def forget(self) -> None:
-        """Keep nothing any more."""
+        """Stop keeping messages."""
         self._is_kept = False
         self.clear()
         self._move(0)
 
     @property
     def is_kept(self) -> bool:
-        """Whether all so far is kept."""
+        """Whether all messages so far are kept."""
         return self._is_kept
 
     @property
     def streams(self) -> Streams | None:
-        """What came; None where that is not kept any more."""
+        """All messages; None if they are no longer kept."""
         return Streams(*map(self._block, Stream)) if self._is_kept else None
 
     def _block(self, stream: Stream) -> SampleBlock:

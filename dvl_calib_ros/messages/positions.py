@@ -1,8 +1,8 @@
-"""Positions of satellites or of acoustics, as they are and as velocities over a window, in east, north, up.
+"""Positions of satellites or acoustics in east, north, up, and velocities over a window.
 
-A position's errors from one second to the next are far more alike than its covariance says, except of RTK, whose
-covariance is honest: so the noise here is never claimed too small. The velocity is that of the middle of the window,
-which in a turn at ω is short of the true one by (ω T)² / 24: 0.2 per cent at 12 degrees per second and a second.
+Errors of successive positions are far more correlated than their covariance suggests, except for RTK, whose covariance
+is realistic; so the claimed noise of velocities is never too small. The velocity belongs to the middle of the window.
+In a turn at ω it is too small by (ω T)² / 24: 0.2 per cent at 12 degrees per second and a window of one second.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from ..calibration.numerics.frames import Array, Vector
 
 # WGS 84: semi-major axis (m) and first eccentricity squared
 SEMI_MAJOR_M, ECCENTRICITY_SQUARED = 6_378_137.0, 6.694_379_990_141e-3
-# Two positions further apart than so many windows are on two sides of an outage.
+# two positions further apart than this number of windows are on two sides of an outage
 LONGEST_WINDOWS = 3.0
-# Positions that come more seldom (s), as of a USBL, are differenced from one to the next where they are looked at.
+# positions with a longer interval (s), such as a USBL's, are differenced between neighbours in previews
 SELDOM_S = 3.0
-# A receiver above so many fixes per window is thinned by the window alone.
+# a receiver with more fixes per window is thinned to the window's ends
 MOST_FIXES = 2000
 
 
@@ -38,11 +38,11 @@ Place = tuple[float, float, float]
 
 
 class PositionType(NamedTuple):
-    """How positions are read from messages of a type.
+    """How to read positions from messages of a type.
 
-    is_valid: message -> whether it has one. place: message -> three numbers. covariance: message -> of east, north, up,
-    9 numbers or 36 of a pose, m²; None where not given. between: two places -> from one to the other, m.
-    has_height: whether its vertical is as good as the rest.
+    is_valid: message -> whether it has a position. place: message -> three numbers. covariance: message -> of east,
+    north, up, 9 numbers or 36 of a pose, m²; None if not given. between: two places -> vector from one to the other, m.
+    has_height: whether the vertical is as accurate as the horizontal.
     """
 
     is_valid: Callable[[Any], bool]
@@ -59,9 +59,9 @@ class _Fix(NamedTuple):
 
 
 class FixDifference:
-    """Takes fixes in order of time and gives velocities.
+    """Differentiator of fixes in order of time.
 
-    window_s: over which positions are differenced. between: as of `PositionType`, by default of latitude, longitude
+    window_s: time between the differenced positions. between: as in `PositionType`, by default for latitude, longitude
     (degrees) and altitude (m).
     """
 
@@ -73,9 +73,9 @@ class FixDifference:
     def __call__(
         self, stamp_ns: int, x: float, y: float, z: float, covariance: Sequence[float] | Array | None
     ) -> FixedVelocity | None:
-        """The velocity of the window that ends with this fix; None while there is no position a window before it.
+        """Return the velocity of the window that ends with this fix; None until there is a position one window earlier.
 
-        x, y, z: its place. covariance: as of `PositionType`.
+        x, y, z: position. covariance: as in `PositionType`.
         """
         fix = _Fix(stamp_ns, (x, y, z), matrix_of(covariance))
         fixes = self._fixes
@@ -84,7 +84,7 @@ class FixDifference:
         if not math.isfinite(x + y + z):
             return None
         fixes.append(fix)
-        # the latest that is a window old, give or take half the interval of a jittery receiver
+        # find the latest fix one window old, with a tolerance of half the interval of a jittery receiver
         while len(fixes) > 2 and stamp_ns - fixes[1].stamp_ns >= 0.95 * self._window_ns:
             fixes.popleft()
         before = fixes[0]
@@ -105,7 +105,7 @@ class FixDifference:
 
 
 def matrix_of(covariance: Sequence[float] | Array | None) -> Array | None:
-    """(3, 3) m² of a covariance of 9 numbers, or of 36 of a pose; None for none."""
+    """Return (3, 3) m² from a covariance of 9 numbers or a pose's of 36; None for None."""
     if covariance is None:
         return None
     given = np.asarray(covariance, dtype=float)
@@ -113,7 +113,7 @@ def matrix_of(covariance: Sequence[float] | Array | None) -> Array | None:
 
 
 def east_north_up(start: Place, end: Place) -> Vector:
-    """From one position to another nearby, m, on the ellipsoid's tangent plane between them."""
+    """Return the vector from one position to another nearby, m, on the tangent plane of the ellipsoid between them."""
     (start_deg, start_longitude_deg, start_m), (end_deg, end_longitude_deg, end_m) = start, end
     latitude = math.radians(0.5 * (start_deg + end_deg))
     height = 0.5 * (start_m + end_m)
@@ -129,7 +129,7 @@ def east_north_up(start: Place, end: Place) -> Vector:
 
 
 def straight(start: Place, end: Place) -> Vector:
-    """From one place of a plane map to another, m."""
+    """Return the vector between two points of a plane map, m."""
     return end[0] - start[0], end[1] - start[1], end[2] - start[2]
 
 

@@ -1,9 +1,7 @@
-"""Types recognised by their fields, whatever their package is called.
+"""Recognition of message types by their fields, for any package name.
 
-Forks and ports of a driver send its messages under packages of their own: waterlinked_a50_ros_driver and dvl_a50_msgs
-are dvl_msgs in all but the name, stonefish_msgs and dave_interfaces are as uuv_sensor_ros_plugins_msgs.
-
-Recordings opened with all that is known of message types.
+Forks and ports of a driver send its messages under their own package names: waterlinked_a50_ros_driver and dvl_a50_msgs
+equal dvl_msgs, stonefish_msgs and dave_interfaces equal uuv_sensor_ros_plugins_msgs.
 """
 
 from __future__ import annotations
@@ -12,7 +10,7 @@ from collections.abc import Collection
 
 from .drivers import VELOCITY_TYPES, VelocityType, add_type
 
-# fields that tell a DVL's message, the most telling first -> the type that is read alike
+# characteristic fields of a DVL's message, the most specific first -> the known type with the same layout
 _ALIKE: tuple[tuple[frozenset[str], str], ...] = (
     (
         frozenset({"header", "velocity", "velocity_valid", "fom", "altitude", "beams"}),
@@ -37,9 +35,9 @@ _ALIKE: tuple[tuple[frozenset[str], str], ...] = (
 
 
 def recognised(name: str, fields: Collection[str]) -> VelocityType | None:
-    """The type of this name: as it is known, else by its fields; None if they are not a DVL's.
+    """Return the type of this name if known, else by its fields; None if they are not a DVL's.
 
-    One that is recognised is known from then on by its name as well.
+    A recognised type is then also known by its name.
     """
     known = VELOCITY_TYPES.get(name)
     if known is not None:

@@ -1,4 +1,4 @@
-"""What messages say of the water: thermometers, salinity, pressure, and the speed of sound that a DVL used."""
+"""Water properties in messages: temperature, salinity, pressure, and the speed of sound that a DVL used."""
 
 from __future__ import annotations
 
@@ -16,20 +16,23 @@ from ..calibration.numerics.frames import Array
 
 _FLOATS = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
 _PHASED_ARRAY = 1
-# Words in the name of a thermometer's topic that is in the water, and of one that is not.
+# words in topic names of thermometers in the water, and of others
 _IN_WATER = {"water", "sea", "ctd", "dvl", "ocean", "outside", "external"}
 _NOT_IN_WATER = {
     "imu", "air", "cpu", "gpu", "board", "battery", "motor", "esc", "internal", "inside", "hull", "housing",
 }  # fmt: skip
-# Thermometers in the water that differ by more (°C) are not all in the water.
+# thermometers that differ by more (°C) are not all in the water
 _AGREE = 1.0
-# Speeds of sound in water, m/s; a DVL whose own moves by more than a share is not set to one.
+# range of the speed of sound in water, m/s; a DVL whose value varies by more than this share has no fixed setting
 _SPEEDS, _STEADY = (1350.0, 1650.0), 0.001
 _SURFACE_PA, _PA_PER_M = 101_325.0, 1025.0 * 9.81
 
 
 class OfWater(NamedTuple):
-    """Of one topic. kind: temperature, salinity, pressure or used. values: (N,) °C, PSU, Pa or m/s. std: of each."""
+    """Readings of one topic.
+
+    kind: temperature, salinity, pressure or used. values: (N,) °C, PSU, Pa or m/s. std: of each.
+    """
 
     topic: str
     kind: str
@@ -39,7 +42,7 @@ class OfWater(NamedTuple):
 
 def _used(field: str) -> Callable[[Any], float]:
     def read(message: Any) -> float:
-        # the velocities of a phased array along its face do not go by the speed of sound
+        # the horizontal velocities of a phased array do not depend on the speed of sound
         is_phased = getattr(message, "dvl_type", 0) == _PHASED_ARRAY
         return math.nan if is_phased else float(getattr(message, field))
 
@@ -56,7 +59,7 @@ _OF_TYPES: Mapping[str, Mapping[str, Callable[[Any], float]]] = {
 
 
 def readers(topic: str, msgtype: str) -> Mapping[str, Callable[[Any], float]]:
-    """What is read of a topic's messages, by kind; nothing of most. A plain number tells by its topic's name."""
+    """Return the readers of a topic's water properties, by kind; a plain number is recognised by the topic's name."""
     if msgtype not in _FLOATS:
         return _OF_TYPES.get(msgtype, {})
     *places, name = topic.lower().split("/")
@@ -66,7 +69,7 @@ def readers(topic: str, msgtype: str) -> Mapping[str, Callable[[Any], float]]:
 
 
 class WaterCollector:
-    """Collects one topic's readings, the last of them if there are more than so many."""
+    """Collector of one topic's last `most` readings."""
 
     def __init__(self, topic: str, msgtype: str, most: int | None = None) -> None:
         self._topic, self._readers = topic, readers(topic, msgtype)
@@ -80,17 +83,17 @@ class WaterCollector:
         self._variance = max(self._variance, float(getattr(message, "variance", 0.0)))
 
     def readings(self) -> list[OfWater]:
-        """Of each kind, where there is one that is a number."""
+        """Return the readings of each kind with a finite number."""
         std = math.sqrt(self._variance) if math.isfinite(self._variance) else 0.0
         found = {kind: np.array(values)[np.isfinite(values)] for kind, values in self._values.items()}
         return [OfWater(self._topic, kind, values, std) for kind, values in found.items() if len(values)]
 
 
 def water_of(readings: Sequence[OfWater], dvl: str) -> Water | None:
-    """What is known of the water, with the speed of sound that the DVL of topic `dvl` used; None if nothing is.
+    """Return the known water properties, with the speed of sound used by the DVL of topic `dvl`; None if none.
 
-    A thermometer counts whose topic says that it is in the water, or that is the only one and does not say where else.
-    Nothing is said where several contradict each other.
+    A thermometer counts if its topic's name indicates water, or if it is the only one and its name indicates no other
+    place. Contradicting readings are ignored.
     """
     by_kind: dict[str, list[OfWater]] = {}
     for reading in readings:
@@ -101,7 +104,7 @@ def water_of(readings: Sequence[OfWater], dvl: str) -> Water | None:
         low, middle, high = np.percentile(wet.values, (5.0, 50.0, 95.0)).tolist()
         known |= {"temperature": middle, "source": wet.topic}
         known["temperature_error"] = max(THERMOMETER, 2.0 * wet.std) + 0.5 * (high - low)
-    salinity = _middle([each for each in by_kind.get("salinity", []) if each.values.any()])  # 0 all along: not filled
+    salinity = _middle([each for each in by_kind.get("salinity", []) if each.values.any()])  # 0 throughout: not filled
     if SALINITIES[0] <= salinity <= SALINITIES[1] + 5.0:
         known["salinity"] = salinity
     pressure = _middle(by_kind.get("pressure", []))
@@ -115,7 +118,7 @@ def water_of(readings: Sequence[OfWater], dvl: str) -> Water | None:
 
 
 def _middle(readings: Sequence[OfWater]) -> float:
-    """The median where one topic tells, else nan."""
+    """Return the median if exactly one topic has readings, else nan."""
     return float(np.median(readings[0].values)) if len(readings) == 1 else math.nan
 
 

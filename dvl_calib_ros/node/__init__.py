@@ -1,1 +1,1 @@
-"""The ROS 2 node: callbacks convert and feed, nothing else."""
+"""The ROS 2 node. Its callbacks only convert messages and feed the calibrator."""

@@ -68,17 +68,17 @@ from .topic_graph import input_problems, output_problems, twin_problems
 from .transforms import MountingOutput, Transforms
 from .water_topics import WaterHeard
 
-# Samples that wait in the middleware while Python is busy: 5 s at 1 kHz.
+# messages that wait in the middleware while Python is busy: 5 s at 1 kHz
 QUEUE = 5000
-# The selected model is updated as its samples come, because its estimate is published; the others when they are asked
-# for, or when so many samples have come together.
+# The selected model is updated with every sample, because its estimate is published. The others are updated in blocks
+# of this number of samples, or when their estimate is requested.
 BLOCK_SIZE = 512
 
 
 class CalibrationNode(AnsweringNode):
-    """See interfaces.md, "The node". Raises ParameterError or InputError for a configuration that cannot run.
+    """The calibration node; docs/operate.md lists its topics, services and parameters.
 
-    parameter_files: those that the node was started with.
+    Raises ParameterError or InputError for a configuration that cannot run. parameter_files: files of the node's start.
     """
 
     def __init__(self, parameter_files: Sequence[Path] = (), **node_options: Any) -> None:
@@ -99,13 +99,13 @@ class CalibrationNode(AnsweringNode):
         self._worker = ThreadPoolExecutor(1, "g2")
         self._initial = initial
         self._begin(parameters, initial)
-        # a saved calibration is one of the mounting that it was saved with
+        # a saved calibration belongs to the mounting that it was saved with
         self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
         self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
         self._given = not_default(parameters)
-        self._heading_is_open = "heading_deviation_std" not in self._given
+        self._awaits_heading_std = "heading_deviation_std" not in self._given
         self._late_clocks, self._gravity = LateClocks(named), GravitySeen()
-        # what every DVL message asks for; none of it changes at run time
+        # used for every DVL message, and constant at run time
         self._unaided_noise = np.eye(3) * parameters.gnss_free_std**2
         self._correction: Correction | None = None
         self._corrected_by = ""
@@ -135,7 +135,7 @@ class CalibrationNode(AnsweringNode):
             "gnss/twist": lambda message, received_ns: self._feed.reference(message, received_ns),
             "imu/data": self._feed_imu,
         }
-        # by the node's own name of an input, that of the topic where it was found
+        # the node's own name of an input -> the discovered topic
         self._found_names: dict[str, str] = {}
         self._found: list[Reason] = []
         self._subscribe(dvl_class, "dvl/twist")
@@ -154,12 +154,12 @@ class CalibrationNode(AnsweringNode):
         self.create_service(Trigger, "~/save_anyway", partial(self._on_save, save=save_result))
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
-        # steady: diagnostics go on while simulated time stands still or jumps
+        # steady: diagnostics continue while simulated time stands still or jumps
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._log_configuration()
 
     def _to_discover(self, parameters: Parameters, topics: Mapping[str, str]) -> Discovering | None:
-        """What looks for topics that were not remapped; None where the DVL's was, or nothing is to be looked for."""
+        """Return the search for topics, or None if the DVL's topic was remapped or discovery is off."""
         roles = {"dvl": "dvl/twist", "gnss": "gnss/twist", "imu": "imu/data"}
         space = self.get_namespace().rstrip("/")
         named = {role: None if topics[own] == f"{space}/{own}" else topics[own] for role, own in roles.items()}
@@ -169,7 +169,7 @@ class CalibrationNode(AnsweringNode):
         return Discovering(self, named, parameters, given, self._worker)
 
     def _discover(self) -> None:
-        """Look for topics while nobody publishes the DVL's, and keep to what is found."""
+        """Search for topics while the DVL's has no publisher, and subscribe to the topics found."""
         searching = self._discovering
         if searching is None:
             return
@@ -179,7 +179,7 @@ class CalibrationNode(AnsweringNode):
         try:
             found = searching.step()
         except InputError as error:
-            self._warn(f"{error}; topics are not looked for")
+            self._warn(f"{error}; topics are not searched")
             searching.close()
             self._discovering = None
             return
@@ -208,7 +208,7 @@ class CalibrationNode(AnsweringNode):
             self.destroy_subscription(old)
         self._begin(parameters, self._initial)
         self._adapted = self._feed.decoder.adapted
-        self._heading_is_open = self._heading_is_open and "heading_deviation_std" not in discovery.values
+        self._awaits_heading_std = self._awaits_heading_std and "heading_deviation_std" not in discovery.values
         now_s = self._pauses.running_s(steady_s())
         heard = {own: subscription.topic_name for own, subscription in self._inputs.items()}
         self._silence, self._recent, self._card = Silence(now_s, heard), RecentCounts(), Card(now_s)
@@ -217,7 +217,7 @@ class CalibrationNode(AnsweringNode):
     def _begin(
         self, parameters: Parameters, initial: Mapping[str, GaussianState] | None, feed: MessageFeed | None = None
     ) -> None:
-        """Calibrate with these parameters from here on. feed: whose messages so far are fed again."""
+        """Start a calibration with these parameters. feed: its earlier messages are fed again."""
         self._calibrator = Calibrator(
             parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn, worker=self._worker
         )
@@ -225,10 +225,10 @@ class CalibrationNode(AnsweringNode):
         self._feed.begin_again(self._calibrator)
         self._lever_arm: Sequence[float] | None = parameters.lever_arm if any(parameters.lever_arm) else None
 
-    def _place(self, message: Any) -> None:
-        """Begin anew with mounting, lever arm and orientation of the IMU from transforms, when they come or change.
+    def _update_mounting(self, message: Any) -> None:
+        """Restart the calibration if new transforms change the mounting, lever arm or orientation of the IMU.
 
-        message: the DVL's that is to be fed next.
+        message: the DVL message that is fed next.
         """
         if self._transforms is None or not self._transforms.heard:
             return
@@ -246,23 +246,23 @@ class CalibrationNode(AnsweringNode):
         if found is None or parameters.replace(**found.values) == parameters:
             return
         place = {name: value for name, value in found.values.items() if name in ("dvl_position", "reference_position")}
-        if parameters.replace(**found.values) == parameters.replace(**place):  # which nothing was learnt with
+        if parameters.replace(**found.values) == parameters.replace(**place):  # nothing was estimated with these values
             self._calibrator.set_parameters(parameters.replace(**place))
             return
         self.get_logger().info(
             f"{printable(found.said)}; the calibration begins with it (use_transforms: false does without)"
         )
-        self._begin_anew(parameters.replace(**found.values))
+        self._restart(parameters.replace(**found.values))
 
-    def _begin_anew(self, parameters: Parameters, feed: MessageFeed | None = None) -> None:
-        """As `_begin`, with nothing of what has been published."""
+    def _restart(self, parameters: Parameters, feed: MessageFeed | None = None) -> None:
+        """Restart as `_begin`, without the previous initial calibration and published values."""
         self._begin(parameters, None, feed)
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         self._recent, self._correction = RecentCounts(), None
         self._mounting_published = self._iac_published = ("", 0)
 
     def _publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Any:
-        # every event callback is one more thing that the executor looks at for every message
+        # every event callback is one more entity that the executor checks for every message
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
@@ -280,10 +280,10 @@ class CalibrationNode(AnsweringNode):
     def _subscribe(
         self, message_type: type, topic: str, reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE
     ) -> None:
-        """Subscribe so that both kinds of publisher are heard.
+        """Subscribe reliably, and change to best effort if a best-effort publisher appears.
 
-        A reliable subscription loses nothing but does not hear a best-effort publisher. When such a one turns up, the
-        subscription is made anew as best effort, which hears both.
+        A reliable subscription loses nothing but receives nothing from a best-effort publisher; best effort receives
+        from both.
         """
 
         def on_incompatible(event: Any) -> None:
@@ -294,7 +294,7 @@ class CalibrationNode(AnsweringNode):
 
         def resubscribe() -> None:
             old = self._inputs[topic]
-            self.deliver()  # what waits in the old one would be lost
+            self.deliver()  # messages waiting in the old subscription would be lost
             self._subscribe(message_type, topic, ReliabilityPolicy.BEST_EFFORT)
             self.destroy_subscription(old)
 
@@ -312,16 +312,16 @@ class CalibrationNode(AnsweringNode):
 
     @property
     def inputs(self) -> Sequence[Subscription]:
-        """Subscriptions that the sensors' messages come by."""
+        """Subscriptions to the sensors' messages."""
         return list(self._inputs.values())
 
     def deliver(self, ready: Collection[Subscription] | None = None) -> None:
-        """Feed all messages that wait. ready: in which alone some do, if that is known."""
+        """Feed all waiting messages. ready: the only subscriptions with waiting messages, if known."""
         inputs = self._inputs.items()
         self._deliver({}, None if ready is None else [topic for topic, each in inputs if each in ready])
 
     def _deliver(self, taken: Mapping[str, Arrived], ready: Collection[str] | None = None) -> None:
-        """Feed messages that were taken, by topic, and all that wait."""
+        """Feed the messages taken, by topic, and all waiting ones."""
         for topic, message in in_order_of_arrival(self._inputs, take, taken, ready=ready):
             if (adapted := self._adapted.get(topic)) is not None:
                 message = adapted(message)
@@ -329,31 +329,31 @@ class CalibrationNode(AnsweringNode):
             self._publish_if_updated()
 
     def _received_ns(self, message: Any) -> int:
-        """Time of reception, asked of the clock only for a message whose stamp is missing or not believed."""
+        """Return the time of reception if the message's stamp is not used, else 0, without a clock call."""
         stamp = message.header.stamp
         believed = self._calibrator.parameters.restamp != RESTAMP_ALL
         return 0 if believed and (stamp.sec or stamp.nanosec) else self.get_clock().now().nanoseconds
 
     def _feed_dvl(self, message: Any, received_ns: int) -> None:
-        self._place(message)
-        self._take_off_late_clocks()
+        self._update_mounting(message)
+        self._subtract_clock_offsets()
         self._newest_dvl = message
         sample = self._feed.dvl(message, received_ns)
         if sample is not None:
             self._publish_corrected(sample)
 
     def _feed_imu(self, message: Any, received_ns: int) -> None:
-        if self._heading_is_open:
-            self._believe_heading(message)
+        if self._awaits_heading_std:
+            self._use_claimed_heading_std(message)
         self._gravity.add(message)
         self._feed.imu(message, received_ns)
 
-    def _believe_heading(self, message: Any) -> None:
-        """Begin with what the first message of the IMU that claims anything claims of its heading, as a replay does."""
+    def _use_claimed_heading_std(self, message: Any) -> None:
+        """Restart with the heading accuracy in the first IMU message that states one, as a replay does."""
         claimed = math.sqrt(heading_variance(message.orientation_covariance))
         if math.isnan(claimed):
             return
-        self._heading_is_open = False
+        self._awaits_heading_std = False
         std = believed_heading(claimed)
         if std is not None:
             self._begin(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial, self._feed)
@@ -375,7 +375,7 @@ class CalibrationNode(AnsweringNode):
         self._estimate_publisher.publish(self._estimate)
 
     def _publish_iac(self) -> None:
-        """Once a second at most, what the paper's own selection says, with the covariance of its filter."""
+        """Publish the paper's own selection with its filter covariance, at most once a second."""
         calibrator = self._calibrator
         name = calibrator.selection.iac_model(calibrator.parameters)
         state_of = (name, calibrator.n_given(name))
@@ -386,7 +386,7 @@ class CalibrationNode(AnsweringNode):
             self._iac_publisher.publish(message)
 
     def _set_correction(self, model: Model, state: GaussianState) -> Correction:
-        """Correct by this state from now on; its correction."""
+        """Set and return the correction for the following samples."""
         parameters = self._calibrator.parameters
         self._correction = Correction(model, state, parameters.rotation_dvl_from_body)
         self._corrected_by = model.name
@@ -414,13 +414,14 @@ class CalibrationNode(AnsweringNode):
         self._corrected_publisher.publish(message)
 
     def _publish_mounting(self) -> None:
-        """Once a second at most: who wants every sample's has ~/estimate."""
+        """Publish the mounting, at most once a second; ~/estimate has every sample."""
         calibrator = self._calibrator
         model = MODELS[calibrator.selected]
         state_of = (model.name, calibrator.n_given(model.name))
         if state_of == self._mounting_published or calibrator.last_ns is None:
             return
-        # of a wrong configuration none, for somebody would take it; messages wait meanwhile, so no look at all there is
+        # A subscriber would use the mounting of a wrong configuration. Waiting messages are not examined, so check
+        # every time.
         if calibrator.suggestion_so_far or any(each.severity is Severity.REJECT for each in calibrator.doubts_so_far):
             return
         self._mounting_published = state_of
@@ -430,13 +431,13 @@ class CalibrationNode(AnsweringNode):
         pose = mounting_pose(model, calibrator.next_recording(model.name), parameters, decoder.turns_dvl)
         self._mounting.publish(pose, stamp, parameters.base_frame, decoder.dvl_frame or "dvl_link", self._transforms)
 
-    def _take_off_late_clocks(self) -> None:
+    def _subtract_clock_offsets(self) -> None:
         calibrator = self._calibrator
         parameters = self._late_clocks.parameters(calibrator.registration_so_far, calibrator.parameters)
         if parameters is not None:
             self._warn(" ".join(map(str, self._late_clocks.found)))
-            self._begin_anew(parameters, self._feed)
-        if self._late_clocks.stand and not self._heading_is_open:
+            self._restart(parameters, self._feed)
+        if self._late_clocks.stand and not self._awaits_heading_std:
             self._feed.kept.forget()
 
     def _publish_diagnostics(self) -> None:
@@ -552,9 +553,9 @@ class CalibrationNode(AnsweringNode):
     # ------------------------------------------------------------------ end
 
     def finish(self) -> bool:
-        """Save the result if a file is named for it; print it if it cannot be saved, so that it is not lost.
+        """Save the result if a file is configured; print it if that fails, so that it is not lost.
 
-        Returns whether the file holds all that there is to save.
+        Returns whether the file has the complete result.
         """
         path = self._calibrator.parameters.result_file
         if not path:
@@ -572,7 +573,7 @@ class CalibrationNode(AnsweringNode):
         return True
 
     def destroy_node(self) -> None:
-        """Leave ROS, and end what solves the full model's blocks."""
+        """Leave ROS, and stop the thread that solves the full model's blocks."""
         if self._discovering is not None:
             self._discovering.close()
         self._worker.shutdown(cancel_futures=True)
@@ -580,7 +581,7 @@ class CalibrationNode(AnsweringNode):
 
 
 def _check_distinct(topics: Mapping[str, str]) -> None:
-    """Raise InputError where two of our topics were remapped to one: a DVL agrees with itself at any mounting."""
+    """Raise InputError if two of our topics were remapped to one: a DVL agrees with itself at any mounting."""
     for first, second in combinations(topics, 2):
         if topics[first] == topics[second]:
             raise InputError(f"{first} and {second} are both {topics[first]}; remap each to its own sensor's topic")

@@ -1,4 +1,4 @@
-"""What /diagnostics says: one status of the running calibration."""
+"""Content of /diagnostics: one status of the running calibration."""
 
 from __future__ import annotations
 
@@ -32,39 +32,39 @@ from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding, of_consequence
 from .operator_card import Card
 
-# A stream that has brought nothing usable for so long is silent, s.
+# A stream without a usable sample for this time is silent, s.
 SILENCE_S = 5.0
-# Counts are warned of while they have grown within this, s: what is over is only counted.
+# Counts that grew within this time give a warning, s; older ones are only counted.
 RECENT_S = 60.0
 _PIECES = 6
 
 Counts = Mapping[str, Mapping[str, int]]
 _NOT_TAKEN = {"invalid", "duplicate", "out_of_order", "stray", "held", "before_restart"}
 _NAMED = {Stream.DVL: "DVL", Stream.REFERENCE: "GNSS", Stream.IMU: "IMU"}
-# Finding and topic, if that is not remapped, of a stream that has gone silent
+# stream -> code of the finding when it is silent, and default topic
 _SILENT = {
     "dvl": ("DVL_SILENT", "dvl/twist"),
     "reference": ("GNSS_OUTAGE", "gnss/twist"),
     "imu": ("IMU_SILENT", "imu/data"),
 }
-# A reference is out after so many of its mean intervals: positions may come every ten seconds.
+# A reference has an outage after this number of its mean intervals: positions may come every ten seconds.
 OUTAGE_INTERVALS = 5.0
 
 
 class RecentCounts:
-    """How much counters have grown within the last `RECENT_S`."""
+    """Growth of counters within the last `RECENT_S`."""
 
     def __init__(self) -> None:
         self._past: deque[tuple[float, Counts]] = deque(maxlen=_PIECES)
 
     def grown(self, counts: Counts, now_s: float) -> dict[str, dict[str, int]]:
-        """The same names with the increase. now_s: a clock that does not go back."""
+        """Return the counters' growth. now_s: monotonic time."""
         if not self._past or now_s - self._past[-1][0] >= RECENT_S / _PIECES:
             self._past.append((now_s, counts))
         before = self._past[0][1] if len(self._past) == _PIECES else {}
         return {
             group: {
-                # one that is smaller than before has begun anew
+                # a counter below its previous value was reset
                 name: count - then if (then := before.get(group, {}).get(name, 0)) <= count else count
                 for name, count in tally.items()
             }
@@ -73,7 +73,7 @@ class RecentCounts:
 
 
 class _Taken(NamedTuple):
-    """How many samples of a stream have been taken, since when it is that many (s), and when the first came."""
+    """Number of samples taken of a stream, time of its last change (s), and of the first sample (s)."""
 
     taken: int
     since_s: float
@@ -81,16 +81,16 @@ class _Taken(NamedTuple):
 
     @property
     def outage_from_s(self) -> float:
-        """How long nothing may come of a reference until that is an outage: one sample tells no interval."""
+        """Silence after which a reference has an outage, s. A single sample has no interval."""
         mean_s = (self.since_s - self.first_s) / (self.taken - 1) if self.taken > 1 else self.taken * RECENT_S
         return max(SILENCE_S, OUTAGE_INTERVALS * mean_s)
 
 
 class Silence:
-    """Finds streams that bring nothing usable any more, and those that live in another time than the DVL.
+    """Detector of silent streams, and of streams whose clock differs from the DVL's.
 
-    Looked at once in a while, so that it costs nothing per message. now_s: a clock that does not go back. topics: what
-    the node's topics are called since they were remapped.
+    It is called periodically, so it costs nothing per message. now_s: monotonic time. topics: the node's topic names
+    after remapping.
     """
 
     def __init__(self, now_s: float, topics: Mapping[str, str]) -> None:
@@ -99,7 +99,7 @@ class Silence:
         self._seen: dict[str, _Taken] = {}
 
     def faults(self, calibrator: Calibrator, counts: Counts, now_s: float) -> dict[str, Reason]:
-        """Stream -> what is wrong. counts: the calibrator's, as of now."""
+        """Return the fault of each faulty stream. counts: the calibrator's current ones."""
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
             lost = _NOT_TAKEN | calibrator.refused_as[stream]
@@ -120,16 +120,16 @@ class Silence:
                     code = "GNSS_OUTAGE_WITHOUT"
                 faults[stream] = finding(code, seconds=silent_s[stream], topic=topic, model=model.name)
         coming = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
-        return faults | _other_times(newest_ns, coming, calibrator.parameters)
+        return faults | _clock_faults(newest_ns, coming, calibrator.parameters)
 
 
-def _other_times(newest_ns: Mapping[str, int | None], coming: set[str], parameters: Parameters) -> dict[str, Reason]:
-    """Of the streams that come, those whose stamps are far from the others'."""
+def _clock_faults(newest_ns: Mapping[str, int | None], coming: set[str], parameters: Parameters) -> dict[str, Reason]:
+    """Return the streams that receive samples with stamps far from the others'."""
     known = {stream: ns for stream, ns in newest_ns.items() if stream in coming and ns is not None}
     dvl_ns = known.get("dvl")
     if dvl_ns is None:
         return {}
-    # the newest of one that comes may have come a while ago
+    # the newest sample of a live stream may be some time old
     ahead = {Stream.DVL: 0.0} | {Stream(stream): 1e-9 * (ns - dvl_ns) for stream, ns in known.items()}
     return {
         each.stream.value: finding(
@@ -154,14 +154,14 @@ def diagnose(
     card: Card | None = None,
     water: Water | None = None,
 ) -> DiagnosticStatus:
-    """Status of the running calibration, still without a name.
+    """Return the status of the running calibration, still without a name.
 
-    dvl_type: of the DVL's messages. problems: what else is known to be wrong. now_s: steady clock. pauses_s: how long
-    this process did not run, of late. card: what an operator has to know beside. water: what is known of it.
+    dvl_type: type of the DVL's messages. problems: further problems. now_s: steady clock. pauses_s: recent pauses of
+    this process. card: further values for the operator. water: water properties, if known.
     """
     estimate, counts, selection = calibrator.estimate(), calibrator.counts, calibrator.selection
     grown = recent.grown(counts, now_s)
-    # what came meanwhile is lost here, whether or not the DVL sent it
+    # messages sent during a pause are lost here, so they are no dropouts of the DVL
     grown["dvl"]["dropouts"] -= min(grown["dvl"]["dropouts"], len(pauses_s))
     found = [finding("PROCESS_PAUSED", seconds=sum(pauses_s))] if pauses_s else []
     found += [*silence.faults(calibrator, counts, now_s).values(), *problems, *_restart_advice(grown)]
@@ -173,7 +173,7 @@ def diagnose(
     doubts = calibrator.doubts_so_far
     rejected = bool(says) or any(each.severity is Severity.REJECT for each in doubts)
     verdict = Severity.REJECT if rejected else calibrator.verdict_so_far
-    # what a replay rejects is an error here
+    # a reason to reject in a replay is an error here
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]
     if verdict is Severity.ACCEPT:
         found = of_consequence(found, calibrator.parameters.target_drift)
@@ -190,7 +190,7 @@ def diagnose(
         "verdict": verdict.value,
         "usable": "no" if verdict is Severity.REJECT or estimate.convergence is Convergence.COLLECTING else "yes",
         **_estimate_values(estimate),
-        **_beside_the_pose(estimate, calibrator.parameters),
+        **_scale_and_delay_values(estimate, calibrator.parameters),
         **_count_values(calibrator, estimate, counts),
         "dvl longest dropout [s]": f"{1e-9 * calibrator.longest_dropout_ns:.1f}",
         **_cause_values(cause_of_scale(MODELS[estimate.model], estimate.of_recording, calibrator.parameters, water)),
@@ -237,14 +237,14 @@ def _estimate_values(estimate: Estimate) -> dict[str, str]:
     low, high = estimate.nis_bounds
     rows = model.n_measurement
     values["mean NIS"] = f"{estimate.mean_nis:.3f} of {rows} (99 %: {low:.3f} .. {high:.3f})"
-    # the same once more as bare numbers, 1 where noise is what it is taken for: plotters read no words
+    # as bare numbers for plotters; 1 if the noise is as assumed
     values["NIS ratio"] = f"{estimate.mean_nis / rows:.4f}"
     values["NIS ratio low"], values["NIS ratio high"] = f"{low / rows:.4f}", f"{high / rows:.4f}"
     return values
 
 
-def _beside_the_pose(estimate: Estimate, parameters: Parameters) -> dict[str, str]:
-    """What ~/mounting cannot hold, whichever model runs; keys of its states begin with std, so these do not."""
+def _scale_and_delay_values(estimate: Estimate, parameters: Parameters) -> dict[str, str]:
+    """Return scale and delay, which ~/mounting cannot hold. Keys of states begin with std, so these do not."""
     state = GaussianState(estimate.state, estimate.covariance)
     beside = scale_and_delay(MODELS[estimate.model], state, parameters)
     values = {"scale error ahead [%]": 100.0 * beside.scale, "dvl_time_offset [s]": beside.time_offset}
@@ -268,7 +268,7 @@ def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
 
 def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) -> dict[str, str]:
     values, model = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}, MODELS[estimate.model]
-    if not model.from_positions:  # which are no samples of the DVL
+    if not model.from_positions:  # these models use positions instead of DVL samples
         where = whereabouts(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
         values |= {f"samples {name}": str(count) for name, count in where.items()}
     for stream, tally in counts.items():

@@ -1,9 +1,9 @@
-"""The executor that the node's program runs in: sensors' messages go to the node by a short way.
+"""Executor of the node's program, with a fast path for sensor messages.
 
-An rclpy executor builds a wait set in Python, entity by entity, twice for every callback, and makes a task of each;
-that is two thirds of the CPU of a subscriber at 50 Hz. Here what is waited for is gathered once, and when only sensors'
-messages have come, the node takes them itself, as it does anyway (`inbox`). All else, services, parameters, timers,
-events of the middleware, is left to rclpy, in its own order, as soon as any of it is there.
+An rclpy executor rebuilds its wait set in Python twice for every callback, entity by entity, and makes a task of each
+callback. This takes two thirds of a subscriber's CPU time at 50 Hz. Here the wait set is collected once, and if only
+sensor messages arrive, the node takes them itself. Services, parameters, timers and events of the middleware are left
+to rclpy in its own order, as soon as one is ready.
 """
 
 from __future__ import annotations
@@ -19,19 +19,20 @@ from rclpy.subscription import Subscription
 if TYPE_CHECKING:
     from .calibration_node import CalibrationNode
 
-# of rclpy.waitable.NumberOfEntities, in the order in which a wait set is told
+# attributes of rclpy.waitable.NumberOfEntities, in the order of a wait set's arguments
 _COUNTS = ("num_subscriptions", "num_guard_conditions", "num_timers", "num_clients", "num_services", "num_events")
 
 
 class _Waiting:
-    """A wait set, and what belongs into it: the node's entities as they are now, and a guard condition."""
+    """Wait set with the node's current entities and a guard condition."""
 
     def __init__(self, node: CalibrationNode, woken: GuardCondition) -> None:
         self.inputs = list(node.inputs)
         others = [
             each
             for each in node.subscriptions
-            if each not in self.inputs and each.callback_group.can_execute(each)  # what is asked for now and then waits
+            # subscriptions that no executor serves are polled elsewhere
+            if each not in self.inputs and each.callback_group.can_execute(each)
         ]
         self.guards, self.waitables = list(node.guards), list(node.waitables)
         kinds: list[tuple[str, list[Any]]] = [
@@ -47,9 +48,9 @@ class _Waiting:
         self._add = [(getattr(self._wait_set, f"add_{kind}"), each.handle) for kind, all_ in kinds for each in all_]
 
     def wait(self, timeout_ns: int) -> tuple[list[Subscription], bool]:
-        """Wait (-1: for ever); by which subscriptions sensors' messages have come, and whether anything else has."""
+        """Wait (-1: for ever). Return the inputs with messages, and whether anything else is ready."""
         wait_set = self._wait_set
-        wait_set.clear_entities()  # what was not ready has left it with the last waiting
+        wait_set.clear_entities()  # waiting removes the entities that were not ready
         for add, handle in self._add:
             add(handle)
         for waitable in self.waitables:
@@ -60,51 +61,51 @@ class _Waiting:
         others = others or any(wait_set.get_ready_entities(kind) for kind in ("timer", "client", "service"))
         if ready := wait_set.get_ready_entities("guard_condition"):
             others = True
-            for guard in self.guards:  # waiting has taken what rclpy is to be told as well
+            for guard in self.guards:  # waiting has consumed the trigger that rclpy must see, too
                 if guard.handle.pointer in ready:
                     guard.trigger()
         return inputs, others or any(each.is_ready(wait_set) for each in self.waitables)
 
 
 class ReceivingExecutor(SingleThreadedExecutor):
-    """Runs one node."""
+    """Executor for one node."""
 
     def __init__(self, node: CalibrationNode) -> None:
         super().__init__(context=node.context)
-        # rclpy's own is not for others to wait for
+        # rclpy does not share its own guard condition
         self._woken = GuardCondition(None, None, context=node.context)
         self._node = node
-        self._unfinished: deque[Any] = deque()  # other threads add to it
+        self._unfinished: deque[Any] = deque()  # other threads append
         self._waiting: _Waiting | None = None
         self._once_more = False
         self.add_node(node)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
-        """As rclpy's; from any thread."""
+        """Create a task as rclpy; from any thread."""
         task = super().create_task(callback, *args, **kwargs)
         self._unfinished.append(task)
         self._woken.trigger()
         return task
 
     def wake(self) -> None:
-        """As rclpy's."""
-        self._waiting = None  # of a node that has created or destroyed something
+        """Wake up as rclpy; called after the node created or destroyed an entity."""
+        self._waiting = None
         super().wake()
         self._woken.trigger()
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Wait until there is something to do, but no longer than so (s), and do some of it."""
+        """Wait until something is ready, at most `timeout_sec` seconds, and handle some of it."""
         if self._once_more:
             timeout_sec = 0.0
         waiting = self._waiting
         if waiting is None:
             waiting = self._waiting = _Waiting(self._node, self._woken)
         inputs, others_ready = waiting.wait(-1 if timeout_sec is None else round(timeout_sec * 1e9))
-        if others_ready or self._once_more:  # what is said of the vehicle may come before what it measures
+        if others_ready or self._once_more:  # the configuration of the vehicle may come before its measurements
             super().spin_once(timeout_sec=0.0)
         elif inputs:
             self._node.deliver(inputs)
         while self._unfinished and self._unfinished[0].done():
             self._unfinished.popleft()
-        # one call does one thing, and a callback may have given it more to do
+        # one call handles one item, and a callback may have added more
         self._once_more = others_ready or bool(self._unfinished)

@@ -1,4 +1,4 @@
-"""Hears what a calibration node says of itself in /diagnostics, wherever on the domain it runs; calls its services."""
+"""Client of a calibration node anywhere on the domain: receives its /diagnostics and calls its services."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ..errors import InputError, printable
 from .services import AnsweringNode
 from .status import Status, status_name
 
-# What a node can be asked for.
+# services of the node
 SERVICES = ("save", "save_anyway", "reset")
 
 
 class Listener:
-    """Use as a context: a node of its own, in a context of its own, without signal handlers.
+    """Context manager with its own node in its own ROS context, without signal handlers.
 
     node: full name of the calibration node. Raises InputError for bad --ros-args.
     """
@@ -29,15 +29,15 @@ class Listener:
         self._status_name = status_name(node)
         self._full_name = f"/{node.strip('/')}"
         self.answer = ""
-        """What the last call came to."""
+        """Answer to the last call."""
         self.is_waiting = False
-        """Whether the answer to the last call is still to come."""
+        """Whether the last call is still unanswered."""
 
     def __enter__(self) -> Listener:
         self._context = rclpy.Context()
         try:
             rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        except Exception as error:  # rclpy raises types of its own for bad --ros-args, which it takes from sys.argv
+        except Exception as error:  # rclpy raises its own types for bad --ros-args, which it takes from sys.argv
             raise InputError(" ".join(str(error).split())) from error
         self._node = AnsweringNode("dvl_calib_watch", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
@@ -53,14 +53,14 @@ class Listener:
         rclpy.shutdown(context=self._context)
 
     def latest(self, wait_s: float) -> Status | None:
-        """The latest status, heard within so many seconds or before."""
+        """Listen for `wait_s` seconds and return the latest status, also an earlier one."""
         deadline = time.monotonic() + wait_s
         while (left := deadline - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=left)
         return self._latest
 
     def call(self, service: str) -> None:
-        """Ask the node for one of `SERVICES`; what comes of it is in `answer`, once `latest` has heard it."""
+        """Call one of `SERVICES`. The result is in `answer` after `latest` has received it."""
         client = self._clients[service]
         if not client.service_is_ready():
             self.answer, self.is_waiting = f"{service}: the node does not answer", False
@@ -72,7 +72,7 @@ class Listener:
         error = future.exception()
         said = future.result().message if error is None else printable(str(error))
         self.is_waiting = False
-        self.answer = f"{time.strftime('%H:%M:%S')} {said}"  # the same answer twice is seen to be another
+        self.answer = f"{time.strftime('%H:%M:%S')} {said}"  # the time distinguishes equal answers
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -1,4 +1,4 @@
-"""Live checks: gravity against orientation, clock offsets taken off, pauses of the process."""
+"""Live checks: gravity against orientation, subtracted clock offsets, pauses of the process."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from ..calibration.registration.registration import ALIKE_S, OFFSETS, Registrati
 from ..discovery.gravity import Gravity
 from ..verdict.reasons import Reason, finding
 
-# What ten minutes do not show, no more does.
+# more than ten minutes of samples add nothing
 MOST = 600
 
 
 class GravitySeen:
-    """Takes messages of the IMU, of which stamps decide which count: a recording of them says the same."""
+    """Collector of gravity samples of the IMU, selected by stamps so that a replay selects the same."""
 
     def __init__(self) -> None:
         self._second = -1
         self._rows: list[tuple[float, ...]] = []
 
     def add(self, message: Any) -> None:
-        """Take a sensor_msgs/Imu."""
+        """Add a sensor_msgs/Imu."""
         second = message.header.stamp.sec
         if second == self._second or len(self._rows) == MOST:
             return
@@ -35,7 +35,7 @@ class GravitySeen:
         self._rows.append((q.x, q.y, q.z, q.w, a.x, a.y, a.z))
 
     def problems(self, topic: str, parameters: Parameters) -> list[Reason]:
-        """What is wrong with how the data of this topic are taken."""
+        """Return the contradictions between gravity and the configured use of this topic."""
         rows = np.array(self._rows, dtype=float).reshape(-1, 7)
         gravity = Gravity.of(rows[:, :4], rows[:, 4:])
         body_from_imu = rotation_from_rpy(parameters.imu_rpy)
@@ -48,19 +48,19 @@ class GravitySeen:
 
 
 class LateClocks:
-    """What is to be taken off, once: where nobody named an offset, and two looks at the clocks agree.
+    """Clock offsets to subtract, once, if none was configured and two successive estimates agree.
 
-    found: what is said of it, while it is off. stand: whether nothing more is to be taken off.
+    found: reasons for the subtraction. stand: whether nothing more is subtracted.
     """
 
     def __init__(self, given: Collection[str]) -> None:
-        """given: names of the parameters that the user named."""
+        """Set up. given: names of the parameters that the user set."""
         self.stand = bool(OFFSETS.keys() & set(given))
         self._before: Registration | None = None
         self.found: list[Reason] = []
 
     def parameters(self, registration: Registration | None, parameters: Parameters) -> Parameters | None:
-        """The parameters to begin anew with, by the newest look; None for as they are."""
+        """Return parameters with the offsets of the newest estimate for a restart, or None if nothing changes."""
         if self.stand or registration is None or registration is self._before:
             return None
         before, self._before = self._before, registration
@@ -80,17 +80,17 @@ def _are_alike(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
     return one.keys() == other.keys() and all(abs(one[name] - other[name]) < ALIKE_S for name in other)
 
 
-# A process that looks at its clock every second and finds so much gone by did not run meanwhile, s.
+# A process that checks its clock every second and finds this much time gone was paused, s.
 PAUSE_S = 5.0
 
 
 def steady_s() -> float:
-    """Seconds of a clock that nobody sets and that goes on while the machine sleeps, where there is one (Linux)."""
+    """Return seconds of a clock that nobody sets and that runs while the machine sleeps, if it has one (Linux)."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
 
 
 class Pauses:
-    """To be told about every second that the process runs. now_s: as of `steady_s`."""
+    """Detector of pauses, to be called every second that the process runs. now_s: of `steady_s`."""
 
     def __init__(self, now_s: float) -> None:
         self._last_s = now_s
@@ -98,7 +98,7 @@ class Pauses:
         self._found: list[tuple[float, float]] = []
 
     def running_s(self, now_s: float) -> float:
-        """Take note that the process runs. A clock (s) that stands still while it does not."""
+        """Register that the process runs. Return a clock (s) that excludes the pauses."""
         gone_s = now_s - self._last_s
         self._last_s = now_s
         if gone_s > PAUSE_S:
@@ -107,11 +107,11 @@ class Pauses:
         return now_s - self._paused_s
 
     def within(self, seconds: float) -> list[float]:
-        """Lengths (s) of the pauses that ended within so many seconds of running."""
+        """Return the lengths (s) of pauses that ended within the last `seconds` of running."""
         running_s = self._last_s - self._paused_s
         self._found = [each for each in self._found if running_s - each[0] <= seconds]
         return [length for _, length in self._found]
 
     def forget(self) -> None:
-        """Tell of no pause before now."""
+        """Forget all pauses before now."""
         self._found.clear()

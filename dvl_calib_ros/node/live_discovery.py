@@ -1,7 +1,7 @@
-"""Topics that nobody named are found while the node runs, by the rules that recordings are looked through with.
+"""Discovery of topics while the node runs, by the same rules as in recordings.
 
-Where the DVL's topic has no publisher and another topic may be a DVL's, all that may be of use is recorded for a while,
-and looked through as a recording. What reads recordings is imported then: a ROS machine need not have it.
+If the DVL's topic has no publisher and another topic may be a DVL's, all candidate topics are recorded for a while and
+examined like a recording. The modules that read recordings are imported only then: a ROS machine need not have them.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from ..discovery.discovery import Discovery
     from .topic_recorder import TopicRecorder
 
-# So long is recorded, s; longer, where a topic that has a publisher has not brought so many messages yet: a USBL gives
-# a position each 5 to 10 s.
+# Length of a recording, s. It is extended up to MOST_S while a published topic has fewer than ENOUGH messages: a USBL
+# gives a position every 5 to 10 s.
 LISTEN_S, MOST_S, ENOUGH = 20.0, 60.0, 3
 
 
 class _Running(NamedTuple):
-    """What records. ends: closes it. began: monotonic time, s."""
+    """A recording in progress. ends: closes it. began: monotonic time, s."""
 
     folder: TemporaryDirectory[str]
     recorder: TopicRecorder
@@ -39,17 +39,17 @@ class _Running(NamedTuple):
 
 
 class FoundTopics(NamedTuple):
-    """What was found. parameters: as given, with the types of the messages and what the recording says."""
+    """Discovered topics. parameters: the given ones, with the types of the messages and the recording's findings."""
 
     discovery: Discovery
     parameters: Parameters
 
 
 class Discovering:
-    """One search after the other, a step at each call, until something is found.
+    """Repeated search, one step per call, until topics are found.
 
-    named: by role (dvl, gnss, imu) the topic that the user named, None where it is the node's own. given: names of
-    parameters that the user gave. worker: looks through what was recorded.
+    named: topic that the user named by role (dvl, gnss, imu), None for the node's own. given: names of parameters that
+    the user set. worker: examines the recordings.
     """
 
     def __init__(
@@ -67,9 +67,9 @@ class Discovering:
         self._said = ""
 
     def step(self) -> FoundTopics | None:
-        """Begin to record, look for new topics, or look through what came; what was found, once.
+        """Start to record, subscribe to new topics, or examine the recording. Return a result once.
 
-        Raises InputError where nothing can be recorded, or read.
+        Raises InputError if recording or reading fails.
         """
         if self._looked_through is not None:
             return self._outcome(self._looked_through)
@@ -81,7 +81,7 @@ class Discovering:
         if recorder.failed is not None:
             raise recorder.failed
         if recorder.look() and time.monotonic() < began + LISTEN_S:
-            began = time.monotonic()  # what has turned up late is listened to for as long
+            began = time.monotonic()  # a topic that appears late is recorded as long as the others
             self._recording = self._recording._replace(began=began)
         waits_for = LISTEN_S if all(recorder.counts[topic] >= ENOUGH for topic in recorder.topics) else MOST_S
         if time.monotonic() < began + waits_for:
@@ -103,7 +103,7 @@ class Discovering:
 
     def _begin(self) -> None:
         topics = ", ".join(self._may_be_dvl())
-        self._node.get_logger().info(f"nobody publishes the DVL's topic; looking through the others ({topics}) ...")
+        self._node.get_logger().info(f"the DVL's topic has no publisher; examining the others ({topics}) ...")
         try:
             from ..bags.writer import BagWriter
             from .topic_recorder import TopicRecorder
@@ -122,13 +122,13 @@ class Discovering:
         try:
             return looked_through.result()
         except InputError as error:
-            if str(error) != self._said:  # it is looked for again
+            if str(error) != self._said:  # the search repeats, the message does not
                 self._said = str(error)
                 self._node.get_logger().warning(self._said)
             return None
 
     def close(self) -> None:
-        """Record no more."""
+        """Stop recording."""
         if self._recording is not None:
             folder, _, ends, _ = self._recording
             self._recording = None
@@ -147,5 +147,5 @@ class Discovering:
                 found = discover(recording, self._parameters, given)
             except InputError as error:
                 raise InputError(str(error).replace(str(path), "the topics there are")) from error
-        # clocks are taken off by the node itself, once two looks agree
+        # the node itself subtracts clock offsets once two estimates agree
         return FoundTopics(found, recording.of_types(found.topics, self._parameters.replace(**found.values)))

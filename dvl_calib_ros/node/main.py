@@ -1,11 +1,9 @@
-"""Start and stop of the node: arguments, signals, exit codes.
+"""Start and stop of the node: arguments, signals, exit codes, and return of memory to the system.
 
-What takes long to import is imported below, so that signals are looked after from the first moment on.
+Slow imports are inside functions, so that signals are handled from the first moment.
 
-Memory that goes back to the system once it is free.
-
-What glibc learns from arrays that come and go is to keep their room, and small ones that stay then cut it into pieces:
-a node's memory climbs for hours although it holds no more than at the start.
+By default glibc keeps the memory of large freed arrays and fragments it with small ones, so a node's memory grows for
+hours although it holds no more than at the start.
 """
 
 from __future__ import annotations
@@ -21,17 +19,17 @@ if TYPE_CHECKING:
 
     from .shutdown import Ending
 
-# A thread that computes gives way to one with a message after so long, s; by default after 0.005.
+# A computing thread yields to one with a message after this time, s; Python's default is 0.005.
 GIVES_WAY_S = 0.0005
-# Says that standard input is a pipe, and that the node is to end with the process that holds its other end.
+# option: standard input is a pipe, and the node ends when its other end closes
 ENDS_WITH_STDIN = "--ends-with-stdin"
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the node until it is told to stop.
+    """Run the node until a signal or a closed pipe ends it.
 
-    0; 1 where the result could not be saved, which is printed then; 2 on a bad configuration, said in one line on
-    standard error.
+    Returns 0; 1 if the result could not be saved, and was printed; 2 for a bad configuration (one line on standard
+    error).
     """
     try:
         from ..standard_streams import open_streams
@@ -42,12 +40,12 @@ def main(args: Sequence[str] | None = None) -> int:
         with_parent = ENDS_WITH_STDIN in given
         with Ending(closed=sys.stdin.fileno() if with_parent else None) as ending:
             return run_until(ending, [arg for arg in given if arg != ENDS_WITH_STDIN])
-    except KeyboardInterrupt:  # before there was an `Ending`, so nothing had begun
+    except KeyboardInterrupt:  # before `Ending` was set up, so nothing was started
         return 0
 
 
 def run_until(ending: Ending, args: Sequence[str]) -> int:
-    """As `main`, with what asks it to stop."""
+    """Run the node as `main`, until `ending` is requested."""
     from ..errors import InputError, needing_ros
 
     try:
@@ -64,7 +62,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
         return 0
     try:
         rclpy.init(args=["calibration_node", *args], signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rclpy raises types of its own for bad --ros-args and unreadable parameter files
+    except Exception as error:  # rclpy raises its own types for bad --ros-args and unreadable parameter files
         return _refused(error)
     node, is_saved = None, True
     give_back_at_once()
@@ -72,8 +70,8 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
     try:
         node = CalibrationNode(parameter_files(args))
         executor = ReceivingExecutor(node)
-        gc.freeze()  # what the start has made stays: to look through it takes 0.01 s now and then, and a message waits
-        # spin_until_future_complete would remember one callback more with every message
+        gc.freeze()  # objects of the start stay; a collection that examines them would delay a message by 0.01 s
+        # spin_until_future_complete would keep one more callback for every message
         ending.tell(lambda: executor.create_task(lambda: None))
         while not ending.requested:
             executor.spin_once()
@@ -89,7 +87,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
 
 
 def parameter_files(args: Sequence[str]) -> list[Path]:
-    """The files that ROS arguments name, as rcl reads them: between --ros-args and --."""
+    """Return the parameter files in ROS arguments, as rcl reads them: between --ros-args and --."""
     from pathlib import Path
 
     files, is_ros = [], False
@@ -108,14 +106,14 @@ def _refused(error: Exception | str) -> int:
     return 2
 
 
-# Of `mallopt` (3). Set, they stay what they are: glibc raises them otherwise with the largest array that is given back.
+# mallopt(3): setting these disables glibc's automatic increase after a large array is freed
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
-# Arrays of at least so many bytes have memory of their own: what comes with each message is smaller.
+# Smallest array, bytes, with its own memory mapping; arrays of one message are smaller.
 LARGE = 1 << 17
 
 
 def give_back_at_once() -> bool:
-    """Have large arrays be given back to the system when they are freed; False where that cannot be asked for."""
+    """Make glibc return large arrays to the system when they are freed. Return False without glibc."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError, TypeError):  # no glibc

@@ -1,7 +1,7 @@
-"""Messages of several subscriptions in the order in which they arrived.
+"""Messages of several subscriptions in order of arrival.
 
-An executor takes one message of each topic in turn. After a stall a DVL at 5 Hz would so run ahead of an IMU at 100 Hz
-by nearly the length of the stall, and go on without it where that is longer than max_latency.
+An executor takes one message per topic in turn. After a stall, a DVL at 5 Hz would overtake an IMU at 100 Hz by nearly
+the length of the stall, and be used without the IMU if that exceeds max_latency.
 """
 
 from __future__ import annotations
@@ -12,29 +12,29 @@ from typing import Any, NamedTuple, TypeVar
 from rclpy.exceptions import InvalidHandle
 from rclpy.subscription import Subscription
 
-# Messages that are taken in one go; then services and timers have their turn.
+# messages taken before services and timers get their turn
 ROUND = 1000
 Input = TypeVar("Input")
 
 
 class Arrived(NamedTuple):
-    """A message and when it arrived (ns, system clock)."""
+    """A message and its time of arrival (ns, system clock)."""
 
     message: Any
     at_ns: int
 
     @classmethod
     def of(cls, message: Any, info: Mapping[str, int]) -> Arrived:
-        """A message as rclpy gives it. A middleware that does not say when it came says when it was sent."""
+        """Wrap a message of rclpy. Some middlewares report the time of sending instead of arrival."""
         return cls(message, info["received_timestamp"] or info["source_timestamp"])
 
 
 def take(subscription: Subscription) -> Arrived | None:
-    """The next message that waits in a subscription; None if there is none."""
+    """Take the next waiting message of a subscription; None if there is none."""
     try:
         with subscription.handle:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-    except InvalidHandle:  # destroyed, as by the executor of a node that ends
+    except InvalidHandle:  # destroyed, for example by the executor of a node that ends
         return None
     return None if taken is None else Arrived.of(*taken)
 
@@ -46,11 +46,11 @@ def in_order_of_arrival(
     at_most: int = ROUND,
     ready: Collection[str] | None = None,
 ) -> Iterator[tuple[str, Any]]:
-    """Topic and message of all that waits, oldest first; those of one topic in the order in which they are taken.
+    """Yield topic and message of all waiting messages, oldest first; messages of one topic keep their order.
 
-    inputs: by topic, what messages are taken from. taken: what was taken before of some of them. at_most: how many
-    more are taken. ready: on which alone something waited a moment ago, if that is known: while these bring no second
-    message, the others are not asked, for to find that nothing waits costs a third of what a message does.
+    inputs: sources by topic. taken: messages already taken from some of them. at_most: limit of further messages.
+    ready: the only topics with messages a moment ago, if known. While these have no second message, the others are not
+    polled: an empty poll costs a third of a message.
     """
     heads, left = dict(taken), at_most
 
@@ -69,6 +69,6 @@ def in_order_of_arrival(
         yield oldest, heads.pop(oldest).message
         if ready is None:
             take_more(inputs)
-        elif take_more(ready):  # what came by the others meanwhile may be older
+        elif take_more(ready):  # a message that arrived meanwhile on another topic may be older
             ready = None
             take_more(inputs)

@@ -1,4 +1,4 @@
-"""Message classes by type name, and a DVL's velocity as a message of any type that is read."""
+"""Message classes by type name, and conversion of a DVL velocity to a message of any supported type."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ from ..messages.type_recognition import recognised
 
 
 def velocity_class(parameter: str, name: str, dvl_fields: str = "") -> Any:
-    """The class of the type that parameter dvl_type or gnss_type names; one that nobody knows is known by its fields.
+    """Return the message class for parameter dvl_type or gnss_type; unlisted DVL types are read by their fields.
 
-    dvl_fields: the parameter, of a DVL. Raises InputError if it is none, or its package is not installed.
+    dvl_fields: value of the parameter of that name. Raises InputError for an unusable type, or if its package is
+    missing.
     """
     package, _, rest = name.partition("/")
     full = f"{package}/msg/{rest.removeprefix('msg/')}"
@@ -49,9 +50,9 @@ def velocity_class(parameter: str, name: str, dvl_fields: str = "") -> Any:
 
 
 def message_class(what: str, name: str) -> Any:
-    """The class of type ``package/msg/Name``. Raises InputError if its package is not installed.
+    """Return the class of type ``package/msg/Name``. Raises InputError if its package is not installed.
 
-    what: the parameter or topic that asks for it, for the error.
+    what: the parameter or topic, for the error.
     """
     package, _, kind = name.partition("/msg/")
     try:
@@ -66,10 +67,10 @@ def message_class(what: str, name: str) -> Any:
 
 DVL_FRAME = "dvl_link"
 ALTITUDE_M = 10.0
-# Where types keep velocity and covariance
+# paths of velocity and covariance in the message types
 _VECTORS = ("vector", "twist.twist.linear", "twist.linear", "velocity")
 _COVARIANCES = ("velocity_covar", "velocity_covariance", "covariance")
-# What says that a measurement is good, by name; each type has some of them
+# fields that mark a good measurement; each type has some of them
 _GOOD: dict[str, Any] = {
     "velocity_mode": BOTTOM_TRACK,
     "coordinate_mode": DS_INSTRUMENT,
@@ -81,11 +82,11 @@ _GOOD: dict[str, Any] = {
 
 
 def fill(message: Any, kind: VelocityType, sample: DvlSample) -> Any:
-    """Fill a new message of a type with a sample (forward-left-up); returns it."""
+    """Fill a new message of a type with a sample (forward-left-up) and return it."""
     axes = FLU_FROM_FRD if kind.points_down else np.eye(3)
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(sample.stamp_ns, 1_000_000_000)
     message.header.frame_id = DVL_FRAME
-    if hasattr(message, "child_frame_id"):  # the velocity's, the header's is that of the pose
+    if hasattr(message, "child_frame_id"):  # child_frame_id is the frame of the velocity, header.frame_id of the pose
         message.header.frame_id, message.child_frame_id = "odom", DVL_FRAME
         message.pose.pose.orientation.w = 1.0
     vector = _first(message, _VECTORS)

@@ -1,6 +1,6 @@
-"""What an operator has to know of a running calibration: the mounting, what it is worth, what to drive next.
+"""Values for the operator of a running calibration: mounting, predicted drift, next manoeuvre.
 
-Looked at once for each status of /diagnostics, so that it costs nothing per message.
+They are computed once per status of /diagnostics, so they cost nothing per message.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.results import Estimate, corrected_rpy, rpy_std, scale_and_delay
 from ..verdict.reasons import Reason, finding
 
-# What to drive next is thought of anew so often, s: it takes a few milliseconds.
+# interval of computing the next manoeuvre, s, which takes a few milliseconds
 THOUGHT_OF_EVERY_S = 5.0
-# What is predicted differs from look to look, by up to twice. It is good enough when each look of so long, s, was
-# within the goal. It no longer is when the median of so long, which is what is told, is above so many times the goal:
-# of 25 blocks a σ is known to a seventh (1σ), so that half as much again is no chance. Seconds are those of the DVL's
-# stamps: a bag that is played faster shows as much in less time, and a DVL that is silent shows nothing.
+# The predicted drift varies between looks by up to a factor of two. It is good enough after all looks within STANDS_S
+# are within the goal. It is no longer good enough when the median over STANDS_S, which is the displayed value, exceeds
+# TAKEN_BACK times the goal: a σ of 25 blocks is known to 1/7 (1σ), so a factor of 1.5 is significant. Seconds are
+# counted by DVL stamps, so a fast playback counts the same and a silent DVL counts nothing.
 STANDS_S, TAKEN_BACK = 30.0, 1.5
-# From one look to the next no more than so long, s, counts: a stamp that is far ahead shows nothing either.
+# Number of looks that STANDS_S needs at least, which limits the step of one: a stamp far ahead counts no more.
 LEAST_LOOKS = 5
-# Two σ of a predicted time, as a share: it is in proportion to a σ², and that of 25 blocks is known to 2/7 (1 σ).
+# 2σ of a predicted time, relative: the time is proportional to σ², which is known to 2/7 (1σ) from 25 blocks.
 SPREAD = 4.0 / 7.0
-# Rates are means over so many statuses.
+# number of statuses over which rates are averaged
 RATED_OVER = 10
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 _STREAMS = {"dvl": "dvl", "reference": "gnss", "imu": "imu"}
 
 
 class RecentWorth:
-    """What a calibration is worth of late, whether that is good enough, and why it no longer is.
+    """Recent predicted drift of a calibration, and whether it is good enough.
 
-    taken_back: None but after it was, until it is again.
+    taken_back: why it is no longer good enough; None if it never was, or is again.
     """
 
     def __init__(self) -> None:
@@ -58,9 +58,9 @@ class RecentWorth:
         self.taken_back: Reason | None = None
 
     def look(self, model: str, drift: PredictedDrift, target: float, now_s: float, rejected: bool) -> PredictedDrift:
-        """What is told of the drift, with this one.
+        """Add a prediction and return the displayed drift, the median of the recent ones.
 
-        now_s: how much the DVL has shown. rejected: whether a replay would reject the calibration.
+        now_s: time by DVL stamps. rejected: whether a replay would reject the calibration.
         """
         was_good = self.is_good
         if rejected or model != self._model:
@@ -89,14 +89,14 @@ class RecentWorth:
         return told
 
     def seconds_left(self, now_s: float) -> float:
-        """How long the drift has to stay within the goal until that is good enough, s."""
+        """Return the time (s) for which the drift must still stay within the goal."""
         return STANDS_S - (0.0 if self._within_since_s is None else min(now_s - self._within_since_s, STANDS_S))
 
 
 class RemainingTime:
-    """Time until a calibration is good enough, s of DVL data, and why it is longer than promised.
+    """Time until a calibration is good enough, s of DVL data, and why it is longer than predicted before.
 
-    Never longer than promised by more than its spread, unless `longer` says why; None else.
+    `longer`: the reason for an increase beyond the spread of the prediction, else None.
     """
 
     def __init__(self) -> None:
@@ -106,7 +106,7 @@ class RemainingTime:
         self.longer: Reason | None = None
 
     def look(self, seconds: float | None, drift: float, now_s: float) -> float | None:
-        """Return the time left. seconds: as predicted now, None for none. drift: m per km, as the bar has it."""
+        """Return the time left. seconds: current prediction, or None. drift: m per km, as displayed."""
         if now_s - self._longer_since_s >= STANDS_S:
             self.longer = None
         self._ends_s.append((now_s, math.inf if seconds is None else now_s + seconds))
@@ -124,7 +124,7 @@ class RemainingTime:
 
 
 class Card:
-    """The values of one status after the other. now_s: a clock that does not go back."""
+    """Values of successive statuses. now_s: monotonic time."""
 
     def __init__(self, now_s: float) -> None:
         self._began_s = now_s
@@ -146,7 +146,7 @@ class Card:
         now_s: float,
         rejected: bool = False,
     ) -> dict[str, str]:
-        """By key of /diagnostics. rejected: whether a replay would reject the calibration."""
+        """Return values by key of /diagnostics. rejected: whether a replay would reject the calibration."""
         return {
             "elapsed [s]": f"{now_s - self._began_s:.0f}",
             **self._streams({name: counts[name]["received"] for name in _STREAMS}, now_s),
@@ -156,7 +156,7 @@ class Card:
         }
 
     def _streams(self, received: Mapping[str, int], now_s: float) -> dict[str, str]:
-        """Rates and ages."""
+        """Return rates and ages of the streams."""
         before_s, before = self._received[0] if self._received else (now_s, received)
         last = self._received[-1][1] if self._received else dict.fromkeys(received, 0)
         values = {}
@@ -169,8 +169,8 @@ class Card:
         self._received.append((now_s, received))
         return values
 
-    def _step(self, newest_ns: int | None) -> float:
-        """How much the DVL has shown since the last look, s."""
+    def _dvl_time_step(self, newest_ns: int | None) -> float:
+        """Return the DVL time since the last look, s."""
         before_ns, self._newest_ns = self._newest_ns, newest_ns
         if before_ns is None or newest_ns is None:
             return 0.0
@@ -178,7 +178,7 @@ class Card:
 
     def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float, rejected: bool) -> dict[str, str]:
         parameters, model = calibrator.parameters, MODELS[estimate.model]
-        motion, step = calibrator.latest_motion(), self._step(calibrator.last_ns)
+        motion, step = calibrator.latest_motion(), self._dvl_time_step(calibrator.last_ns)
         self._shown_s += step
         if motion is not None and motion.speed > 0.0:
             self._squares, self._looks = self._squares + motion.speed**2, self._looks + 1
@@ -195,17 +195,17 @@ class Card:
         elif now.both <= target:
             found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(self._shown_s))
         else:
-            found = self._thought(calibrator, estimate, motion, now_s)
+            found = self._suggestion(calibrator, estimate, motion, now_s)
         left = None
         if rejected or worth.is_good:
             self._remaining = RemainingTime()
-        elif found.next.code != "NEXT_WAIT":  # a vehicle that stands keeps what it was promised
+        elif found.next.code != "NEXT_WAIT":  # a standing vehicle keeps its last prediction
             left = self._remaining.look(found.seconds, drift.both, self._shown_s)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
         goals = {
-            "side": _done(drift.side, unknown[0], target / math.sqrt(2.0)),
-            "ahead": _done(drift.ahead, unknown[1], target / math.sqrt(2.0)),
-            "worth": 100.0 if worth.is_good else min(_done(drift.both, math.hypot(*unknown), target), 99.0),
+            "side": _progress_percent(drift.side, unknown[0], target / math.sqrt(2.0)),
+            "ahead": _progress_percent(drift.ahead, unknown[1], target / math.sqrt(2.0)),
+            "worth": 100.0 if worth.is_good else min(_progress_percent(drift.both, math.hypot(*unknown), target), 99.0),
         }
         return {
             "worth": f"{drift.both:.2f}",
@@ -221,10 +221,10 @@ class Card:
             "longer": "" if self._remaining.longer is None else self._remaining.longer.sentence,
         }
 
-    def _thought(
+    def _suggestion(
         self, calibrator: Calibrator, estimate: Estimate, motion: RecentMotion | None, now_s: float
     ) -> Outlook:
-        """What to drive next, as it was thought of last."""
+        """Return the suggested manoeuvre, computed again after `THOUGHT_OF_EVERY_S`."""
         if self._outlook is None or now_s - self._thought_s >= THOUGHT_OF_EVERY_S:
             self._thought_s, self._thought_shown_s = now_s, self._shown_s
             parameters, mean_square = calibrator.parameters, self._squares / max(self._looks, 1)
@@ -233,22 +233,22 @@ class Card:
             noise = noise_of_a_second(estimate, parameters, seconds, mean_square)
             still = RecentMotion(0.0, None, False, noise)
             moving = still if motion is None else motion._replace(noise=noise)
-            if moving.speed > 0.0:  # of a vehicle that slows down in a turn, the usual one
+            if moving.speed > 0.0:  # if the vehicle slows down in a turn, its usual speed
                 moving = moving._replace(speed=max(moving.speed, math.sqrt(mean_square)))
             self._outlook = outlook(estimate, parameters, moving, self._outlook and self._outlook.next)
         planned, since = self._outlook.seconds, self._shown_s - self._thought_shown_s
         return self._outlook._replace(seconds=None if planned is None else max(planned - since, 0.0) + STANDS_S)
 
 
-def _done(drift: float, unknown: float, target: float) -> float:
-    """Per cent of the way from what is not known at all to the target, by the logarithm; nan for what never will."""
+def _progress_percent(drift: float, unknown: float, target: float) -> float:
+    """Return the progress from the initial uncertainty to the target on a logarithmic scale, per cent; nan if never."""
     if drift <= target or math.isnan(drift):
         return 100.0 if drift <= target else math.nan
     return max(0.0, min(99.0, 100.0 * math.log(unknown / drift) / max(math.log(unknown / target), 1e-9)))
 
 
 def _mounting(calibrator: Calibrator, estimate: Estimate) -> dict[str, str]:
-    """The DVL's mounting as a URDF has it, and what a pose does not hold; of what the model does not know, no σ."""
+    """Return the mounting as in a URDF, scale and delay; no σ for a quantity that the model does not estimate."""
     parameters, model = calibrator.parameters, MODELS[estimate.model]
     angles = np.degrees(corrected_rpy(estimate.misalignment, parameters))
     stds = np.degrees(rpy_std(estimate.misalignment, estimate.covariance, parameters))

@@ -1,4 +1,4 @@
-"""The messages that the node publishes an estimate in."""
+"""Conversion of estimates to the node's messages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..calibration.results.velocity_correction import NOT_ESTIMATED, twist_terms
 
 
 def empty_twist() -> TwistWithCovarianceStamped:
-    """A message to be filled again and again; what never changes in it is set here."""
+    """Return a message that is filled repeatedly, with its constant values set."""
     message = TwistWithCovarianceStamped()
     message.twist.covariance[[21, 28, 35]] = NOT_ESTIMATED  # calibrated_twist has no angular velocity
     return message

@@ -1,4 +1,4 @@
-"""The schema's parameters as ROS 2 parameters with descriptors."""
+"""ROS 2 parameters with descriptors, made from the parameter schema."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TYPES = {
 
 
 def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
-    """What `ros2 param describe` shows."""
+    """Return the descriptor for `ros2 param describe`."""
     constraints = []
     if spec.choices:
         constraints.append("one of " + ", ".join(spec.choices))
@@ -41,11 +41,11 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
 
 
 def declare_parameters(node: Node, files: Sequence[Path] = ()) -> Parameters:
-    """Declare every parameter, with the values given at the start. Raises ParameterError and InputError.
+    """Declare every parameter with its value at the start. Raises ParameterError and InputError.
 
-    The node must have declared its overrides by itself; so names that do not exist are seen (ROS 2 would ignore
-    them), and whole numbers are taken where a double is meant, here and later. files: the parameter files that the
-    node was started with; what they set for all nodes alike, and is no parameter of ours, is another's.
+    The node must have declared its overrides automatically: unknown names are then seen, which ROS 2 would ignore, and
+    integers are accepted for doubles, now and later. files: the parameter files of the start. Unknown names in their
+    sections for all nodes belong to other nodes.
     """
     others: set[str] = set()
     for path in files:
@@ -66,7 +66,7 @@ def declare_parameters(node: Node, files: Sequence[Path] = ()) -> Parameters:
 
 
 def _as_declared(parameters: Sequence[Parameter]) -> list[Parameter]:
-    """Return parameters that are to be set with doubles for whole numbers, which ROS 2 would refuse by their type."""
+    """Return parameters with integers converted to doubles, which ROS 2 would refuse by their type."""
     found = []
     for each in parameters:
         kind = SCHEMA[each.name].kind if each.name in SCHEMA else ""

@@ -1,7 +1,7 @@
-"""Requests to end (Ctrl-C, kill, a terminal or a parent that is gone) as a flag, which cuts nothing short.
+"""Requests to end (Ctrl-C, kill, a closed terminal or parent) as a flag that interrupts nothing.
 
-A KeyboardInterrupt would come up wherever Python happens to be: within the middleware, which makes another error of
-it, or within the estimator, which would then have one half of a sample. Imports little: it must be there first.
+A KeyboardInterrupt could be raised inside the middleware, which converts it to another error, or inside the estimator,
+which would then have half a sample. This module imports little, because it must be active first.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from collections.abc import Callable
 from types import FrameType, TracebackType
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# Who is told and does not end is told again, s: a wake-up that the middleware loses would be waited for for ever.
+# Interval of repeated calls to functions that have not ended, s: the middleware may lose a wake-up.
 AGAIN_S = 1.0
 
 
 class Ending:
-    """Whether to end. A context manager, to be entered in the main thread, as early as can be.
+    """Context manager that records requests to end. Enter it in the main thread as early as possible.
 
-    Left after a request, further signals are ignored, as the process is about to end; else all is as before.
+    After a request, further signals are ignored on exit, because the process is about to end; else the previous signal
+    handlers are restored.
 
     Parameters
     ----------
-    closed: File descriptor of a pipe; that its other end is closed is a request, too.
-
+    closed: File descriptor of a pipe; closing its other end is a request, too.
     """
 
     def __init__(self, closed: int | None = None) -> None:
-        # no Event: setting one takes a lock, and the signal that comes meanwhile would wait for itself for ever
+        # no threading.Event: setting it takes a lock, on which a signal handler could block itself
         self._requested = False
         self._told: list[Callable[[], object]] = []
         self._closed = closed
@@ -38,7 +38,7 @@ class Ending:
     def __enter__(self) -> Ending:
         self._reading, self._writing = socket.socketpair()
         self._writing.setblocking(False)
-        # the interpreter writes to it at once; its own handlers wait for the middleware to come back
+        # the interpreter writes to it immediately; its own handlers wait until the middleware returns
         self._wakeup_before = signal.set_wakeup_fd(self._writing.fileno(), warn_on_full_buffer=False)
         self._before = {number: signal.signal(number, self._on_signal) for number in ENDING}
         self._thread = threading.Thread(target=self._watch, name="ending", daemon=True)
@@ -57,17 +57,17 @@ class Ending:
 
     @property
     def requested(self) -> bool:
-        """Whether it has been asked for."""
+        """Whether an end was requested."""
         return self._requested
 
     def tell(self, function: Callable[[], object]) -> None:
-        """Call a function, from another thread, when it is asked for, and again until `heard`; now, if it has been."""
+        """Call a function from another thread after a request, repeatedly until `heard`; now if already requested."""
         self._told.append(function)
         if self.requested:
             function()
 
     def heard(self) -> None:
-        """Tell nobody any more."""
+        """Stop calling the functions."""
         self._told.clear()
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
@@ -81,7 +81,7 @@ class Ending:
                 self._tell()
                 continue
             numbers = self._reading.recv(64) if watched[0] in ready else b"\0"
-            if not numbers:  # left
+            if not numbers:  # the context was left
                 return
             if self._closed in ready:
                 watched.remove(self._closed)

@@ -1,7 +1,7 @@
-"""Our simulator as a node: publishes DVL, GNSS and IMU of a simulated run, or of a motion that it follows.
+"""Simulator node: publishes DVL, GNSS and IMU of a simulated run or of a followed motion.
 
-Publishing follows the stamps: in a run, a sample goes out when its stamp's time has come; following an odometry topic,
-when the odometry has reached the stamp and is one message past the time of measurement (`simulation.live_simulation`).
+In a run, a sample is published when the time of its stamp comes. When following an odometry topic, it is published when
+the odometry has reached the stamp and is one message past the time of measurement (`simulation.live_simulation`).
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from .services import AnsweringNode
 from .shutdown import Ending
 
 NODE_NAME = "dvl_simulator"
-# Messages that may wait for a slow subscriber, or in the queue of the odometry
+# messages that may wait for a slow subscriber, or in the queue of the odometry
 QUEUE = 1000
 PATIENCE = Duration(seconds=10)
-# How long a wait for a subscriber, or for the next stamp, goes on without looking whether to end, s
+# longest wait without checking for a request to end, s
 BREATH_S = 0.05
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """Topics, and the type of the DVL's messages (a name of `messages.drivers`). Raises InputError for another."""
+    """Topics, and the DVL's message type (a name of `messages.drivers`). Raises InputError for an unknown type."""
 
     dvl: str = "dvl/twist"
     gnss: str = "gnss/twist"
@@ -87,20 +87,20 @@ class SimulatorNode(AnsweringNode):
             self.sent += 1
 
     def finish(self) -> None:
-        """Wait until subscribers have what was published."""
+        """Wait until subscribers have received all messages."""
         for each in (self._dvl, self._gnss, self._imu):
             each.wait_for_all_acked(PATIENCE)
 
     def follow(self, topic: str, scenario: Scenario) -> None:
-        """Publish what the sensors measure on the motion of an odometry topic. Raises InputError."""
+        """Publish the sensors' measurements on the motion of an odometry topic. Raises InputError."""
         self._scenario = scenario
-        Follower(scenario)  # raises what is wrong with the scenario
+        Follower(scenario)  # raises InputError for an invalid scenario
         self._follower: Follower | None = None
         self._start_ns, self._last_ns = 0, 0
         self._subscribe(topic, ReliabilityPolicy.RELIABLE)
 
     def _subscribe(self, topic: str, reliability: ReliabilityPolicy) -> None:
-        """Reliable, which loses nothing; made anew when a publisher turns up that is best effort, to hear that."""
+        """Subscribe reliably, and change to best effort if a best-effort publisher appears."""
 
         def on_incompatible(event: Any) -> None:
             if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
@@ -126,7 +126,7 @@ class SimulatorNode(AnsweringNode):
             return
         if self._follower is None or now_ns < self._last_ns:
             if self._follower is not None:
-                self.get_logger().info("odometry went back in time; beginning anew")
+                self.get_logger().info("odometry went back in time; starting again")
             self._follower, self._start_ns = Follower(self._scenario, now_ns), now_ns
         elif now_ns == self._last_ns:
             return
@@ -139,16 +139,16 @@ def run_until(
     ending: Ending, scenario: Scenario, outputs: Outputs, ros_args: Sequence[str], follow: str | None, speed: float,
     wait: bool,
 ) -> int:  # fmt: skip
-    """Run until the run is over, or it is told to end. Returns how many messages were sent. Raises InputError.
+    """Publish until the run or `ending` ends it. Return the number of messages sent. Raises InputError.
 
-    follow: odometry topic, None for a run of the scenario's own motion, that many times as fast as real time. wait:
-    begin when every topic has a subscriber.
+    follow: odometry topic; None runs the scenario's own motion at `speed` times real time. wait: start when every topic
+    has a subscriber.
     """
     run = simulate(scenario) if follow is None else None
     samples: list[Sample] = [] if run is None else in_order(run)
     try:
         rclpy.init(args=[NODE_NAME, *ros_args], signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # rclpy raises types of its own for bad --ros-args
+    except Exception as error:  # rclpy raises its own types for bad --ros-args
         raise InputError(" ".join(str(error).split())) from error
     node = None
     try:
@@ -175,7 +175,7 @@ def run_until(
 def _play(
     node: SimulatorNode, executor: SingleThreadedExecutor, ending: Ending, samples: list[Sample], speed: float
 ) -> None:
-    """Publish samples at their stamps, which begin now, that many times as fast."""
+    """Publish samples at their stamps, starting now, at `speed` times real time."""
     start_ns = node.get_clock().now().nanoseconds
     began = time.monotonic()
     for sample in shifted(samples, start_ns - START_NS):

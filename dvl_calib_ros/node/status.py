@@ -1,4 +1,4 @@
-"""The calibration's status in /diagnostics, for those who read it; without ROS."""
+"""The calibration's status in /diagnostics, for its readers; without ROS."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 
 def status_name(node: str) -> str:
-    """Name of a node's status, by the node's full name, as in /second/dvl_calibration."""
+    """Return the name of a node's status from the node's full name, such as /second/dvl_calibration."""
     return f"{node.strip('/')}: calibration"
 
 
 @dataclass(frozen=True)
 class Status:
-    """One status as received. level: 0 OK, 1 WARN, 2 ERROR. received_s: monotonic time."""
+    """One received status. level: 0 OK, 1 WARN, 2 ERROR. received_s: monotonic time."""
 
     level: int
     message: str
@@ -21,5 +21,5 @@ class Status:
     received_s: float
 
     def get(self, key: str) -> str:
-        """A value, '-' if there is none."""
+        """Return a value, or '-' if missing."""
         return self.values.get(key, "-")

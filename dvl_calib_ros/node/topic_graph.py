@@ -1,4 +1,4 @@
-"""Who else is on the node's topics, and who of them does not hear or is not heard."""
+"""Other nodes on the node's topics, and incompatibilities with them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from rclpy.qos import LivelinessPolicy, QoSCompatibility, QoSProfile, qos_check_
 from ..messages.drivers import TYPES_OF
 from ..verdict.reasons import Reason, finding
 
-# What ROS 2 calls a node whose topic is discovered before it is
+# ROS 2's name of a node whose topic is discovered before the node
 UNKNOWN_NAME = "_NODE_NAME_UNKNOWN_"
 
 
 def input_problems(node: Node, subscription: Any, type_parameter: str | None) -> list[Reason]:
-    """What is wrong with the publishers of one of the node's inputs, and the remedy.
+    """Return the problems with the publishers of an input, with remedies.
 
-    type_parameter: the one that names the type of the topic, if it can be chosen.
+    type_parameter: parameter that selects the topic's type, if there is one.
     """
     topic, kind = subscription.topic_name, _type_name(subscription.msg_type)
     publishers = node.get_publishers_info_by_topic(topic)
@@ -52,7 +52,7 @@ def _other_type_remedy(name: str, type_parameter: str | None) -> str:
 
 
 def output_problems(node: Node, publisher: Any) -> list[Reason]:
-    """Which subscribers of one of the node's outputs do not hear it, and why."""
+    """Return the subscribers of an output that cannot receive it, with the reason."""
     problems = []
     for info in node.get_subscriptions_info_by_topic(publisher.topic_name):
         reason = _incompatible(_in_full(publisher.qos_profile), info.qos_profile)
@@ -62,7 +62,7 @@ def output_problems(node: Node, publisher: Any) -> list[Reason]:
 
 
 def twin_problems(node: Node, publisher: Any) -> list[Reason]:
-    """Whether others publish what the node alone should: their estimates mix, and their files replace each other."""
+    """Report other publishers of the node's own topic: their estimates mix, and their files replace each other."""
     publishers = node.get_publishers_info_by_topic(publisher.topic_name)
     if len(publishers) < 2:
         return []
@@ -76,7 +76,7 @@ def _incompatible(offered: QoSProfile, requested: QoSProfile) -> str | None:
 
 
 def _in_full(own: QoSProfile) -> QoSProfile:
-    """One of the node's own profiles, with what it leaves open said as others' profiles say it."""
+    """Return one of the node's profiles with its defaults filled in, for comparison with others'."""
     return QoSProfile(
         depth=1,
         reliability=own.reliability,

@@ -1,4 +1,4 @@
-"""Records what of a running system a calibration may use, bytes as they come over DDS."""
+"""Recorder of a running system's topics for calibration; keeps the bytes as received over DDS."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DEPTH = 1000
 
 
 class TopicRecorder:
-    """Writes messages of a node's graph into a bag. counts: by topic. left_out: of what is not installed, why."""
+    """Writer of ROS messages into a bag. counts: messages by topic. left_out: topics of missing types, and why."""
 
     def __init__(self, node: Node, writer: BagWriter) -> None:
         self._node, self._writer = node, writer
@@ -37,11 +37,11 @@ class TopicRecorder:
 
     @property
     def topics(self) -> list[str]:
-        """What is heard that moves."""
+        """Recorded topics that are not static."""
         return [each.topic_name for each in self._subscriptions if each.topic_name not in self._static]
 
     def look(self) -> bool:
-        """Subscribe to topics that have turned up; whether there are any."""
+        """Subscribe to new topics. Return whether there are any."""
         before = len(self._subscriptions)
         own = f"{self._node.get_fully_qualified_name()}/"
         for topic, kinds in self._node.get_topic_names_and_types():
@@ -69,7 +69,7 @@ class TopicRecorder:
             reliability=ReliabilityPolicy.RELIABLE if is_reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE,
         )
-        definition = None  # of a driver's own type what readers know of it
+        definition = None  # for a driver's own type, the definition that bag readers need
         with suppress(LookupError):
             text, _ = self._writer.typestore.generate_msgdef(kind, ros_version=2)
             definition = Definition(MessageDefinitionFormat.MSG, text)
@@ -80,7 +80,7 @@ class TopicRecorder:
         )
 
     def close(self) -> None:
-        """Hear no more."""
+        """Stop receiving."""
         for each in self._subscriptions:
             self._node.destroy_subscription(each)
         self._subscriptions = []

@@ -1,4 +1,4 @@
-"""Transforms of the node: /tf_static and robot_description heard, ~/mounting and TF published."""
+"""Transforms of the node: subscribes to /tf_static and robot_description, publishes ~/mounting and TF."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ from ..calibration.results.results import MountingPose
 from ..discovery.transforms import FrameTree
 from ..verdict.reasons import Reason, finding
 
-# Transforms that are kept; more is garbage.
+# number of transforms kept; a system with more is faulty
 MOST_TRANSFORMS = 1000
-# What this node broadcasts itself comes back within this many of its own.
+# number of own broadcasts that are remembered, to recognise them when they are received
 OWN_TRANSFORMS = 100
 _LATCHED = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Transforms:
-    """Subscribes on a node. `heard` grows with every message, so that nobody need look twice at the same."""
+    """Subscriber to transforms. `heard` counts its messages, so that callers can skip an unchanged tree."""
 
     def __init__(self, node: Node) -> None:
         self._transforms: dict[str, Any] = {}
         self._own: deque[Any] = deque(maxlen=OWN_TRANSFORMS)
         self._description = ""
         self.heard = 0
-        # every event callback is one more thing that is waited for with every message
+        # every event callback is one more entity that is waited for with every message
         quiet = SubscriptionEventCallbacks(use_default_callbacks=False)
         self._subscriptions = [
             node.create_subscription(String, "robot_description", self._on_description, _LATCHED, event_callbacks=quiet)
         ]
         try:
             from tf2_msgs.msg import TFMessage
-        except ImportError:  # ROS from PyPI is without it; the description alone will have to do
+        except ImportError:  # ROS from PyPI has no tf2_msgs; only the description is used
             return
         self._subscriptions.append(
             node.create_subscription(TFMessage, "/tf_static", self._on_transforms, _LATCHED, event_callbacks=quiet)
@@ -58,22 +58,22 @@ class Transforms:
         self.heard += bool(others)
 
     def own(self, transform: Any) -> None:
-        """Let what this node is about to broadcast not be taken for another's: it would begin anew with its own."""
+        """Remember an own broadcast: received as another node's, it would restart the calibration."""
         self._own.append(transform)
 
     def has(self, frame: str) -> bool:
-        """Whether another node has published a transform to this frame."""
+        """Return whether another node has published a transform to this frame."""
         return frame in self._transforms
 
     def tree(self) -> FrameTree:
-        """What is known by now."""
+        """Return the current tree."""
         return FrameTree.of(self._transforms.values(), [self._description] if self._description else [])
 
 
 class MountingOutput:
-    """Publishes poses with this publisher, and broadcasts them from this node if it is to and tf2_ros is there.
+    """Publisher of mounting poses, which also broadcasts them to TF if requested and tf2_ros is installed.
 
-    problems: what others or the installation do to the transform.
+    problems: faults of the transform caused by other nodes or by the installation.
     """
 
     def __init__(self, node: Any, publisher: Any, broadcasts: bool, warn: Callable[[str], None]) -> None:
@@ -84,13 +84,13 @@ class MountingOutput:
             return
         try:
             from tf2_ros import StaticTransformBroadcaster
-        except ImportError:  # ROS from PyPI is without it
+        except ImportError:  # ROS from PyPI has no tf2_ros
             warn(str(finding("TF_NOT_THERE")))
             return
         self._broadcaster = StaticTransformBroadcaster(node)
 
     def publish(self, pose: MountingPose, stamp: Any, base: str, dvl: str, transforms: Transforms | None) -> None:
-        """Publish a pose of frame `dvl` in `base`. transforms: what hears transforms, so that it knows ours."""
+        """Publish the pose of frame `dvl` in `base`. transforms: subscriber that must recognise this broadcast."""
         message = PoseWithCovarianceStamped()
         message.header.stamp, message.header.frame_id = stamp, base
         at, turn = message.pose.pose.position, message.pose.pose.orientation
@@ -111,7 +111,7 @@ class MountingOutput:
         self._broadcaster.sendTransform(transform)
 
     def problems(self, dvl: str, transforms: Transforms | None) -> list[Reason]:
-        """Whether others publish a transform to frame `dvl` beside ours."""
+        """Report an unknown position, or other publishers of a transform to frame `dvl`."""
         if self._broadcaster is not None and self._unknown_in:
             return [finding("POSITION_UNKNOWN", base=self._unknown_in)]
         if self._broadcaster is None or transforms is None or not transforms.has(dvl):

@@ -1,7 +1,6 @@
-"""What topics of a running vehicle say of its water, looked at once a second.
+"""Water properties from a running vehicle's topics, read once a second.
 
-What nobody waits for costs nothing per message: of each topic the newest message stays in the middleware until it is
-asked for.
+The newest message of each topic stays in the middleware until it is read, so waiting messages cost nothing.
 """
 
 from __future__ import annotations
@@ -19,24 +18,24 @@ from ..messages.water_properties import WaterCollector, readers, water_of
 from .message_queue import take
 from .message_types import message_class
 
-# New topics are looked for each so many seconds; of each so many of the last readings are kept, one a second.
+# interval of the search for new topics, s, and number of last readings kept per topic, one per second
 LOOK_S, READINGS = 5, 600
 
 
 class NeverCalled(CallbackGroup):
-    """Of subscriptions that no executor is to wait for."""
+    """Callback group of subscriptions that no executor waits for."""
 
     def can_execute(self, entity: Any) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
     def beginning_execution(self, entity: Any) -> bool:
-        """Never."""
+        """Return False."""
         return False
 
 
 class WaterHeard:
-    """Readings of the topics that there are. looks_for: whether topics are listened to, beside the DVL's own."""
+    """Readings of all water topics. looks_for: whether to subscribe to topics other than the DVL's."""
 
     def __init__(self, node: Node, looks_for: bool) -> None:
         self._node, self._looks_for = node, looks_for
@@ -46,9 +45,9 @@ class WaterHeard:
         self._seconds = 0
 
     def hear(self, own: Collection[str], dvl: tuple[str, str, Any]) -> Water | None:
-        """What is known of the water, asked once a second.
+        """Return the known water properties; called once a second.
 
-        own: topics that the node hears anyway. dvl: topic, type and newest message of the DVL's, None for none.
+        own: topics that the node already receives. dvl: topic, type and newest message of the DVL, None for none.
         """
         if self._looks_for and self._seconds % LOOK_S == 0:
             self._look(own)
@@ -71,7 +70,7 @@ class WaterHeard:
                     continue
                 try:
                     class_ = message_class(topic, kind)
-                except InputError:  # not installed, so nothing of it can be read
+                except InputError:  # not installed, so its messages cannot be read
                     continue
                 profile = QoSProfile(
                     history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT

@@ -1,4 +1,4 @@
-"""How results are shown: each is a document of sentences, tables and figures, for a terminal, a page, JSON, a notebook.
+"""Presentation of results: documents of sentences, tables and figures for a terminal, a page, JSON or a notebook.
 
-Pages need matplotlib and jinja2, which are imported when one is asked for.
+Pages need matplotlib and jinja2, which are imported only for a page.
 """

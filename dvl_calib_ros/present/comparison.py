@@ -1,4 +1,4 @@
-"""What a comparison of calibrations says."""
+"""Document of a comparison of calibrations."""
 
 from __future__ import annotations
 
@@ -15,14 +15,17 @@ from ..calibration.results.mounting_quantities import date
 from .document import Answer, Columns, Document, Section, Sentence, Table, Where, columns_for, figures, table_by
 from .numbers import with_std
 
-# Of more pairs than these a terminal shows the neighbours in time.
+# with more pairs than these a terminal shows only neighbours in time
 MOST_PAIRS = 10
-OWN_NOTE = "± is 1σ as each calibration states it; – was not shown by its data."
+OWN_NOTE = "± is 1σ as each calibration states it; – was not observable in its data."
 _DEGREE = math.degrees(1.0)
 
 
 class ComparedQuantity(NamedTuple):
-    """Quantity of a comparison. component: its index in `COMPONENTS`. factor: from SI. changes: of `Comparison`."""
+    """Quantity of a comparison.
+
+    component: its index in `COMPONENTS`. factor: from SI. changes: attribute of `Comparison`.
+    """
 
     component: int
     name: str
@@ -44,7 +47,7 @@ QUANTITIES = (
 
 
 def comparison(result: Comparison) -> Document:
-    """Whether the mounting moved, by how much, and each calibration and difference with its σ."""
+    """Lay out whether the mounting moved and by how much, with each calibration and difference and their σ."""
     pairs, ordered = result.pairs, result.calibrations
     by_name = [f"{each.first.name} → {each.second.name}" for each in pairs]
     neighbours = {(id(one), id(other)) for one, other in pairwise(ordered)}
@@ -72,7 +75,7 @@ def comparison(result: Comparison) -> Document:
             Section(
                 "Over time",
                 [
-                    Sentence("With ±1σ; a dashed line where it is said to have changed.", soft=True),
+                    Sentence("With ±1σ; a dashed line marks a change.", soft=True),
                     figures("comparison_figures.trend", result),
                 ],
                 Where.PAGE,
@@ -93,13 +96,13 @@ def comparison(result: Comparison) -> Document:
 
 
 def shown_quantities(result: Comparison) -> list[ComparedQuantity]:
-    """Quantities that two calibrations have shown at least."""
+    """Return the quantities that were observable in at least two calibrations."""
     return [each for each in QUANTITIES if sum(own.shown[each.component] for own in result.calibrations) > 1]
 
 
 DIFFERENCES_NOTE = (
-    "Angles as in a URDF. p: how often chance alone makes the most significant of angles and lever arm as large, "
-    "corrected for the number of tests."
+    "Angles as in a URDF. p: probability under no change that the most significant of angles and lever arm is as "
+    "large, corrected for the number of tests."
 )
 
 

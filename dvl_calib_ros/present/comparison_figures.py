@@ -1,7 +1,4 @@
-"""Pictures of a comparison: every quantity over time, with a line where it is said to have changed.
-
-Pictures of a fleet.
-"""
+"""Pictures of a comparison and of a fleet: every quantity over time, with a line at each change."""
 
 from __future__ import annotations
 
@@ -25,12 +22,12 @@ from .fleet import deviation
 _POINT, _MOVED = "#1f6fb2", "#c0392b"
 PANEL_WIDTH, PANEL_HEIGHT = 4.6, 2.3
 PNG_DPI = 160
-# Of more calibrations than these the first and the last are told to who cannot see the picture.
+# with more calibrations than these the alternative text has only the first and the last
 TOLD = 20
 
 
 def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONENTS)) -> list[Picture]:
-    """Every quantity that two have shown, a picture each. components: those alone."""
+    """Draw every quantity observable in two calibrations, one picture each. components: restrict to these."""
     made = []
     for quantity in (each for each in shown_quantities(comparison) if each.component in components):
         at = quantity.component
@@ -46,7 +43,7 @@ def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONEN
 
 
 def trend_png(comparison: Comparison) -> bytes:
-    """Every quantity that was shown over time, as one picture."""
+    """Draw every observable quantity over time, as one PNG."""
     with drawing():
         quantities = shown_quantities(comparison)
         columns = 2 if len(quantities) > 1 else 1
@@ -69,7 +66,7 @@ def _panel(comparison: Comparison, quantity: ComparedQuantity) -> Figure:
 
 
 def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> None:
-    """One quantity over time with ±1σ; a line where it is said to have changed."""
+    """Draw one quantity over time with ±1σ, and a line at each change."""
     known = [each for each in comparison.calibrations if each.shown[quantity.component]]
     dated = _dated(comparison.calibrations)
     order = {id(each): index for index, each in enumerate(comparison.calibrations)}
@@ -83,7 +80,7 @@ def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> Non
         label = "changed" if index == 0 else None
         axes.axvline(sum(ends) / 2.0, color=_MOVED, linewidth=1.2, linestyle="--", label=label)
     if dated:
-        # seven dates fit beside each other; as few as three let it find an interval for every span
+        # seven dates fit next to each other; with a minimum of three, matplotlib finds an interval for every span
         locator = AutoDateLocator(minticks=3, maxticks=7)  # type: ignore[no-untyped-call]
         axes.xaxis.set_major_locator(locator)
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
@@ -102,17 +99,17 @@ def _short(name: str) -> str:
 
 
 def _dated(calibrations: Sequence[Extrinsics]) -> bool:
-    """Whether they follow each other; those of simulations, stamped alike, do not."""
+    """Return whether the calibrations follow each other; simulated ones may have equal stamps."""
     return all(before.last_ns <= after.first_ns for before, after in pairwise(calibrations))
 
 
 def _middle(each: Extrinsics) -> float:
-    """In days since 1970, as matplotlib counts dates."""
+    """Return the middle in days since 1970, matplotlib's unit of dates."""
     return 0.5 * (each.first_ns + each.last_ns) * 1e-9 / 86400.0
 
 
 def compass(known: Sequence[tuple[str, CompassDeviation]]) -> Figure:
-    """Deviation of the heading against the heading, a line a vehicle."""
+    """Draw the deviation over the heading, one line per vehicle."""
     figure, axes = new_figure()
     north = np.linspace(0.0, 360.0, 181)
     for name, heading in known:

@@ -1,4 +1,4 @@
-"""What a diagnosis says."""
+"""Document of a diagnosis."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ NOISE_MEANING = {
 }
 ALL = "all of the run"
 MAX_PLACES = 12
-# Effects of the first screen of a terminal
+# effects on the first screen of a terminal
 FIRST_EFFECTS = 3
 PLACES = "Share: of the gap's energy. Places overlap, so that only the shares of the axes over all of the run add up."
 EFFECTS_NOTE = (
-    "The calibration is refitted with every effect. p is adjusted for all effects that were tried. Of names joined by "
+    "The calibration is refitted with every effect. p is adjusted for all effects tried. For names joined by "
     "“or”, the parameters are those of the first."
 )
 TRACES_NOTE = (
@@ -60,8 +60,8 @@ TRACES_NOTE = (
     "both curves, so they show only what is evidence for the effect."
 )
 TWINS_NOTE = (
-    "The twin is a simulated DVL on the recorded motion, without and with what was found. What is shown is what was "
-    "recorded less what the twin measured, on stretches that its parameters had not seen."
+    "The twin is a simulated DVL on the recorded motion, without and with the effects found. Shown is the recorded "
+    "minus the twin's velocity, on stretches that were not used for its parameters."
 )
 
 
@@ -111,19 +111,19 @@ NOISE: Columns[NoiseFinding] = {
 
 
 def first_screen(d: Diagnosis) -> Document:
-    """Lay out the answer, what to do, what the gap costs and what to record next, within 24 rows of a terminal."""
+    """Lay out answer, remedy, cost of the gap and next recording, within 24 rows of a terminal."""
     whole, gap = diagnosis(replace(d, effects=d.effects[:FIRST_EFFECTS])), d.gap
     more = len(d.effects) - FIRST_EFFECTS
     further = [f"{more} more effects: --verbose."] if more > 0 else []
     if math.isfinite(gap.before):
         cost = mm(math.sqrt(max(gap.before**2 - gap.noise_floor**2, 0.0)))
-        further.append(f"Cost: {cost} mm/s beyond the noise, of which {mm(gap.not_explained)} mm/s are not explained.")
+        further.append(f"Cost: {cost} mm/s beyond the noise; {mm(gap.not_explained)} mm/s of it are not explained.")
     further += [f"Next: {d.next_manoeuvre}.", "Details: --verbose, or --report FILE."]
     return replace(whole, sections=[section("", *map(Sentence, further))])
 
 
 def diagnosis(d: Diagnosis) -> Document:
-    """Lay out the gap between DVL and reference: places, effects that explain it, and what cannot be told."""
+    """Lay out the gap between DVL and reference: places, effects that explain it, and limits of the data."""
     series, has_effects = d.series, bool(d.effects)
     found = [
         f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, EFFECTS.get(e.name))}." for e in d.effects
@@ -161,11 +161,11 @@ def diagnosis(d: Diagnosis) -> Document:
             section("", closed if has_effects and math.isfinite(d.gap.closure) else None, where=Where.PAGE),
             section("Where the gap lies", table_by(WHERE, d.where[:MAX_PLACES], (PLACES, *more))),
             section("" if d.where else "Regimes of motion", regimes, where=Where.PAGE),
-            *(_of_series(d, series) if series is not None else []),
-            section("What is left", *_left(d), where=Where.PAGE),
+            *(_sections_over_time(d, series) if series is not None else []),
+            section("Residual", *_residual_items(d), where=Where.PAGE),
             section(
                 "What this data cannot tell",
-                *_alike(d),
+                *_equivalence_sentences(d),
                 Sentence(f"Next: {d.next_manoeuvre}."),
                 table_by(NEEDS, d.untestable.items()),
                 table_by(DETECTABLE, _detectable(d), (DETECTABLE_NOTE,)),
@@ -175,8 +175,8 @@ def diagnosis(d: Diagnosis) -> Document:
     )
 
 
-def _of_series(d: Diagnosis, series: DiagnosisSeries) -> Iterator[Section]:
-    """What a page shows over time: each effect as measured, and the recorded against the twin."""
+def _sections_over_time(d: Diagnosis, series: DiagnosisSeries) -> Iterator[Section]:
+    """Yield the sections over time: each effect as measured, and recorded against twin."""
     axes, has_effects = series.axes, bool(d.effects)
     for each in d.effects:
         if series.traces[each.name].any():
@@ -196,11 +196,8 @@ def _of_series(d: Diagnosis, series: DiagnosisSeries) -> Iterator[Section]:
         yield section(twin.name, figures("diagnosis_pictures.twin_pictures", twin, axes, has_effects), where=Where.PAGE)
 
 
-# ------------------------------------------------------------------ sentences
-
-
-def _alike(d: Diagnosis) -> Iterator[Sentence]:
-    """Effects that cannot be told apart, and what is known of a lever arm and a clock together."""
+def _equivalence_sentences(d: Diagnosis) -> Iterator[Sentence]:
+    """Yield sentences on equivalent effects, and on the known combination of lever arm and clock offset."""
     for each in d.effects:
         if each.equivalent_to:
             others = " or ".join(each.equivalent_to)
@@ -224,16 +221,16 @@ def _numbers(d: Diagnosis) -> list[Number]:
         told = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=told))
     claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
-    slow = ", and what the lag has made slow" if any(each.name == LAG for each in d.effects) else ""
-    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"as high frequencies show it{slow}{claimed}"))
+    slow = ", and slow noise due to the lag" if any(each.name == LAG for each in d.effects) else ""
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"estimated from high frequencies{slow}{claimed}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="left beyond the noise")]
 
 
-def _left(d: Diagnosis) -> Iterator[Item]:
-    """How much the effects do not explain, whether that follows anything, and what it follows most."""
+def _residual_items(d: Diagnosis) -> Iterator[Item]:
+    """Yield the unexplained residual and the variable that it depends on most."""
     gap, series = d.gap, d.series
     if not math.isfinite(gap.after):
-        yield Sentence("Not known: this data says nothing of the gap.")
+        yield Sentence("Unknown: the gap is not observable in this data.")
         return
     amount = (
         f"{mm(gap.after)} mm/s rms, noise of {mm(gap.noise_floor)} mm/s included, on held-out data: "
@@ -253,22 +250,19 @@ def _left(d: Diagnosis) -> Iterator[Item]:
         where, followed = series.axes[series.followed.axis], series.followed
         yield figure(
             "diagnosis_figures.against_what_it_follows",
-            f"What is left {where}, against {followed.label.partition(',')[0]}",
-            f"What the fit leaves {where} against {followed.label}, with means of groups and their standard deviations",
+            f"Residual {where}, against {followed.label.partition(',')[0]}",
+            f"Residual of the fit {where} against {followed.label}, with means of groups and their standard deviations",
             followed,
-            f"left {where}, mm/s",
-            caption="Dots: what is left, averaged over two samples of the slower stream. Band: standard deviation of a "
+            f"residual {where}, mm/s",
+            caption="Dots: residual, averaged over two samples of the slower stream. Band: standard deviation of a "
             "group about its mean; bars: of the mean, twice.",
         )
 
 
-# ------------------------------------------------------------------ tables
-
-
 class Detectable(NamedTuple):
-    """The smallest size of a parameter that would have been found. effect: in the first row of each.
+    """Smallest detectable size of a parameter. effect: only in the first row of each effect.
 
-    spec: None of an effect that is not in the library.
+    spec: None for an effect that is not in the library.
     """
 
     effect: str
@@ -278,7 +272,7 @@ class Detectable(NamedTuple):
 
     @property
     def said(self) -> tuple[list[float], str]:
-        """It and the size worth knowing of, in a unit that both are said in."""
+        """Detectable and typical size, and their common unit."""
         return quantity((self.size, self.spec.typical), self.spec.unit) if self.spec else ([self.size], "")
 
 
@@ -304,12 +298,12 @@ def _detectable(d: Diagnosis) -> Iterator[Detectable]:
 
 
 def rms(values: Array) -> float:
-    """m/s of the vector, of values (N, 3)."""
+    """Return the rms length of vectors (N, 3), m/s."""
     return float(np.sqrt((values**2).sum(axis=1).mean())) if len(values) else float("nan")
 
 
 class TwinError(NamedTuple):
-    """What a recording differs by from its twin, m/s rms, in a regime of motion; by what the twin has of effects."""
+    """Difference between recording and twin in a regime of motion, m/s rms, by the effects of the twin."""
 
     twin: HeldOutTwin
     regime: str
@@ -318,7 +312,7 @@ class TwinError(NamedTuple):
 
 
 def twin_errors(twin: HeldOutTwin, has_effects: bool) -> list[TwinError]:
-    """Of all of the run, then of each regime."""
+    """Return the errors over the whole run, then in each regime."""
     found = twin.errors(has_effects)
     regimes = {ALL: np.ones(len(twin.time), dtype=bool), **twin.regimes}
     return [
@@ -329,8 +323,8 @@ def twin_errors(twin: HeldOutTwin, has_effects: bool) -> list[TwinError]:
 
 TWIN_HEADS = {"without": "without, m/s", "with": "with, m/s"}
 TWIN_NOTE = (
-    "Rms of the vector, with the noise of DVL and reference, where there is a reference. The error and the noise at "
-    "the top are those of all recordings together. The twin moves as the reference says."
+    "Rms of the vector, with the noise of the DVL and, if present, of the reference. The error and the noise at "
+    "the top are for all recordings together. The twin follows the motion of the reference."
 )
 TWIN: Columns[TwinError] = {
     "recording": lambda each: each.twin.name if each.regime == ALL else "",

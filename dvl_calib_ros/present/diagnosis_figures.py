@@ -1,4 +1,4 @@
-"""The figures of a diagnosis: functions from plain arrays to a matplotlib Figure, units on every axis."""
+"""Figures of a diagnosis: functions from plain arrays to a matplotlib Figure, units on every axis."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from .figure_data import TimeAxis, running_mean
 from .figure_style import FAINT, INK, legend_above, new_figure, plain_log_ticks
 from .replay_figures import AFTER, BAD
 
-# Points of a line: running means are smooth, so more cannot be seen
+# points of a line; a running mean has no finer detail
 LINE_POINTS = 300
-# Groups of equally many samples in which the measured is compared with the effect
+# number of groups of equal size in which measurement and effect are compared
 GROUPS = 12
-# Bins of a histogram, points of a line of quantiles, dots of a scatter
+# bins of a histogram, points of a line of quantiles, dots of a scatter plot
 BINS, QUANTILES, SCATTER_POINTS = 40, 200, 2000
 MM = 1e3
 MEASURED_COLOUR = "#555b61"
@@ -36,10 +36,10 @@ _STYLES = {
 
 
 def over_time(time: TimeAxis, stamps_ns: Array, series: Mapping[str, Array], points: int, label: str) -> Figure:
-    """Running means over so many samples of one body axis of series (M,), m/s, by name; the last in front."""
+    """Draw running means over `points` samples of series (M,), m/s, by name; the last in front."""
     figure, axes = new_figure()
     t = time(stamps_ns)
-    for (name, values), (colour, width) in zip(series.items(), _lines(list(series)), strict=True):
+    for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
         where, mean = running_mean(t, MM * values, points)
         kept = slice(None, None, max(1, len(where) // LINE_POINTS))
         axes.plot(where[kept], mean[kept], color=colour, linewidth=width, label=name)
@@ -50,19 +50,19 @@ def over_time(time: TimeAxis, stamps_ns: Array, series: Mapping[str, Array], poi
     return figure
 
 
-def _lines(names: Sequence[str]) -> list[tuple[str, float]]:
-    """Colour and width of lines by what they show; names of effects are not among them."""
+def _line_styles(names: Sequence[str]) -> list[tuple[str, float]]:
+    """Return colour and width of each line by its name; effects have the default."""
     return [_STYLES.get(name, (AFTER, 2.0)) for name in names]
 
 
 def spectra(frequency: Array, series: Mapping[str, Array], label: str) -> Figure:
-    """Amplitude spectral densities (F,) m/s/√Hz of one body axis, by name, over frequency (F,) Hz."""
+    """Draw amplitude spectral densities (F,) m/s/√Hz of one body axis, by name, over frequency (F,) Hz."""
     figure, axes = new_figure()
-    for (name, values), (colour, width) in zip(series.items(), _lines(list(series)), strict=True):
+    for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
         axes.plot(frequency, MM * values, color=colour, linewidth=width, label=name)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    axes.set_ylim(*_a_decade(MM * np.concatenate(list(series.values()))))
+    axes.set_ylim(*_decade_limits(MM * np.concatenate(list(series.values()))))
     plain_log_ticks(axes.xaxis)
     plain_log_ticks(axes.yaxis)
     axes.set_xlabel("frequency, Hz")
@@ -71,28 +71,28 @@ def spectra(frequency: Array, series: Mapping[str, Array], label: str) -> Figure
     return figure
 
 
-def _a_decade(values: Array) -> tuple[float, float]:
-    """Limits about positive values, a decade apart at least: a logarithmic axis has few plain numbers in less."""
+def _decade_limits(values: Array) -> tuple[float, float]:
+    """Return limits around positive values, at least a decade apart, so that a logarithmic axis has tick labels."""
     low, high = 0.8 * float(values.min()), 1.25 * float(values.max())
     widen = max(1.0, np.sqrt(10.0 * low / high))
     return low / widen, high * widen
 
 
 def gap_bars(names: Sequence[str], gaps: Mapping[str, Array]) -> Figure:
-    """The gap in each regime of motion, by name (R, 3): value and 95 per cent interval, m/s."""
+    """Draw the gap in each regime of motion, by name (R, 3): value and 95 per cent interval, m/s."""
     return _bars(names, gaps, "gap beyond the noise, mm/s rms (95 %)")
 
 
 def error_bars(names: Sequence[str], errors: Mapping[str, Array], noise: float) -> Figure:
-    """Error in each regime of motion (R, 1) m/s rms, by name, and the noise that is in all."""
+    """Draw the error in each regime of motion (R, 1) m/s rms, by name, and the common noise."""
     return _bars(names, errors, "recorded − twin, mm/s rms", noise)
 
 
 def _bars(names: Sequence[str], groups: Mapping[str, Array], label: str, noise: float | None = None) -> Figure:
-    """Bars of each regime, by name (R, 1), with an interval (R, 3), m/s; noise: a line across all."""
+    """Draw bars for each regime, by name (R, 1) or with an interval (R, 3), m/s. noise: a line across all."""
     figure, axes = new_figure(height=1.2 + 0.36 * len(names))
     height = 0.8 / len(groups)
-    for i, ((name, values), (colour, _)) in enumerate(zip(groups.items(), _lines(list(groups)), strict=True)):
+    for i, ((name, values), (colour, _)) in enumerate(zip(groups.items(), _line_styles(list(groups)), strict=True)):
         rows = np.arange(len(names)) + (i - 0.5 * (len(groups) - 1)) * height
         value, *interval = MM * values.T
         axes.barh(rows, value, height=0.9 * height, color=colour, alpha=0.85, label=name)
@@ -110,15 +110,15 @@ def _bars(names: Sequence[str], groups: Mapping[str, Array], label: str, noise: 
 
 
 def histogram(values: Mapping[str, Array], noise: Array) -> Figure:
-    """Densities of values (K,) m/s, by name, and of normal noise with standard deviations (A,) m/s, equally often.
+    """Draw densities of values (K,) m/s, by name, and of mixed normal noise with σ (A,) m/s.
 
-    As far as the last of them reaches; what is beyond is in the last bins.
+    The range is set by the last series; values beyond it are in the last bins.
     """
     figure, axes = new_figure()
     last = list(values.values())[-1]
     reach = MM * float(max(np.quantile(np.abs(last), 0.995), 4.0 * np.max(noise)))
     edges = np.linspace(-reach, reach, BINS + 1)
-    for (name, each), (colour, width) in zip(values.items(), _lines(list(values)), strict=True):
+    for (name, each), (colour, width) in zip(values.items(), _line_styles(list(values)), strict=True):
         counts, _ = np.histogram(np.clip(MM * each, -reach, reach), edges)
         axes.stairs(counts / len(each) / np.diff(edges), edges, color=colour, linewidth=width, label=name)
     at = np.linspace(-reach, reach, 20 * BINS)
@@ -133,9 +133,9 @@ def histogram(values: Mapping[str, Array], noise: Array) -> Figure:
 
 
 def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
-    """Quantiles of values (K,) m/s, by name, against those of normal noise with standard deviations (A,) m/s.
+    """Draw quantiles of values (K,) m/s, by name, against mixed normal noise with σ (A,) m/s.
 
-    As far as the last of them reaches.
+    The range is set by the last series.
     """
     figure, axes = new_figure(height=3.2)
     k = max(len(each) for each in values.values())
@@ -145,7 +145,7 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
     grid = np.linspace(-6.0, 6.0, 4001) * std.max()
     of_noise = np.interp(shares, normal_sf(-grid[:, None] / std).mean(axis=1), grid)
     axes.plot(of_noise[[0, -1]], of_noise[[0, -1]], color=FAINT, linewidth=2.0, label="noise", zorder=1)
-    for (name, each), (colour, _) in zip(values.items(), _lines(list(values)), strict=True):
+    for (name, each), (colour, _) in zip(values.items(), _line_styles(list(values)), strict=True):
         axes.plot(of_noise, MM * np.quantile(each, shares), ".", color=colour, markersize=3.5, label=name)
     axes.set_xlabel("quantiles of normal noise, mm/s")
     axes.set_ylabel("of recorded − twin, mm/s")
@@ -156,12 +156,12 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
 
 
 def against_what_it_follows(followed: Followed, label: str) -> Figure:
-    """What is left against what it follows: samples, means of groups with twice their error, and their scatter."""
+    """Draw the residual against its explaining variable: samples, group means with two standard errors, and scatter."""
     figure, axes = new_figure(height=3.2)
     at, mean, std, error = followed.groups()
     shown = slice(None, None, max(1, len(followed.at) // SCATTER_POINTS))
     axes.plot(
-        followed.at[shown], MM * followed.left[shown], ".", color=FAINT, markersize=2.5, label="left", zorder=1,
+        followed.at[shown], MM * followed.left[shown], ".", color=FAINT, markersize=2.5, label="residual", zorder=1,
         rasterized=True,
     )  # fmt: skip
     axes.fill_between(at, MM * (mean - std), MM * (mean + std), color=AFTER, alpha=0.15, linewidth=0.0, label="σ")
@@ -176,7 +176,7 @@ def against_what_it_follows(followed: Followed, label: str) -> Figure:
 
 
 def closure_bars(names: Sequence[str], closures: Array, together: tuple[float, float, float]) -> Figure:
-    """Share of the gap that each effect closes alone (E,), and all together: value and 95 per cent interval."""
+    """Draw the share of the gap closed by each effect alone (E,), and by all: value and 95 per cent interval."""
     labels = [*names, "together"] if len(names) > 1 else list(names)
     values = [*closures, together[0]] if len(names) > 1 else [together[0]]
     colours = [FAINT] * len(names) + [AFTER] if len(names) > 1 else [AFTER]
@@ -195,9 +195,9 @@ def closure_bars(names: Sequence[str], closures: Array, together: tuple[float, f
 
 
 def measured_against_effect(effect: Array, measured: Array) -> Figure:
-    """What was measured (K,) against what an effect adds there (K,), m/s: means of groups with 95 per cent intervals.
+    """Draw measurements (K,) against an effect's contribution (K,), m/s: group means with 95 per cent intervals.
 
-    Points on the diagonal: the effect is what was measured.
+    Points on the diagonal mean that the effect equals the measurement.
     """
     figure, axes = new_figure(height=3.2)
     groups = np.array_split(np.argsort(effect), GROUPS)

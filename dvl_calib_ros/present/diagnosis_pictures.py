@@ -1,7 +1,4 @@
-"""Pictures of a diagnosis: the gap by regime, what effects close, and their traces.
-
-The part of a diagnosis' report that shows recorded against simulated twin, and what is left of it.
-"""
+"""Pictures of a diagnosis: gap by regime, closure by effects, their traces, simulated twin, and residual."""
 
 from __future__ import annotations
 
@@ -20,27 +17,27 @@ from .figure_data import CUT_FROM_S, TimeAxis, running_mean
 from .figure_style import Picture, picture
 from .numbers import mm
 
-# Lines over time are means over this share of the run, and over so many seconds at least
+# a line over time is a running mean over this share of the run, and at least this number of seconds
 WINDOW_SHARE, WINDOW_S = 1.0 / 50.0, 5.0
-# An axis of an effect's trace is drawn if it holds this share of its energy
+# an axis of an effect's trace is drawn if it has at least this share of the energy
 AXIS_SHARE = 0.1
 RESAMPLES = 500
 
 
 def _stamps(series: DiagnosisSeries) -> Array:
-    """(M,) ns: the recordings one after the other, far enough apart for the axis to cut out what is between them."""
+    """Return stamps (M,) ns that put the recordings one after the other, with gaps that the time axis cuts out."""
     apart = CUT_FROM_S + float(series.time.max()) * len(series.recordings)
     return np.asarray(1e9 * (series.time + series.recording_of * (series.time.max() + apart)), dtype=np.int64)
 
 
 def _window(series: DiagnosisSeries) -> int:
-    """Samples in a running mean."""
+    """Return the number of samples in a running mean."""
     interval = float(np.median(np.diff(series.time)))
     return max(3, round(WINDOW_S / interval), round(WINDOW_SHARE * len(series.time)))
 
 
 def regime_picture(series: DiagnosisSeries, with_effects: bool) -> Picture:
-    """The gap in each regime of motion, without and with the effects."""
+    """Draw the gap in each regime of motion, without and with the effects."""
     before, after = series.held_out.before, series.held_out.after
     residuals: Mapping[str, Array] = {"before": before, "after": after} if with_effects else {"residual": before}
     names = ["all of the run", *series.regimes]
@@ -63,7 +60,7 @@ def regime_picture(series: DiagnosisSeries, with_effects: bool) -> Picture:
 def _gap(
     residual: Array, floor: Array, block: NDArray[np.integer[Any]], mask: NDArray[np.bool_]
 ) -> tuple[float, float, float]:
-    """Gap (m/s) in a part of the samples and its 95 per cent interval, by a bootstrap over blocks."""
+    """Return the gap (m/s) in a part of the samples, with its 95 per cent bootstrap interval over blocks."""
     excess = np.bincount(block[mask], (residual**2 - floor)[mask].sum(axis=1), minlength=block.max() + 1)
     counts = np.bincount(block[mask], minlength=block.max() + 1)
     at = np.random.default_rng(0).integers(0, len(counts), (RESAMPLES, len(counts)))
@@ -74,7 +71,7 @@ def _gap(
 
 
 def trace_pictures(name: str, series: DiagnosisSeries, axes: Mapping[str, str]) -> Iterable[Picture]:
-    """An effect's trace over time, and against what was measured."""
+    """Draw an effect's trace over time, and against the measurement."""
     stamps_ns = _stamps(series)
     time, points = TimeAxis(stamps_ns), _window(series)
     trace = series.traces[name]
@@ -86,25 +83,25 @@ def trace_pictures(name: str, series: DiagnosisSeries, axes: Mapping[str, str]) 
         if smooth[axis] > AXIS_SHARE * sum(smooth):
             lines = {"measured": measured[:, axis], name: trace[:, axis]}
             yield picture(
-                f"{name}, {where}", f"Measured trace {where} beside the trace of {name}, running mean in mm/s",
+                f"{name}, {where}", f"Measured trace {where} and the trace of {name}, running mean in mm/s",
                 figures.over_time, time, stamps_ns, lines, points, f"{where}, mm/s",
             )  # fmt: skip
     drawn = energy > AXIS_SHARE * energy.sum()
     yield picture(
         f"Measured against {name}", f"Means of what was measured in groups of what {name} adds, with 95 % intervals",
         figures.measured_against_effect, trace[:, drawn].ravel(), measured[:, drawn].ravel(),
-        caption="Points on the line: what was measured is what the effect adds.",
+        caption="Points on the line: the measurement equals the effect's contribution.",
     )  # fmt: skip
 
 
-# Points of a spectrum in each decade of frequency
+# points of a spectrum per decade of frequency
 SPECTRUM_STEPS = 10
-# Lines over time are means over this share of the run, and over so many seconds at least
+# a line over time is a running mean over this share of the run, and at least this number of seconds
 TWIN_WINDOW_SHARE, TWIN_WINDOW_S = 1.0 / 100.0, 3.0
 
 
 def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool) -> Iterable[Picture]:
-    """Over time along each axis, by frequency, distribution, and by regime."""
+    """Draw recorded against twin over time along each axis, by frequency, as distribution, and by regime."""
     found = twin.errors(has_effects)
     stamps_ns = np.asarray(1e9 * twin.time, dtype=np.int64)
     time = TimeAxis(stamps_ns)
@@ -129,14 +126,14 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
     )  # fmt: skip
     pooled = {name: values[:, measured].ravel() for name, values in found.items()}
     yield picture(
-        f"{twin.name}: distribution", f"Histogram of recorded less twin, {names}, beside that of the noise",
+        f"{twin.name}: distribution", f"Histogram of recorded less twin, {names}, and of the noise",
         figures.histogram, pooled, twin.noise[measured],
         caption="All axes together; what lies beyond the ends is in the last bins.",
     )  # fmt: skip
     yield picture(
-        f"{twin.name}: against normal noise", f"Quantiles of recorded less twin, {names}, against those of the noise",
+        f"{twin.name}: against normal noise", f"Quantiles of recorded less twin, {names}, against the noise",
         figures.quantiles, pooled, twin.noise[measured],
-        caption="On the line, it is distributed as the noise is; what is far off runs out of the picture.",
+        caption="On the line, the distribution equals the noise; larger outliers are outside the picture.",
     )  # fmt: skip
     parts = twin_errors(twin, has_effects)
     errors = {name: np.array([[each.errors[name]] for each in parts]) for name in found}
@@ -150,9 +147,9 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
 
 
 def spectrum(twin: HeldOutTwin, values: Array) -> tuple[Array, Array]:
-    """Frequency (F,) Hz and amplitude spectral density (F,) of vectors (N, A), means over even steps of log frequency.
+    """Return frequency (F,) Hz and amplitude spectral density (F,) of vectors (N, A).
 
-    Of the longest stretch without a gap.
+    They are averaged in even steps of log frequency, over the longest stretch without a gap.
     """
     longest = max(twin.segments, key=lambda part: part.stop - part.start)
     count = longest.stop - longest.start

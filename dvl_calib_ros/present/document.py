@@ -1,8 +1,8 @@
-"""A result as it is said: an answer, sentences, tables and figures, whoever shows them.
+"""Presentation of a result as a document: answer, sentences, tables and figures.
 
-What a result says is laid out once, by the module of this room that is called as the result is. Terminal
-(`terminal.py`), page (`page.py`) and data frame (`Table.frame`) are made of that; JSON is the result's own plain data.
-Names in it are of recordings, files and instruments: each text is made `printable` as it is put into a document.
+Each result is laid out once, by its own module of this room. Terminal (`terminal.py`), page (`page.py`) and data frame
+(`Table.frame`) are made from the document; JSON is the result's own plain data. Texts may include names of recordings,
+files and instruments, so each text is made `printable` when it enters a document.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from .figure_style import Picture
 
 
-# Characters of a bar
+# characters of a bar
 BAR = 20
-# Errors of a held-out verification, in the order in which they are drawn
+# errors of a held-out verification, in the order of drawing
 HELD_OUT_KINDS = ("uncorrected", "corrected", "predicted")
-# Class of a cell that holds a verdict
+# style class of a cell with a verdict
 CELL_KINDS = {Severity.ACCEPT: "good", Severity.MARGINAL: "off", Severity.REJECT: "bad"}
 
 
 class Where(Enum):
-    """Which of the two shows a section."""
+    """Where a section is shown."""
 
     BOTH = "both"
     TERMINAL = "terminal"
@@ -41,10 +41,10 @@ class Where(Enum):
 
 
 class _Printable:
-    """A part of a document, with texts that neither steer a terminal nor turn a line around."""
+    """Part of a document whose texts contain no control characters for a terminal or text direction."""
 
     def __post_init__(self) -> None:
-        for each in fields(self):  # type: ignore[arg-type]  # those who inherit are dataclasses
+        for each in fields(self):  # type: ignore[arg-type]  # subclasses are dataclasses
             object.__setattr__(self, each.name, _printable(getattr(self, each.name)))
 
 
@@ -63,7 +63,7 @@ def _printable(value: Any) -> Any:
 class Cell(_Printable):
     """Text of a table. kind: a class of the style sheet, such as good, off, far, bad.
 
-    below: small, on a second line.
+    below: small text on a second line.
     """
 
     text: str
@@ -82,16 +82,15 @@ class Table(_Printable):
     rows
         Cells, each a text or a `Cell`.
     title
-        Above it.
+        Title above the table.
     marked
-        Index of the row that stands out.
+        Index of the highlighted row.
     notes
-        Below it.
+        Notes below the table.
     dense
-        Whether it has many columns.
+        Whether the table has many columns.
     words
-        How many columns at the left are words; the others are numbers.
-
+        Number of text columns at the left; the others are numbers.
     """
 
     head: Sequence[str | Cell]
@@ -103,10 +102,9 @@ class Table(_Printable):
     words: int = 1
 
     def frame(self) -> pandas.DataFrame:
-        """The table as a DataFrame: a column of numbers holds these, with their σ and whether they are shown (no ?) in
-        columns beside it; others hold texts.
+        """Return a DataFrame, in which columns of σ and observability (no ?) follow a numeric column.
 
-        Raises ImportError without pandas.
+        Other columns are texts. Raises ImportError without pandas.
         """
         import pandas
 
@@ -125,15 +123,15 @@ class Table(_Printable):
         return pandas.concat(columns, axis=1)
 
 
-# A number, perhaps with its σ and a mark where it is not shown, or a dash for none
+# number, optionally with σ and with ? if it is not observable, or a dash for none
 _NUMBER = re.compile(r"(?P<value>[+-]?\d+(\.\d+)?)( ± (?P<std>\d+(\.\d+)?))?(?P<unseen> \?)?|–")
 T = TypeVar("T")
-# Heading -> what a column holds of a row's object.
+# heading -> function from a row's object to its cell
 Columns = Mapping[str, Callable[[T], str | Cell]]
 
 
 def table_by(columns: Columns[T], of: Iterable[T], notes: Sequence[str] = (), words: int = 1) -> Table:
-    """A row for each object, by what each column holds of it; headings of texts are aligned as these are."""
+    """Return a table with a row per object. Headings of text columns are aligned like their texts."""
     rows = [[column(each) for column in columns.values()] for each in of]
     texts = [isinstance(cell, Cell) and cell.kind.startswith("text") for cell in rows[0]] if rows else ()
     head = [Cell(name, "text") if is_text else name for name, is_text in zip(columns, texts, strict=False)]
@@ -144,7 +142,7 @@ Key = TypeVar("Key")
 
 
 def columns_for(keys: Mapping[str, Key], cell: Callable[[T, Key], str | Cell]) -> Columns[T]:
-    """A column for each key, under its heading: what of it a row's object holds."""
+    """Return one column per key, under its heading, whose cell depends on the row's object and the key."""
 
     def column(key: Key) -> Callable[[T], str | Cell]:
         return lambda each: cell(each, key)
@@ -154,7 +152,7 @@ def columns_for(keys: Mapping[str, Key], cell: Callable[[T, Key], str | Cell]) -
 
 @dataclass(frozen=True)
 class Sentence(_Printable):
-    """A sentence. soft: less than the others."""
+    """A sentence. soft: less prominent."""
 
     text: str
     soft: bool = False
@@ -162,9 +160,9 @@ class Sentence(_Printable):
 
 @dataclass(frozen=True)
 class Figures(_Printable):
-    """Pictures, which only a page has drawn: by a function of a module of this room, from what it is given.
+    """Pictures drawn by a function of this room from given data; only a page shows them.
 
-    title, alt, caption: of the one picture whose figure the function draws; none where it makes pictures itself.
+    title, alt, caption: of the single figure; empty if the function makes `Picture` objects itself.
     """
 
     module: str
@@ -175,7 +173,7 @@ class Figures(_Printable):
     caption: str = ""
 
     def draw(self) -> Sequence[Picture]:
-        """Make them, which imports matplotlib."""
+        """Draw the pictures, which imports matplotlib."""
         function = getattr(import_module(f"{__package__}.{self.module}"), self.name)
         if self.title:
             from .figure_style import picture
@@ -187,36 +185,36 @@ class Figures(_Printable):
 
 @dataclass(frozen=True)
 class SideBySide:
-    """Figures that stand beside each other, where there is room."""
+    """Figures next to each other, if there is room."""
 
     figures: Sequence[Figures]
 
     def draw(self) -> Sequence[Picture]:
-        """Make them."""
+        """Draw the pictures."""
         return [each for of in self.figures for each in of.draw()]
 
 
 def figures(function: str, *given: Any) -> Figures:
-    """Those that a function draws, such as ``diagnosis_pictures.twin_pictures``."""
+    """Return the figures drawn by a function, such as ``diagnosis_pictures.twin_pictures``."""
     module, _, name = function.partition(".")
     return Figures(module, name, given)
 
 
 def figure(function: str, title: str, alt: str, *given: Any, caption: str = "") -> Figures:
-    """The one that a function draws, such as ``diagnosis_figures.closure_bars``; see `Picture`."""
+    """Return the figure drawn by a function, such as ``diagnosis_figures.closure_bars``; see `Picture`."""
     return replace(figures(function, *given), title=title, alt=alt, caption=caption)
 
 
 @dataclass(frozen=True)
 class FindingLine(_Printable):
-    """Something that was found, with its remedy."""
+    """A finding with its remedy."""
 
     reason: Reason
 
 
 @dataclass(frozen=True)
 class Commands(_Printable):
-    """What to type, or to paste: a line each, with what it is called. on_page: further ones, for a page alone."""
+    """Commands or text to copy, one line each, with a label. on_page: further ones for a page only."""
 
     lines: Sequence[tuple[str, str]]
     on_page: Sequence[tuple[str, str]] = ()
@@ -224,22 +222,21 @@ class Commands(_Printable):
 
 @dataclass(frozen=True)
 class Facts(_Printable):
-    """Short texts by name; an empty one is left out."""
+    """Short texts by name; empty ones are omitted."""
 
     facts: Mapping[str, str]
 
 
 def facts_by(facts: Mapping[str, Callable[[T], str]], of: T) -> Facts:
-    """What each says of an object."""
+    """Return the facts of an object, each from its function."""
     return Facts({name: fact(of) for name, fact in facts.items()})
 
 
 @dataclass(frozen=True)
 class Number(_Printable):
-    """A quantity that was found, in its unit. std: its σ. nominal: as configured. change: from that. note: what is to
-    be known of it.
+    """Estimated quantity. std: its σ. nominal: configured value. change: from nominal. note: a remark.
 
-    is_shown: whether the data show it.
+    is_shown: whether the data make it observable.
     """
 
     name: str
@@ -253,13 +250,13 @@ class Number(_Printable):
 
 @dataclass(frozen=True)
 class Numbers:
-    """The quantities that a result is about: large on a page, a table on a terminal."""
+    """Main quantities of a result: large on a page, a table on a terminal."""
 
     numbers: Sequence[Number]
 
     @property
     def table(self) -> Table:
-        """They as rows."""
+        """The quantities as rows."""
         if any(each.std for each in self.numbers):
             stds = (each.std if each.is_shown else f"{each.std} ?" for each in self.numbers)
             rows = [(n.name, n.nominal, n.value, n.change, std) for n, std in zip(self.numbers, stds, strict=True)]
@@ -269,7 +266,7 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Worth(_Printable):
-    """Drift of dead reckoning on a straight kilometre, m, without and with what was found: the largest on a page."""
+    """Drift of dead reckoning on a straight kilometre, m, without and with the correction: largest number of a page."""
 
     before: str
     after: str
@@ -277,7 +274,7 @@ class Worth(_Printable):
 
 @dataclass(frozen=True)
 class Legend:
-    """Lines of models in the figures that follow."""
+    """Legend of the models in the following figures."""
 
     models: Sequence[str]
     selected: str
@@ -285,7 +282,7 @@ class Legend:
 
 @dataclass(frozen=True)
 class Warned:
-    """Where a page has the document's warnings: before all sections, where none says so."""
+    """Position of the document's warnings on a page; by default before all sections."""
 
     warned: bool = True
 
@@ -295,7 +292,7 @@ Item = Warned | Sentence | Table | Figures | SideBySide | FindingLine | Commands
 
 @dataclass(frozen=True)
 class Section(_Printable):
-    """What stands under one heading."""
+    """Heading and the items below it."""
 
     title: str
     items: Sequence[Item]
@@ -303,13 +300,13 @@ class Section(_Printable):
 
 
 def section(title: str, *items: Item | None, where: Where = Where.BOTH) -> Section:
-    """What there is of the items, under a heading: no None, and no table without rows."""
+    """Return a section of the given items, without None and empty tables."""
     return Section(title, [each for each in items if each is not None and getattr(each, "rows", True)], where)
 
 
 @dataclass(frozen=True)
 class Answer(_Printable):
-    """What a result says first: a word, how good or bad that is, and sentences. advice: what to do."""
+    """First part of a result: a word, its severity, and sentences. advice: what to do."""
 
     word: str
     severity: Severity
@@ -319,10 +316,10 @@ class Answer(_Printable):
 
 @dataclass(frozen=True)
 class Document(_Printable):
-    """A result as it is said.
+    """Presentation of a result.
 
-    warnings: what to know beside it. sections: in order; those without items are left out. parameters: what it was made
-    with, by name; for the page. lead: what is found before all else. folded: warnings that a page folds away.
+    sections: in order; empty ones are omitted. parameters: parameters of the run by name, for the page. lead: a finding
+    before all others. folded: warnings that a page folds away.
     """
 
     title: str
@@ -336,7 +333,7 @@ class Document(_Printable):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """All of them in order, by the heading that each stands below; of further ones below it with their number."""
+        """All tables in order, by their heading; further tables under a heading get a number."""
         found: dict[str, Table] = {}
         heading, below = self.title, 0
         for each in self.sections:
@@ -350,11 +347,11 @@ class Document(_Printable):
         return found
 
     def frames(self) -> dict[str, pandas.DataFrame]:
-        """Its tables as data frames. Raises ImportError without pandas."""
+        """Return the tables as data frames. Raises ImportError without pandas."""
         return {heading: table.frame() for heading, table in self.tables.items()}
 
 
 def bar(full: float, kind: str) -> Cell:
-    """A share as a bar. kind: a class of the style sheet."""
+    """Return a share (0..1) as a bar. kind: a class of the style sheet."""
     blocks = round(BAR * full)
     return Cell("█" * blocks + "░" * (BAR - blocks), f"bar {kind}")

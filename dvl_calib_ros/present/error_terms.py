@@ -1,4 +1,4 @@
-"""Error terms as people read them, and the estimates of models in them."""
+"""Error terms in displayed units, and the models' estimates of them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .numbers import with_std
 
 
 class Term(NamedTuple):
-    """An error term as people read it. row: of φ (3) and δk (3). factor: from SI."""
+    """Displayed error term. row: index in φ (3) and δk (3). factor: from SI."""
 
     row: int
     name: str
@@ -41,19 +41,19 @@ ANY_SCALE = Term(3, "δk", "Scale error", " %", 100.0)
 
 
 def _error_terms(estimate: Estimate) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """φ (3) and δk (3) with their standard deviations, and which of them the model estimates; each (6,)."""
+    """Return φ (3) and δk (3), their standard deviations, and whether the model estimates them; each (6,)."""
     terms = MODELS[estimate.model].error_terms_from_state
     variance = np.diag(terms @ estimate.covariance @ terms.T)
     return terms @ estimate.state, np.sqrt(variance), np.asarray(terms.any(axis=1))
 
 
 def state_of(model: Model, term: Term) -> int:
-    """Index of the state that an error term comes from."""
+    """Return the index of the state of an error term."""
     return int(np.argmax(model.error_terms_from_state[term.row]))
 
 
 def scale_terms(model: Model) -> list[Term]:
-    """The scale terms that are a state of their own: δk if one stands for all axes, else each axis of its own."""
+    """Return the scale terms with their own state: a common δk, or one per axis."""
     terms = [term for term in SCALES if model.error_terms_from_state[term.row].any()]
     if len(terms) == 3 and len({state_of(model, term) for term in terms}) == 1:
         return [ANY_SCALE._replace(in_words="Scale error, all axes")]
@@ -61,7 +61,7 @@ def scale_terms(model: Model) -> list[Term]:
 
 
 def estimate_table(result: Result, shown: Sequence[str]) -> Table:
-    """One row for each model, the selected one marked."""
+    """Return one row per model, the selected one marked."""
     per_axis = any(len(scale_terms(MODELS[name])) > 1 for name in shown)
     terms = (*ANGLES, *(SCALES if per_axis else (ANY_SCALE,)))
     rows = []
@@ -84,7 +84,7 @@ def estimate_table(result: Result, shown: Sequence[str]) -> Table:
 
 
 def _cells(estimate: Estimate, terms: Sequence[Term]) -> list[str]:
-    """Error terms with their ±1σ; – where the model has none; ? marks what is not shown."""
+    """Return error terms with ±1σ; – if the model has none, ? if not observable."""
     model = MODELS[estimate.model]
     value, std, estimated = _error_terms(estimate)
     cells = []

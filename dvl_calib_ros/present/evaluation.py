@@ -1,7 +1,4 @@
-"""What an evaluation says.
-
-What bags say that are checked against each other.
-"""
+"""Documents of an evaluation, and of bags checked against each other."""
 
 from __future__ import annotations
 
@@ -40,10 +37,10 @@ from .document import (
 )
 from .numbers import number
 
-# Deviations from a published figure up to which a cell is coloured so; the last is where there is none
+# largest relative deviations from a published figure for each colour; the last is for no published figure
 WITHIN, KINDS = (0.05, 0.25, 0.5, math.inf), ("good", "off", "far", "bad", "")
 BODY_AXES = ("ahead", "to port", "up")
-# Points of a trace that are drawn
+# points drawn of a trace
 TRACE_POINTS = 400
 CONVERGENCE_NOTE = (
     "Error of the misalignment, ° rms: of the whole angle / of pitch and yaw alone. Calibrated on each run with "
@@ -55,9 +52,9 @@ BASELINES_NOTE = (
     "reference velocity, whose noise grows with time, where they had positions), and of velocities (Troni and "
     "Whitcomb, 2010). They have neither scale nor prior."
 )
-# How names of states begin, and how people read them
+# prefixes of state names -> displayed symbols
 SYMBOLS = {"phi_": "φ", "delta_k": "δk", "delta_k_": "δk "}
-# Shares that the intervals claim, and from where to where a share that was found is as claimed
+# shares claimed by the intervals, with the range of observed shares that agrees
 CLAIMED = ((0.68, (0.60, 0.76)), (0.95, (0.91, 0.98)))
 FACTS: Mapping[str, Callable[[Evaluation], str]] = {
     "Trajectories": lambda e: f"{len(e.trajectories)}: {', '.join(e.trajectories)}",
@@ -83,7 +80,7 @@ SEVERITIES = {"better": Severity.ACCEPT, "not_better": Severity.REJECT, "not_kno
 
 
 def evaluation(e: Evaluation) -> Document:
-    """How large the velocity error is after calibration, by model and set, and whether σ can be trusted."""
+    """Lay out the velocity error after calibration, by model and set, and the reliability of σ."""
     studies = [
         (e.each, "Calibrated on each run with attitude"),
         (e.single_heading, "Calibrated on stretches of a single heading"),
@@ -133,11 +130,10 @@ def evaluation(e: Evaluation) -> Document:
 
 
 def _scores(e: Evaluation) -> Iterable[Item]:
-    """Avg.VRMSE, a line per model and a column per set, with the published figure and the ratio to it below; and how
-    much of the error is gone, by model."""
+    """Yield Avg.VRMSE by model and set, with the published figure and the ratio, and the error reduction by model."""
     here, published = (np.vstack([each, each.mean(axis=0)]).T for each in (e.seed_mean, e.published_of_these))
     ratio = here / published
-    kinds = np.searchsorted(WITHIN, np.abs(ratio - 1.0))  # nan after all others
+    kinds = np.searchsorted(WITHIN, np.abs(ratio - 1.0))  # nan sorts after all others
     rows: list[tuple[str | Cell, ...]] = []
     for name, *of_sets in zip(e.columns, *map(np.ndarray.tolist, (here, published, ratio, kinds)), strict=True):
         cells = (
@@ -153,9 +149,9 @@ def _scores(e: Evaluation) -> Iterable[Item]:
     if np.isfinite(published).any():
         near = e.ratio[np.isfinite(e.ratio)]
         notes.append(
-            f"{int((np.abs(near - 1.0) <= 0.25).sum())} of {len(near)} published cells are met within 25 %. "
+            f"{int((np.abs(near - 1.0) <= 0.25).sum())} of {len(near)} published cells are reproduced within 25 %. "
             "Below each: the published figure and the ratio to it; green within 5 %, yellow 25 %, orange 50 %, red "
-            "beyond. Means are those of the cells beside them, not the paper's."
+            "beyond. Means are over the cells in the row, not the paper's."
         )
     yield Table(("model", *(each.name for each in e.sets), "mean"), rows, notes=notes)
     base = e.columns.index(UNCALIBRATED)
@@ -199,7 +195,7 @@ def _by_time(e: Evaluation) -> Section:
 
 
 def _converging(e: Evaluation) -> Section:
-    """Lay out the error of the misalignment against time."""
+    """Lay out the error of the misalignment over time."""
     rows = [
         (f"{seconds:g} s", *(f"{each.angle_deg[k]:.2f} / {each.level_deg[k]:.2f}" for each in e.convergence))
         for k, seconds in enumerate(TIMES_S)
@@ -229,7 +225,7 @@ def _converging(e: Evaluation) -> Section:
 
 
 def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
-    """Share of the errors inside the intervals that σ claims, by model."""
+    """Yield the share of errors inside the intervals claimed by σ, by model."""
     states = list(dict.fromkeys(name for coverage in coverages for name in coverage.state_names))
     rows: list[tuple[str | Cell, ...]] = []
     for coverage in coverages:
@@ -361,7 +357,7 @@ def _held_out(held_out: Sequence[HeldOut]) -> Section:
 
 
 def _trace(trace: Trace) -> Section:
-    """Velocity of one trajectory before and after the correction by the model that does best on it."""
+    """Lay out one trajectory's velocity before and after the correction by its best model."""
     step = max(1, len(trace.time) // TRACE_POINTS)
     time_s, truth, uncorrected = trace.time[::step], trace.truth[::step], trace.uncorrected[::step]
     corrected = {name: velocity[::step] for name, velocity in trace.corrected.items()}
@@ -402,13 +398,13 @@ ERRORS_NOTE = (
     "check against."
 )
 DRIFT_NOTE = (
-    "Drift in m per km, and per cent of the distance, rms over stretches of up to 1 km. With the lever arm of the bag "
-    "calibrated on; the delay, which is the day's, is that of the bag itself."
+    "Drift in m per km, and per cent of the distance, rms over stretches of up to 1 km. With the lever arm of the "
+    "calibrating bag; the delay, which differs per recording, is estimated from the bag itself."
 )
 
 
 def cross_check(check: CrossCheck) -> Document:
-    """What the calibration of each bag is worth on every other one."""
+    """Lay out the errors of each bag's calibration on every other bag."""
     pictures: list[Item] = []
     for bag, name in zip(check.bags, check.names, strict=True):
         by = {f"by {one}": check.navigation.get((each, bag)) for each, one in zip(check.bags, check.names, strict=True)}

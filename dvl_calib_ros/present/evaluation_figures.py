@@ -1,4 +1,4 @@
-"""The figures of an evaluation: functions from plain arrays to a matplotlib Figure, units on every axis."""
+"""Figures of an evaluation: functions from plain arrays to a matplotlib Figure, units on every axis."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from .figure_data import mark_time, running_mean
 from .figure_style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure
 from .figure_style import plain_log_ticks as log_ticks
 
-# Seconds beyond the longest window at which "all" of a run stands
+# position of "all" of a run, seconds beyond the longest window
 ALL_STANDS_S = 40.0
 
 
 def improvement_bars(models: Sequence[str], improvement: Array, published: Array) -> Figure:
-    """How much of the uncalibrated error each model takes away.
+    """Draw the share of the uncalibrated error that each model removes.
 
-    improvement, published: (S, M) share of Avg.VRMSE that is gone, nan where there is none. Bars are the mean over the
-    sets, points the sets, rings the published figures.
+    improvement, published: (S, M) removed share of Avg.VRMSE, nan if missing. Bars are means over the sets, points the
+    sets, rings the published figures.
     """
     figure, axes = new_figure(height=1.2 + 0.3 * len(models))
     rows = np.arange(len(models))
@@ -52,9 +52,9 @@ def error_over_calibration_time(
     published_window_s: float | None,
     published: Array,
 ) -> Figure:
-    """Avg.VRMSE (W, M) m/s of models calibrated on the first windows_s (None: all) of a run.
+    """Draw Avg.VRMSE (W, M) m/s of models calibrated on the first windows_s (None: all) of a run.
 
-    uncalibrated: m/s. published: (M,) m/s at published_window_s, nan where there is none.
+    uncalibrated: m/s. published: (M,) m/s at published_window_s, nan if missing.
     """
     figure, axes = new_figure(height=3.2)
     finite = [window for window in windows_s if window is not None]
@@ -89,7 +89,7 @@ def misalignment_over_time(
     degrees: Sequence[Array],
     published: tuple[float, float],
 ) -> Figure:
-    """Error of the misalignment (T,) ° of several models against time. gnss_std: m/s, None without a reference.
+    """Draw the error of the misalignment (T,) ° of several models over time. gnss_std: m/s, None without a reference.
 
     published: s and ° of a published method.
     """
@@ -113,7 +113,7 @@ def misalignment_over_time(
 
 
 def coverage_points(models: Sequence[str], within: Mapping[float, Sequence[float]]) -> Figure:
-    """Share of the errors inside the intervals that σ claims; claimed share -> one share per model, all in 0..1."""
+    """Draw the share of errors inside the intervals of σ; claimed share -> observed share per model, all in 0..1."""
     figure, axes = new_figure(height=1.1 + 0.28 * len(models))
     rows = np.arange(len(models))
     for (claimed, shares), marker, colour in zip(within.items(), "os", ("#1f6fb2", "#e76300"), strict=True):
@@ -135,7 +135,7 @@ def coverage_points(models: Sequence[str], within: Mapping[float, Sequence[float
 def errors_in_variables(
     models: Sequence[str], gnss_std: Array, predicted: Array, measured: Array, standard_error: Array
 ) -> Figure:
-    """Pull of the scale (G, V), dimensionless, predicted (lines) and measured (points, ±2 standard errors)."""
+    """Draw the pull of the scale (G, V), dimensionless, predicted (lines) and measured (points, ±2 standard errors)."""
     figure, axes = new_figure(height=3.2)
     order = np.argsort(gnss_std)
     for i, (name, width) in enumerate(zip(models, line_widths(models), strict=True)):
@@ -152,7 +152,7 @@ def errors_in_variables(
 
 
 def error_by_run(runs: Sequence[str], models: Sequence[str], uncalibrated: Array, errors: Array) -> Figure:
-    """Avg.VRMSE m/s of every model (L, M), calibrated on each of L runs; uncalibrated: (L,)."""
+    """Draw Avg.VRMSE m/s of every model (L, M), calibrated on each of L runs; uncalibrated: (L,)."""
     figure, axes = new_figure(height=1.1 + 0.26 * len(runs))
     rows = np.arange(len(runs))
     axes.plot(uncalibrated, rows, "|", color=UNCALIBRATED_COLOUR, markersize=9.0, markeredgewidth=1.6)
@@ -169,7 +169,7 @@ def error_by_run(runs: Sequence[str], models: Sequence[str], uncalibrated: Array
 
 
 def velocity_of_trace(time_s: Array, truth: Array, uncorrected: Array, corrected: Array, label: str) -> Figure:
-    """One body axis (N,) m/s of an evaluated trajectory: truth, and the DVL before and after correction."""
+    """Draw one body axis (N,) m/s of an evaluated trajectory: truth, and the DVL before and after correction."""
     figure, axes = new_figure()
     axes.plot(time_s, uncorrected, color="#c0392b", linewidth=0.9, label="DVL as measured")
     axes.plot(time_s, corrected, color="#1f6fb2", linewidth=0.9, label="DVL corrected")
@@ -183,7 +183,7 @@ def velocity_of_trace(time_s: Array, truth: Array, uncorrected: Array, corrected
 
 
 def error_of_trace(time_s: Array, uncorrected: Array, corrected: Mapping[str, Array]) -> Figure:
-    """Running RMS of the velocity error before correction, and after it with several models, from (N,) lengths m/s."""
+    """Draw the running rms of velocity errors, from lengths (N,) m/s, before and after correction by several models."""
     figure, axes = new_figure(height=3.2)
     axes.plot(
         *_running_rms(time_s, uncorrected), color=UNCALIBRATED_COLOUR, linestyle=":", linewidth=1.4,

@@ -1,4 +1,4 @@
-"""What the doctor says of a recording."""
+"""Document of an examination (``dvl-calib doctor``)."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from ..verdict.kinds import Severity
 from .document import Answer, Columns, Commands, Document, FindingLine, Section, Sentence, bar, table_by
 from .numbers import options, typed
 
-SHOWN_NOTE = "A full bar is fine (fine_std_misalignment, fine_std_scale); red is not shown, and yellow between."
+SHOWN_NOTE = "A full bar is fine (fine_std_misalignment, fine_std_scale); red is not observable, yellow is between."
 ANSWERS = {
     "yes": (Severity.ACCEPT, "This recording can calibrate the DVL."),
     "partly": (Severity.MARGINAL, "This recording can calibrate a part of the DVL's errors."),
-    "no": (Severity.REJECT, "This recording cannot calibrate the DVL as it is."),
+    "no": (Severity.REJECT, "This recording cannot calibrate the DVL without changes."),
 }
 
 
 def examination(examined: Examination, is_live: bool = False, named: Sequence[str] = ()) -> Document:
-    """What is in a recording, what is wrong with it, what its motion shows, and what to type next.
+    """Lay out content, faults, observable quantities and the next command.
 
-    is_live: it was made of a running system, to be looked at alone. named: options that were given, for what is next.
+    is_live: recorded from a running system only for this. named: given options, for the next command.
     """
     severity, answer = ANSWERS[examined.verdict]
     names = ", ".join(path.name or str(path) for path in examined.paths)
@@ -31,11 +31,11 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     found = (*found, *examined.against)
     notes = (note.sentence for note in discovery.notes)
     said = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
-    motion = f"What the motion shows of the DVL (median speed {examined.speed_mps:.2f} m/s)"
+    motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"
     also = "else " if lead or examined.notes else ""
-    nothing = "Without a reference only pitch shows, and yaw on opposite headings."
+    nothing = "Without a reference only pitch is observable, and yaw on opposite headings."
     return Document(
-        title="What is in a recording",
+        title="Examination of a recording",
         subtitle=names,
         answer=Answer(examined.verdict, severity, [f"{answer} {examined.why}".rstrip()]),
         warnings=examined.notes,
@@ -71,8 +71,8 @@ SHOWN: Columns[Shown] = {
 
 
 def next_commands(examined: Examination, is_live: bool, named: Sequence[str]) -> list[tuple[str, str]]:
-    """What to type next."""
-    if is_live:  # the node on the topics that were found, with what was found of them
+    """Return the commands to type next."""
+    if is_live:  # run the node with the discovered topics and parameters
         discovery, default = examined.discovery, Topics()
         names = ((role, getattr(discovery.topics, role)) for role in ("dvl", "gnss", "imu"))
         topics = [(role, name) for role, name in names if name.lstrip("/") not in ("", getattr(default, role))]

@@ -1,10 +1,7 @@
-"""Figures over time as data, from which the script of the page draws them anew: with a cursor and a zoom for all.
+"""Figures over time as data for the page's script, which draws them with a common cursor and zoom.
 
-On a map the cursor is a point on each track.
-
-The figure stays the one description of what is shown: its lines, sleeves and limits are read back from matplotlib.
-
-Time and series of a run as figures show them: from its start, in a fitting unit, without hours between two bags.
+On a map the cursor is a point on each track. The figure remains the only description: its lines, bands and limits are
+read back from matplotlib. Time axes start at zero, have a fitting unit, and omit long gaps between bags.
 """
 
 from __future__ import annotations
@@ -26,29 +23,32 @@ from numpy.typing import ArrayLike
 from ..calibration.numerics.frames import Array
 from .numbers import fitting_unit
 
-# Points of a line or cloud: a zoom of ten times still shows some, and a page stays small enough to be sent from a ship
+# points of a line or cloud: enough for a zoom of ten times, few enough to send the page from a ship
 POINTS = 1500
-# What marks axes over time and, on them, what was cut out; matplotlib's own free label of an artist
+# labels (matplotlib's free gid) of axes over time, and of the marks of omitted time
 TIME_MARK, BREAK_MARK = "time", "cut out"
 
 
 def mark_time(axes: Axes, run: str) -> None:
-    """Say that the x axis is the time of a run: figures of one run share cursor and zoom."""
+    """Mark the x axis as time of a run: figures of one run share cursor and zoom."""
     axes.set_gid(f"{TIME_MARK} {run}")
 
 
 class MapTrack(Line2D):
-    """A line on a map, once more and unseen, with the time of each of its points on the axis of the run's figures."""
+    """Invisible copy of a line on a map, with a time for each point.
+
+    The times are on the axis of the run's figures.
+    """
 
     def __init__(self, line: Line2D, run: str, times: Array) -> None:
-        """line: as it was drawn, of P points. times: (P,)."""
+        """Set up. line: drawn line of P points. times: (P,)."""
         super().__init__(*line.get_data(), color=line.get_color(), alpha=0.0)
         self.run = f"{TIME_MARK} {run}"
         self.times = times
 
 
 def explorable(figure: Figure) -> str:
-    """A drawn figure over time, or a map with tracks, as base64 of deflated JSON; "" for any other figure."""
+    """Return a drawn figure over time or map with tracks as base64 of deflated JSON; "" for any other figure."""
     axes = figure.axes[0]
     tracks = [line for line in axes.get_lines() if isinstance(line, MapTrack)]
     if tracks:
@@ -95,7 +95,7 @@ def _packed(plot: dict[str, Any]) -> str:
 
 
 def _map(figure: Figure, axes: Axes, tracks: Sequence[MapTrack]) -> dict[str, Any]:
-    """Where the points of tracks are in the picture, per cent from its left and upper edge."""
+    """Return the points of tracks in the picture, per cent from its left and upper edge."""
     shown = []
     for track in tracks:
         at = figure.transFigure.inverted().transform(axes.transData.transform(np.column_stack(track.get_data())))
@@ -105,7 +105,7 @@ def _map(figure: Figure, axes: Axes, tracks: Sequence[MapTrack]) -> dict[str, An
 
 
 def _sleeve(area: PolyCollection) -> dict[str, Any]:
-    """What fill_between drew: lowest and highest value at each position."""
+    """Return the lowest and highest value of a fill_between at each position."""
     vertices = np.asarray(area.get_paths()[0].vertices)
     red, green, blue, alpha = np.asarray(area.get_facecolor(), dtype=float)[0]
     x, group = np.unique(vertices[:, 0], return_inverse=True)
@@ -126,27 +126,27 @@ def _thinned(values: ArrayLike) -> Array:
 
 
 def _numbers(values: Iterable[float], digits: int = 4) -> list[float | None]:
-    """Numbers to so many digits, None for what is none."""
+    """Round numbers to `digits` significant digits; None if not finite."""
     return [float(f"{value:.{digits}g}") if np.isfinite(value) else None for value in values]
 
 
-# Points of a line: more cannot be seen at this width
+# points of a line; more are not visible at this width
 LINE_POINTS = 600
-# A gap is cut out if it is longer than this (s) and than this share of what was recorded in all ...
+# a gap is omitted if it is longer than this (s) and than this share of the recorded time ...
 CUT_FROM_S, CUT_SHARE = 60.0, 0.2
-# ... and this share of it is left.
+# ... and replaced by this share of the recorded time
 LEFT_SHARE = 0.02
 
 
 class TimeAxis:
-    """Turns stamps into what is plotted.
+    """Conversion of stamps to plot positions.
 
-    breaks: (B, 2) from and to where time was cut out, in the unit of the axis. label: with the unit. run: its name to
-    figures that share a cursor.
+    breaks: (B, 2) start and end of omitted time, in the unit of the axis. label: with the unit. run: name for figures
+    that share a cursor.
     """
 
     def __init__(self, stamps_ns: ArrayLike) -> None:
-        """From the stamps of the run, in order; at least one."""
+        """Set up from the stamps of the run, in order; at least one."""
         stamps = np.asarray(stamps_ns, dtype=np.int64)
         self._first_ns = stamps[0]
         self._seconds = (stamps - self._first_ns) * 1e-9
@@ -161,12 +161,12 @@ class TimeAxis:
         self.label = f"time from the start, {unit}" + (" (gaps cut out)" if cut.any() else "")
 
     def __call__(self, stamps_ns: ArrayLike) -> Array:
-        """Stamps (N,) ns within the run -> positions on the axis (N,)."""
+        """Convert stamps (N,) ns within the run to positions on the axis (N,)."""
         seconds = (np.asarray(stamps_ns, dtype=np.int64) - self._first_ns) * 1e-9
         return np.asarray(np.interp(seconds, self._seconds, self._shown))
 
     def dress(self, axes: Axes) -> None:
-        """Label the axis and mark what was cut out."""
+        """Label the axis and mark omitted time."""
         mark_time(axes, self.run)
         axes.set_xlabel(self.label)
         axes.set_xlim(self._shown[0], max(self._shown[-1], 1e-3))
@@ -178,13 +178,13 @@ class TimeAxis:
 
 
 def thin(n: int) -> slice:
-    """Every so many-th of n points, and so that the last one is among them."""
+    """Return a slice with an even step over n points that includes the last one."""
     step = max(1, -(-n // LINE_POINTS))
     return slice((n - 1) % step if n else 0, None, step)
 
 
 def running_mean(t: Array, values: Array, points: int = 31) -> tuple[Array, Array]:
-    """Positions and mean of so many neighbours; of fewer where there are not enough, nan across a gap."""
+    """Return positions and means of `points` neighbours (fewer for short runs); nan across a gap."""
     width = max(1, min(points, len(values) // 5))
     window = np.ones(width) / width
     mean = np.convolve(values, window, "valid")

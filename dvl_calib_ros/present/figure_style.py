@@ -1,7 +1,6 @@
-"""How figures look, and how they become part of a page.
+"""Style of figures, and their embedding in a page.
 
-Figures are made with matplotlib's object interface only: no pyplot, no window, nothing global but the settings that
-`drawing` holds for as long as it lasts.
+Figures use only matplotlib's object interface: no pyplot, no window, and no global settings outside `drawing`.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from ..calibration.models import MODELS
 from .figure_data import explorable
 
-# Inches. Narrow, so that the text is still legible where a phone shows the figure 340 pixels wide.
+# inches; narrow, so that text is legible on a phone that shows the figure 340 pixels wide
 WIDTH, HEIGHT = 4.6, 2.9
-# Of what is drawn as pixels inside the SVG: clouds of points
+# resolution of the parts drawn as pixels inside the SVG: clouds of points
 RASTER_DPI = 160
 
-# Petroff's ten colours, made to be told apart with any colour vision; the quiet ones first, for the baselines
+# Petroff's ten colours, distinguishable with any colour vision; muted ones first, for the baselines
 _COLOURS = (
     "#94a4a2",
     "#b9ac70",
@@ -94,9 +93,9 @@ MODEL_STYLES = _styles()
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure on a page. title and caption are text beside it, alt what it shows for who cannot see it.
+    """Figure on a page. title and caption: text next to it. alt: description for readers who cannot see it.
 
-    plot: a figure over time as data, for the script of the page; "" for any other.
+    plot: data of a figure over time for the page's script; "" for any other.
     """
 
     title: str
@@ -107,31 +106,31 @@ class Picture:
 
     @property
     def data_uri(self) -> str:
-        """The figure as the source of an <img>: there its ids and styles cannot clash with another figure's."""
+        """The figure as the source of an <img>, where its ids and styles cannot clash with another figure's."""
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg).decode()
 
 
 def drawing() -> AbstractContextManager[None]:
-    """Context in which figures are made and saved in the style of the reports."""
+    """Return a context in which figures are made and saved in the style of the reports."""
     return matplotlib.rc_context(_SETTINGS)
 
 
 def new_figure(height: float = HEIGHT) -> tuple[Figure, Axes]:
-    """A figure with one pair of axes; height in inches."""
+    """Return a figure with one pair of axes; height in inches."""
     figure = Figure(figsize=(WIDTH, height))
     return figure, figure.add_subplot()
 
 
 def line_widths(models: Sequence[str], selected: str = "") -> list[float]:
-    """Line widths: the selected model's is the widest, the others get thinner and lie on top.
+    """Return line widths: the selected model's is the widest, later ones are thinner.
 
-    So models that agree stay visible, the narrow ones upon the wide ones.
+    Models that agree stay visible, because the thin lines are drawn on the wide ones.
     """
     return [4.0 if name == selected else 2.2 - 1.2 * i / len(models) for i, name in enumerate(models)]
 
 
 def legend_above(axes: Axes, columns: int = 3, markerscale: float = 1.0) -> None:
-    """Legend over the axes, where it hides no data."""
+    """Draw the legend above the axes, where it hides no data."""
     axes.legend(
         loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, columnspacing=1.2, handlelength=1.4,
         handletextpad=0.5, markerscale=markerscale,
@@ -139,7 +138,7 @@ def legend_above(axes: Axes, columns: int = 3, markerscale: float = 1.0) -> None
 
 
 def plain_log_ticks(axis: Axis) -> None:
-    """Ticks of a logarithmic axis as plain numbers."""
+    """Format the ticks of a logarithmic axis as plain numbers."""
     low, high = axis.get_view_interval()
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 300.0 * low else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -147,7 +146,7 @@ def plain_log_ticks(axis: Axis) -> None:
 
 
 def picture(title: str, alt: str, draw: Callable[..., Figure], *arguments: Any, caption: str = "") -> Picture:
-    """Draw a figure from data and keep it as SVG."""
+    """Draw a figure from data and return it as SVG."""
     with drawing():
         figure = draw(*arguments)
         buffer = io.BytesIO()
@@ -155,7 +154,7 @@ def picture(title: str, alt: str, draw: Callable[..., Figure], *arguments: Any, 
     return Picture(title, alt, _PATH_DATA.sub(_rounded, buffer.getvalue()), caption, explorable(figure))
 
 
-# matplotlib writes paths to a millionth of a point; a hundredth cannot be seen and takes half the space
+# matplotlib writes paths to a millionth of a point; a hundredth is invisible and halves the size
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _DECIMALS = re.compile(rb"(\.\d\d)\d+")
 

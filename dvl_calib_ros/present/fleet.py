@@ -1,4 +1,4 @@
-"""What a catalogue of a fleet says."""
+"""Document of a fleet's catalogue."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from .document import (
 )
 from .numbers import counted, number, with_std
 
-# Speed of sound that instruments are delivered with, m/s
+# default speed of sound of instruments, m/s
 SET_SPEED = 1500.0
-# Recordings that are named of those that need a person for one reason
+# number of recordings named per reason to ask a person
 NAMED = 4
 MOVEMENTS = ("MOUNTING_MOVED", "MOUNTING_SUSPICIOUS", "MOUNTING_SUSPECTED")
 _ANGLES_AND_SCALE = tuple(each for each in QUANTITIES if each.component in (0, 1, 2, SCALE))
 
 
 def fleet(result: Fleet) -> Document:
-    """The mounting of each vehicle over time, speed of sound, heading, and which recordings need a person."""
+    """Lay out the mounting of each vehicle over time, speed of sound, heading, and recordings that need a person."""
     vehicles = result.vehicles
     recordings = result.recordings
     persons = sum(len(each.recordings) for each in result.persons)
@@ -62,7 +62,7 @@ def fleet(result: Fleet) -> Document:
         said = ["No vehicle has two days that show the same angle, so nothing can be compared."]
     said.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
-    sitting = [VehicleNow(each, now(each)) for each in sorted(vehicles, key=_by_need)]
+    sitting = [VehicleNow(each, now(each)) for each in sorted(vehicles, key=_urgency)]
     speeds = [
         VehicleSpeeds(each, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.value[SCALE]))
         for each in vehicles
@@ -104,15 +104,15 @@ def fleet(result: Fleet) -> Document:
     )
 
 
-def _by_need(vehicle: VehicleHistory) -> int:
-    """Those whose mounting moved come first, then those that nothing is known of."""
+def _urgency(vehicle: VehicleHistory) -> int:
+    """Return the sort key: vehicles whose mounting moved first, then those without a comparison."""
     if vehicle.compared is None:
         return WORDS.index("same") if vehicle.days else WORDS.index("suspicious")
     return WORDS.index(vehicle.compared.word) + (vehicle.compared.word == "same")
 
 
 def now(vehicle: VehicleHistory) -> Extrinsics | None:
-    """The mounting as it is since it last moved; None where no recording is usable."""
+    """Return the mounting since it last moved; None if no recording is usable."""
     days = vehicle.days
     if not days:
         return None
@@ -123,19 +123,19 @@ def now(vehicle: VehicleHistory) -> Extrinsics | None:
 
 
 class VehicleNow(NamedTuple):
-    """A vehicle with its mounting as it is, None where no recording is usable."""
+    """A vehicle with its current mounting, None if no recording is usable."""
 
     history: VehicleHistory
     mounting: Extrinsics | None
 
     @property
     def word(self) -> str:
-        """What comparing its days says."""
+        """Result of comparing the vehicle's days."""
         return "not compared" if self.history.compared is None else self.history.compared.word
 
     @property
     def why(self) -> str:
-        """Why its days are not compared; '' where they are."""
+        """Why the days are not compared; '' if they are."""
         if self.history.compared is not None:
             return ""
         days = len(self.history.days)
@@ -143,13 +143,13 @@ class VehicleNow(NamedTuple):
 
     @property
     def seen_from(self) -> str:
-        """Movement in degrees that is found of the angle that is known worst."""
+        """Detectable movement, degrees, of the least known angle."""
         compared = self.history.compared
         return "–" if compared is None else f"{math.degrees(float(np.nanmax(compared.smallest, initial=0.0))):.1f}"
 
     @property
     def moved(self) -> int:
-        """How many times its mounting moved."""
+        """Number of times the mounting moved."""
         return 0 if self.history.compared is None else len(self.history.compared.moved)
 
 
@@ -178,7 +178,7 @@ VEHICLES: Columns[VehicleNow] = {
         ),
     ),
 }
-SEVERAL_NOTE = "Of several recordings the sentence is that of the first."
+SEVERAL_NOTE = "With several recordings the sentence is about the first."
 PERSONS: Columns[NeedsPerson] = {
     "recordings": lambda each: str(len(each.recordings)),
     "why": lambda each: Cell(
@@ -210,20 +210,20 @@ def _trend(name: str, compared: Comparison) -> Section:
 
 
 SPEED_NOTE = (
-    "A scale is what a wrong speed of sound looks like: if that explains all of it, the water had these speeds. Where "
-    f"no recording tells what the DVL was set to, {SET_SPEED:.0f} m/s are assumed."
+    "A wrong speed of sound causes a scale error: if it causes all of it, the water had these speeds. If "
+    f"no recording has the DVL's setting, {SET_SPEED:.0f} m/s are assumed."
 )
 
 
 class VehicleSpeeds(NamedTuple):
-    """A vehicle and its days that show a scale, the smallest scale first."""
+    """A vehicle and its days with an observable scale, the smallest scale first."""
 
     history: VehicleHistory
     days: Sequence[Extrinsics]
 
     @property
     def set_to(self) -> float:
-        """Speed of sound that the DVL used in the newest recording that tells, m/s; else what is usual."""
+        """Speed of sound setting of the DVL in the newest recording that has it, m/s; else the default."""
         used = math.nan if self.history.water is None else self.history.water.used
         return SET_SPEED if math.isnan(used) else used
 
@@ -245,12 +245,12 @@ SPEEDS: Columns[VehicleSpeeds] = {
 
 
 def deviation(heading: CompassDeviation, yaw: np.ndarray) -> np.ndarray:
-    """Degrees at yaws (N,) rad."""
+    """Return the heading deviation in degrees at yaws (N,) rad."""
     terms = np.stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)], axis=1)
     found: np.ndarray = terms @ heading.value
     return found
 
 
 def largest(heading: CompassDeviation) -> float:
-    """Of all headings, degrees."""
+    """Return the largest absolute deviation over all headings, degrees."""
     return float(np.abs(deviation(heading, np.linspace(0.0, 2.0 * math.pi, 361))).max())

@@ -1,11 +1,7 @@
-"""From data to a page: the template engine, tables, and the writing of the file.
+"""HTML pages: the template engine, tables, and writing of a self-contained report.
 
-Everything that comes from a bag or a folder is escaped by the engine. By its content security policy the page runs
-the two scripts that stand in it, known by their hashes, and nothing else, and has no access to the network.
-
-Reports that people read: one self-contained HTML file of a result.
-
-Needs matplotlib and jinja2: nobody imports this but when a report is asked for.
+Texts from bags and folders are escaped by the engine. The page's content security policy allows only its two embedded
+scripts, by their hashes, and no network access. Needs matplotlib and jinja2, so it is imported only for a report.
 """
 
 from __future__ import annotations
@@ -34,12 +30,12 @@ from .result_documents import DOCUMENTS
 
 
 def breakable(text: str) -> Markup:
-    """A text that may be broken within names of topics and files, but only between their parts."""
+    """Allow line breaks in a text, within topic and file names only between their parts."""
     return Markup(re.sub(r"([/_])(?=\w)", r"\1<wbr>", str(escape(text))))
 
 
 def plain(value: Any) -> str:
-    """A parameter as it is shown."""
+    """Format a parameter."""
     if isinstance(value, list):
         return " ".join(map(plain, value))
     return f"{value:.6g}" if isinstance(value, float) else str(value) or "''"
@@ -64,7 +60,7 @@ def write_document(path: Path, document: Document) -> None:
     if not any(isinstance(item, Warned) for section in sections for item in section.items):
         sections.insert(0, Section("", [Warned()]))
     environment = _environment()
-    # uPlot (MIT, uplot.LICENSE) draws, explore.js gives it the data of the figures
+    # uPlot (MIT, uplot.LICENSE) draws, explore.js passes the figures' data to it
     scripts = [Markup(environment.get_template(name).render().strip()) for name in ("uplot.js", "explore.js")]
     digests = (base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts)
     page = environment.get_template("document.html").render(
@@ -80,7 +76,7 @@ def write_document(path: Path, document: Document) -> None:
 
 
 def fragment(document: Document) -> str:
-    """HTML of the answer, its sentences and tables, for a notebook: what a terminal shows of a document."""
+    """Return HTML of the answer, sentences and tables for a notebook, as on a terminal."""
     sections = [each for each in document.sections if each.where is not Where.PAGE and each.items]
     context = {"document": document, "sections": sections}
     return _environment().get_template("fragment.html").render(context).strip()
@@ -90,7 +86,7 @@ __all__ = ["write_replay_report", "write_report"]
 
 
 def write_report(path: Path, result: Any) -> None:
-    """Write the report (HTML); of a comparison the picture alone if `path` ends in .png.
+    """Write the report (HTML); for a comparison and a path ending in .png only the picture.
 
     Raises InputError if it cannot be written.
     """
@@ -101,5 +97,5 @@ def write_report(path: Path, result: Any) -> None:
 
 
 def write_replay_report(path: Path, run: Replayed, bags: Sequence[Path], models: Sequence[str]) -> None:
-    """Write the report of a replay that was run with a history. models: names to show. Raises InputError."""
+    """Write the report of a replay with history. models: names to show. Raises InputError."""
     write_document(path, replayed(run, bags, models))

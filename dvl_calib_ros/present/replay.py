@@ -1,4 +1,4 @@
-"""What a replay says: what to do with the calibration, the mounting found, what it is worth, and what to type next."""
+"""Document of a replay: verdict, mounting, drift and next commands."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from .document import (
 from .error_terms import estimate_table
 from .numbers import fitting_unit, typed
 
-# What the verdict's word asks of the reader.
+# advice for each verdict
 ADVICE = {
     Severity.ACCEPT: "Use this calibration.",
     Severity.MARGINAL: "Use this calibration with care.",
@@ -56,13 +56,13 @@ ADVICE = {
 }
 EARTH = (VelocityFrame.ENU, VelocityFrame.NED)
 FAMILIES = ((True, "Models with GNSS"), (False, "Models without GNSS"))
-# Which way is plus, for who mounts it
+# positive direction of each quantity, for the installer
 _AXES = {
     "scale": "scale of motion ahead",
 }
 
 
-NO_MOUNTING = "No mounting is given. What the models estimate is in the details (--verbose)."
+NO_MOUNTING = "No mounting is given. The models' estimates are in the details (--verbose)."
 AGAINST_TRAVEL = (
     "Without a reference the angles are relative to the direction of travel: a constant sideslip looks like yaw, and "
     "driving astern looks like a DVL turned by 180°."
@@ -74,8 +74,8 @@ AGAINST_IMU = (
 STRAIGHT = "A straight kilometre of dead reckoning ends {0.before} m off as mounted, {0.after} m corrected (1σ)."
 NO_RESIDUALS = ". No reference is beside enough of them for residuals."
 RESIDUALS = (
-    "; residuals are at the reference point, corrected by estimates that had not seen the data, with all that was "
-    "found, lever arm and delay too. The noise of the reference is in them. Lines are running means."
+    "; residuals are at the reference point, corrected by estimates without this data, with everything "
+    "found, including lever arm and delay. They include the reference's noise. Lines are running means."
 )
 HELD_OUT_NOTE = (
     "Each block of the run was held back in turn and corrected with a calibration that had not seen it. Velocity error "
@@ -141,23 +141,22 @@ def replayed(
     warnings: Sequence[str] | None = None,
     commands: Sequence[str] = (),
 ) -> Document:
-    """The answer of a replay.
+    """Lay out the result of a replay.
 
     Parameters
     ----------
     run
         The replay; a page has its pictures if it was run with a history.
     bags
-        What was replayed.
+        Replayed bags.
     models
-        Names to show; the selected one is always among them.
+        Names to show, in addition to the selected one.
     details
-        Whether a terminal shows the models and the counts as well.
+        Whether a terminal also shows the models and the counts.
     warnings
-        What to warn of; None for all notes, those of models that were not chosen folded away.
+        Warnings; None for all notes, with those of other models folded away.
     commands
-        What to type next.
-
+        Commands to type next.
     """
     result, history, drift = run.result, run.history, run.navigation
     shown = [name for name in result.estimates if name in models or name == result.selected]
@@ -169,7 +168,7 @@ def replayed(
     own = [note for note in notes if not note.startswith(others)] if warnings is None else warnings
     where = Where.BOTH if details else Where.PAGE
     streams = [(name, result.counts[key]) for key, name in _STREAMS]
-    # an angle that the data do not show is none to put on a vehicle
+    # an angle that is not observable must not be put on a vehicle
     is_shown = not rejected and any(each.shown for each in quantities(result)[:3])
     worth = Worth(*map(metres, straight_kilometre(result))) if is_shown else None
     return Document(
@@ -189,10 +188,10 @@ def replayed(
             section(
                 "", Sentence("Corrected mounting, ready to paste:", soft=True) if is_shown else None, where=Where.PAGE
             ),
-            section("", _paste(run) if is_shown else None),
+            section("", _mounting_to_copy(run) if is_shown else None),
             section("", Warned(), where=Where.PAGE),
             section(
-                "What it means for navigation",
+                "Effect on navigation",
                 None if worth is None else Sentence(STRAIGHT.format(worth)),
                 *map(Sentence, in_words(drift) if drift else ()),
                 figures("replay_figures.navigation_pictures", drift, {"": drift}, "", history.stamps_ns)
@@ -221,9 +220,9 @@ def replayed(
 
 
 def straight_kilometre(result: Result) -> tuple[float, float]:
-    """Return how far dead reckoning ends beside a straight kilometre, m (1σ): as mounted, and with the correction.
+    """Return the error of dead reckoning after a straight kilometre, m (1σ): as mounted, and with the correction.
 
-    What is not known of the correction is not known of the mounting as it is either.
+    The uncertainty of the correction is included in both.
     """
     parameters = Parameters.from_mapping(result.parameters)
     ahead, nominal = np.eye(3)[0], parameters.rotation_dvl_from_body
@@ -244,7 +243,7 @@ def _answer(verification: Verification | None) -> Answer:
 
 
 def _headline(run: Replayed, rejected: bool) -> str:
-    """By how much the mounting is off, by which model, from how much data; after a reject no mounting."""
+    """Return rotation from the configured mounting, model and amount of data; no mounting after a reject."""
     result = run.result
     seconds = 1e-9 * ((result.last_ns or 0) - (result.first_ns or 0)) - run.pause_s
     data = f"(model {result.selected}, {seconds:.0f} s of data)"
@@ -253,11 +252,11 @@ def _headline(run: Replayed, rejected: bool) -> str:
     parameters = Parameters.from_mapping(result.parameters)
     turn = parameters.rotation_dvl_from_body @ result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
     angle = math.degrees(math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(turn)) - 1.0)))))
-    return f"The DVL is turned by {angle:.2f}° from its nominal place in {parameters.base_frame} {data}"
+    return f"The DVL is rotated by {angle:.2f}° from its configured mounting in {parameters.base_frame} {data}"
 
 
 def _mounting(run: Replayed) -> Iterator[Item]:
-    """What was found, what the angles are measured against, whose own error stays in them, and what is not shown."""
+    """Yield the mounting found, the reference of the angles with its own error, and unobservable quantities."""
     body_axes = Parameters.from_mapping(run.result.parameters).body_axes
     names = _AXES | {f"lever arm {axis}": f"lever arm, {where}" for axis, where in zip("xyz", body_axes, strict=True)}
     numbers = [
@@ -282,11 +281,11 @@ def _mounting(run: Replayed) -> Iterator[Item]:
     if (cause := run.cause_of_scale) is not None:
         yield Sentence(cause.sentence)
     if run.result.iac_model in run.result.estimates and run.result.iac_model != run.result.selected:
-        yield Sentence(_of_iac(run.result))
+        yield Sentence(_iac_sentence(run.result))
 
 
-def _of_iac(result: Result) -> str:
-    """What the paper's own selection says of roll, pitch, yaw and scale."""
+def _iac_sentence(result: Result) -> str:
+    """Return the result of the paper's own selection for roll, pitch, yaw and scale."""
     found = quantities(replace(result, selected=result.iac_model))
     said = ", ".join(
         f"{each.name} {each.in_unit(each.value)} ± {each.in_unit(each.std)}" if each.shown else f"{each.name} not shown"
@@ -295,8 +294,8 @@ def _of_iac(result: Result) -> str:
     return f"The paper's own selection (iac, {result.iac_model}): {said}."
 
 
-def _paste(run: Replayed) -> Commands:
-    """The corrected mounting as a URDF joint's origin, of forward-right-down data with both axes, and for tf2."""
+def _mounting_to_copy(run: Replayed) -> Commands:
+    """Return the corrected mounting to copy: URDF origin (for forward-right-down data with both axes) and tf2."""
     result = run.result
     parameters = Parameters.from_mapping(result.parameters)
     rotation = result.estimate.rotation_body_from_dvl(parameters.rotation_dvl_from_body)
@@ -313,7 +312,7 @@ def _paste(run: Replayed) -> Commands:
 
 
 def _held_out(result: Result, shown: Sequence[str]) -> Iterator[Item]:
-    """What each model's correction did to data that it had not seen."""
+    """Yield the errors of each model's correction on held-out data."""
     verifications = {name: result.verifications[name] for name in shown if name in result.verifications}
     judged = {name: each.held_out for name, each in verifications.items() if each.held_out is not None}
     if judged:
@@ -329,7 +328,7 @@ def _held_out(result: Result, shown: Sequence[str]) -> Iterator[Item]:
 
 
 def _over_time(run: Replayed, shown: Sequence[str]) -> Iterator[Section]:
-    """Estimates over time and innovations, for the models with GNSS and for those without; velocities."""
+    """Yield estimates over time and innovations, for models with and without GNSS; velocities."""
     result, history = run.result, run.history
     if history is None:
         return
@@ -350,7 +349,7 @@ def _over_time(run: Replayed, shown: Sequence[str]) -> Iterator[Section]:
 def next_commands(
     run: Replayed, bags: Sequence[Path], saved: Path | None, options: Sequence[str], doubts: bool
 ) -> list[str]:
-    """What to type next, in order. options: of this run, which the next needs as well."""
+    """Return the commands to type next, in order. options: options of this run that the next one needs."""
     verdict = run.result.verifications[run.result.selected].verdict
     if verdict is Severity.REJECT:
         moved = run.recordings is not None and run.recordings.moved

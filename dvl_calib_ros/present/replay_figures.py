@@ -1,10 +1,6 @@
-"""The figures of a replay: functions from plain arrays to a matplotlib Figure, units on every axis.
+"""Figures of a replay: functions from plain arrays to a matplotlib Figure, units on every axis.
 
-How the DVL sits on the vehicle: its axes as configured and as found, from above and from the side.
-
-Figures of dead reckoning: the track on a map, and how far it is astray along it.
-
-A calibration in one picture: the mounting as it settles, and the velocity error before and after.
+They show estimates over time, the DVL's axes on the vehicle, dead reckoning on a map, and a summary in one picture.
 """
 
 from __future__ import annotations
@@ -56,7 +52,7 @@ class ModelLine(NamedTuple):
 def estimate_over_time(
     time: TimeAxis, stamps_ns: Array, lines: Sequence[ModelLine], selected: str, label: str
 ) -> Figure:
-    """One error term with the ±1σ sleeves of several models; the selected one stands out."""
+    """Draw one error term with the ±1σ bands of several models; the selected one is highlighted."""
     figure, axes = new_figure()
     kept = thin(len(stamps_ns))
     t = time(stamps_ns)[kept]
@@ -74,7 +70,7 @@ def estimate_over_time(
 
 
 def _settled_range(lines: Sequence[ModelLine]) -> tuple[float, float]:
-    """Limits that show every estimate from the first tenth on, and its σ at the end; not the prior's width."""
+    """Return limits for every estimate after the first tenth, and its final σ, without the prior's width."""
     settled = [line.value[len(line.value) // 10 :] for line in lines]
     low = min(min(value.min(), line.value[-1] - line.std[-1]) for value, line in zip(settled, lines, strict=True))
     high = max(max(value.max(), line.value[-1] + line.std[-1]) for value, line in zip(settled, lines, strict=True))
@@ -85,7 +81,7 @@ def _settled_range(lines: Sequence[ModelLine]) -> tuple[float, float]:
 def velocity_over_time(
     time: TimeAxis, dvl_ns: Array, before: Array, after: Array, reference_ns: Array, reference: Array, label: str
 ) -> Figure:
-    """One body axis of the velocity: DVL before (N,) and after correction (N,), and the reference (M,), m/s."""
+    """Draw one body axis of the velocity: DVL before (N,) and after correction (N,), and the reference (M,), m/s."""
     figure, axes = new_figure()
     kept = thin(len(reference_ns))
     if len(reference_ns):
@@ -104,7 +100,7 @@ def velocity_over_time(
 
 
 def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: Array, label: str) -> Figure:
-    """DVL minus reference (N,) along one body axis, before and after correction, m/s: points and running mean."""
+    """Draw DVL minus reference (N,) along one body axis, before and after correction, m/s: points and running mean."""
     figure, axes = new_figure()
     t = time(stamps_ns)
     for residual, colour, name in ((before, BAD, "before"), (after, AFTER, "after")):
@@ -123,7 +119,7 @@ def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: A
 def selection_over_time(
     time: TimeAxis, segments: Sequence[tuple[str, int, int]], stamps_ns: Array, paired_share: Array
 ) -> Figure:
-    """Which model was selected, (name, from, to) in ns, and the share of the samples (N,) that had a reference."""
+    """Draw the selected model, (name, from, to) in ns, and the share of samples (N,) with a reference."""
     names = list(dict.fromkeys(name for name, _, _ in segments))
     figure, axes = new_figure(height=1.0 + 0.36 * (len(names) + 1))
     for name, start, end in segments:
@@ -141,7 +137,7 @@ def selection_over_time(
 
 
 def _filled_from_next(values: Array) -> Array:
-    """(N,) with every nan replaced by the next number: a slow receiver decides several samples at once."""
+    """Replace every nan in (N,) by the next number: a slow receiver decides several samples together."""
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
         return np.zeros_like(values)
@@ -150,7 +146,7 @@ def _filled_from_next(values: Array) -> Array:
 
 
 def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Array], selected: str) -> Figure:
-    """Mean normalised innovation squared per measurement row (N,) of several models; 1 is what they expect."""
+    """Draw the mean normalised innovation squared per measurement row (N,) of several models; 1 is expected."""
     figure, axes = new_figure()
     t = time(stamps_ns)
     for (name, values), width in zip(nis.items(), line_widths(list(nis), selected), strict=True):
@@ -171,7 +167,7 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
 
 
 def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) -> Figure:
-    """Bars of how many DVL samples each model used, gated, or was not given, by reason."""
+    """Draw bars of the DVL samples that each model used, gated, or was not given, by reason."""
     colours = (GOOD, BAD, WARNING, FAINT, "#8d99a6", "#d8dde1")
     figure, axes = new_figure(height=1.1 + 0.28 * len(models))
     left = np.zeros(len(models))
@@ -188,7 +184,7 @@ def samples_by_fate(models: Sequence[str], counts: Mapping[str, Sequence[int]]) 
 
 
 def held_out_errors(labels: Sequence[str], uncorrected: Array, corrected: Array, predicted: Array) -> Figure:
-    """Velocity error on data held back (N,), m/s rms. Points, not bars from zero: the reference's noise is in each."""
+    """Draw velocity errors on held-out data (N,), m/s rms. Points, because each includes the reference's noise."""
     figure, axes = new_figure(height=1.2 + 0.27 * len(labels))
     rows = np.arange(len(labels))
     axes.hlines(rows, corrected, uncorrected, color=FAINT, linewidth=1.6)
@@ -204,16 +200,16 @@ def held_out_errors(labels: Sequence[str], uncorrected: Array, corrected: Array,
     return figure
 
 
-# A turn is drawn as large as this (rad) if it is smaller, by a whole number of times up to so many: 1° is not seen.
+# a smaller rotation is enlarged to this (rad), by an integer factor up to this limit: 1° is not visible
 _SEEN, _MOST_TIMES = math.radians(12.0), 20
-# Length of a vehicle whose DVL is in its middle, and of the axes drawn, m and a share of it; its height by its length
+# length of the drawn vehicle, m; drawn axes as a share of it; its height divided by its length
 _LENGTH, _AXIS, _SLENDER = 2.0, 0.25, 0.3
-# Two axes of the body, and who looks along the third
+# two axes of the body, and the viewpoint on the third
 _VIEWS = ((0, 1, "from above"), (0, 2, "from starboard"))
 
 
 def mounting_pictures(result: Result) -> list[Picture]:
-    """From above and from the side; the place is drawn where it is known."""
+    """Draw the DVL from above and from the side, at its position if known."""
     parameters = Parameters.from_mapping(result.parameters)
     nominal = rotation_from_rpy(parameters.mounting_rpy)
     found = result.estimate.rotation_body_from_dvl(nominal.T)
@@ -249,14 +245,14 @@ def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Se
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("ahead, m")
     axes.set_ylabel(f"{name}, m")
-    if down:  # port stays on the left, the surface above
+    if down:  # port stays on the left, the surface on top
         axes.invert_yaxis()
     legend_above(axes)
     return figure
 
 
 def _axes_of_dvl(axes: Axes, ends: Array, at: tuple[float, float], length: float, colour: str, label: str) -> None:
-    """Axes of a DVL, ends (2, 3) in this view, from where it is; one that points at who looks is left out."""
+    """Draw the DVL's axes, ends (2, 3) in this view; one that points at the viewer is omitted."""
     for index, axis in enumerate("xyz"):
         along = length * ends[:, index]
         if float(np.hypot(*along)) < 0.3 * length:
@@ -265,12 +261,12 @@ def _axes_of_dvl(axes: Axes, ends: Array, at: tuple[float, float], length: float
         axes.annotate("", tip, at, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.8})
         if colour == AFTER:
             axes.text(at[0] + 1.15 * along[0], at[1] + 1.15 * along[1], axis, color=colour, ha="center", va="center")
-            axes.update_datalim([(at[0] + 1.3 * along[0], at[1] + 1.3 * along[1])])  # no letter on a title
+            axes.update_datalim([(at[0] + 1.3 * along[0], at[1] + 1.3 * along[1])])  # keeps letters off the title
     axes.plot([], [], color=colour, label=label)
     axes.plot(*at, "o", color=colour, markersize=4.0)
 
 
-# A map is as high as it is wide at most, and never a strip, inches
+# a map is at most as high as wide, and never a strip, inches
 HIGHEST, LOWEST = WIDTH, 2.2
 _OTHERS = (AFTER, "#2a7f62", "#832db6", "#a96b59")
 
@@ -278,10 +274,10 @@ _OTHERS = (AFTER, "#2a7f62", "#832db6", "#a96b59")
 def navigation_pictures(
     one: Navigation, corrected: Mapping[str, Navigation], where: str = "", stamps_ns: Array | None = None
 ) -> Sequence[Picture]:
-    """Map, if headings are known, and error along the track.
+    """Draw a map, if headings are known, and the error along the track.
 
-    one: whose reference and uncorrected track are drawn. corrected: by what corrected it, '' for one alone; the first
-    four are drawn. stamps_ns: of figures whose cursor the map follows.
+    one: its reference and uncorrected track are drawn. corrected: tracks by their correction ('' for a single one); the
+    first four are drawn. stamps_ns: of figures whose cursor the map follows.
     """
     told = "; ".join(f"{name or 'corrected'} {each.after.end:.1f} m" for name, each in corrected.items())
     alt = f"over {one.distance_m:.0f} m; off at the end: as mounted {one.before.end:.1f} m; {told}"
@@ -290,15 +286,15 @@ def navigation_pictures(
     if one.on_a_map:
         figures.append(
             picture(f"Track{where}", f"Map of the track {alt}", track_map, one, corrected, time,
-                    caption="From the same start; the corrected track by estimates that had not seen the data, its "
-                    "colour by how far it is off the reference.")
+                    caption="From the same start; the corrected track by estimates without this data, its "
+                    "colour by its distance from the reference.")
         )  # fmt: skip
     figures.append(picture(f"Error of position{where}", f"Error of dead reckoning {alt}", error_along, one, corrected))
     return figures
 
 
 def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAxis | None = None) -> Figure:
-    """East and north, m, the same scale along both. time: of the figures whose cursor is followed."""
+    """Draw east and north, m, with equal scales. time: of the figures whose cursor is followed."""
     drawn = [one.reference, one.track_before, *(each.track_after for each in corrected.values())]
     every = np.concatenate(drawn)
     east, north = np.ptp(every, axis=0)
@@ -309,7 +305,7 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
     for (name, each), colour in zip(corrected.items(), _OTHERS, strict=False):
         lines += axes.plot(*each.track_after.T, color=colour, linewidth=1.2, label=name or "corrected")
     if len(corrected) == 1:
-        lines[-1].set(alpha=0.0, label="_corrected")  # the bar of colours says it
+        lines[-1].set(alpha=0.0, label="_corrected")  # the colour bar is the legend
         _coloured(figure, axes, one)
     if time is not None:
         for line in lines:
@@ -326,7 +322,7 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
 
 
 def _coloured(figure: Figure, axes: Axes, one: Navigation) -> None:
-    """The corrected track, by its distance from the reference's."""
+    """Draw the corrected track, coloured by its distance from the reference's."""
     off = np.linalg.norm(one.track_after - one.reference, axis=1)
     parts = np.stack([one.track_after[:-1], one.track_after[1:]], axis=1)
     track = LineCollection(list(parts), cmap="viridis", linewidths=1.6, zorder=3.0)
@@ -339,7 +335,7 @@ def _coloured(figure: Figure, axes: Axes, one: Navigation) -> None:
 
 
 def error_along(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:
-    """Distance of the dead-reckoned position from the reference's, m, along the track."""
+    """Draw the distance of the dead-reckoned position from the reference's, m, along the track."""
 
     def off(each: Navigation, track: Array) -> Array:
         return np.asarray(np.linalg.norm(track - each.reference, axis=1))
@@ -357,12 +353,12 @@ def error_along(one: Navigation, corrected: Mapping[str, Navigation]) -> Figure:
 
 
 _COLOURS = ("#1f6fb2", "#2a7f62", "#c0392b")
-# Share of the run at its beginning that does not set the limits: the prior's width would
+# share of the run at its beginning that does not set the limits, because the prior is wide
 _SETTLING = 0.1
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows by itself, without pyplot and its state."""
+    """Figure that a notebook displays without pyplot."""
 
     def _repr_png_(self) -> bytes:
         target = io.BytesIO()
@@ -371,9 +367,9 @@ class NotebookFigure(Figure):
 
 
 def calibration_figure(replayed: Replayed) -> Figure:
-    """Above, roll, pitch and yaw over time with ±1σ, less those configured; below, the velocity error of samples.
+    """Draw roll, pitch and yaw minus the configured ones over time with ±1σ; below, the velocity error of samples.
 
-    replayed: with a history. Degrees; m/s, corrected by estimates that had not seen the data, with all that was found.
+    replayed: with a history. Degrees; m/s, corrected by estimates without this data, with everything found.
     """
     result, history, navigation = replayed.result, replayed.history, replayed.navigation
     if history is None:
@@ -388,7 +384,7 @@ def calibration_figure(replayed: Replayed) -> Figure:
     turned = np.degrees([corrected_rpy(each, parameters) for each in phi]) - np.degrees(parameters.mounting_rpy)
     std = np.degrees([rpy_std(*each, parameters) for each in zip(phi, model.misalignment_covariance, strict=True)])
     settled = slice(int(_SETTLING * len(time)), None)
-    for axis, found in enumerate(quantities(result)[:3]):  # whose σ is also of the next recording
+    for axis, found in enumerate(quantities(result)[:3]):  # σ includes the change to the next recording
         value, sleeve = turned[:, axis], std[:, axis]
         label = f"{found.name} {value[-1]:+.2f}° ± {found.in_unit(found.std)}"
         angles.fill_between(time, value - sleeve, value + sleeve, color=_COLOURS[axis], alpha=0.15, linewidth=0)
@@ -413,12 +409,12 @@ def calibration_figure(replayed: Replayed) -> Figure:
 
 
 def _errors(axes: Axes, time: Array, error: Array, name: str, colour: str) -> None:
-    """Points of the length of an error (N, 3), with its root mean square."""
+    """Draw the length of an error (N, 3) as points, with its root mean square."""
     length = np.linalg.norm(error, axis=1)
     rms = float(np.sqrt(np.mean(length**2)))
     axes.plot(time, length, ".", markersize=3, color=colour, alpha=0.6, label=f"{name}: {rms:.3f} m/s rms")
 
 
 def _legend_above(axes: Axes) -> None:
-    """One line above the axes, where it hides nothing."""
+    """Draw the legend in one line above the axes, where it hides nothing."""
     axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize="small", frameon=False)

@@ -1,4 +1,4 @@
-"""Pictures of a replay: estimates over time, velocities, what became of the samples."""
+"""Pictures of a replay: estimates over time, velocities, use of the samples."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .error_terms import ANGLES, ANY_SCALE, SCALES, Term, scale_terms, state_of
 from .figure_data import TimeAxis
 from .figure_style import Picture, picture
 
-# What becomes of DVL samples, by model
+# use of DVL samples, by model
 FATES: Mapping[str, Callable[[Result, str], int]] = {
     "used": lambda result, name: result.estimates[name].used,
     "gated": lambda result, name: result.estimates[name].gated,
@@ -28,7 +28,7 @@ FATES: Mapping[str, Callable[[Result, str], int]] = {
 
 
 def estimate_pictures(result: Result, history: RunHistory, models: Sequence[str]) -> Iterable[Picture]:
-    """What some models estimate over time, and their innovations."""
+    """Draw the estimates of some models over time, and their innovations."""
     time = TimeAxis(history.stamps_ns)
     for term in (*ANGLES, *_scales_shown(models)):
         lines = [
@@ -47,12 +47,12 @@ def estimate_pictures(result: Result, history: RunHistory, models: Sequence[str]
     yield picture(
         "Innovations (NIS)", "Mean normalised innovation squared over time; 1 is expected",
         figures.innovations_over_time, time, history.stamps_ns, nis, result.selected,
-        caption="Running mean. The line at 1 is what the model expects: above it the σ is too small, below too large.",
+        caption="Running mean. The model expects 1 (line): above it the σ is too small, below too large.",
     )  # fmt: skip
 
 
 def _scales_shown(models: Sequence[str]) -> list[Term]:
-    """One figure for the scale; one for each axis if a model has more than one scale error."""
+    """Return one figure for the scale, or one per axis if a model has more than one scale error."""
     if any(len(scale_terms(MODELS[name])) > 1 for name in models):
         return list(SCALES)
     return [ANY_SCALE]
@@ -64,7 +64,7 @@ def _line(name: str, history: ModelHistory, term: Term) -> figures.ModelLine:
 
 
 def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
-    """Velocity and, with a reference, residual, per body axis."""
+    """Draw velocity and, with a reference, residual, per body axis."""
     time = TimeAxis(history.stamps_ns)
     parameters = Parameters.from_mapping(replayed.result.parameters)
     t = parameters.rotation_dvl_from_body
@@ -92,7 +92,7 @@ def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
 
 
 def data_pictures(result: Result, history: RunHistory, shown: Sequence[str]) -> list[Picture]:
-    """What became of the samples, and which model was selected when."""
+    """Draw the use of the samples, and the selected model over time."""
     time = TimeAxis(history.stamps_ns)
     fates = {fate: [count(result, name) for name in shown] for fate, count in FATES.items()}
     ends = [*(segment.from_ns for segment in result.segments[1:]), result.last_ns]
@@ -107,6 +107,6 @@ def data_pictures(result: Result, history: RunHistory, shown: Sequence[str]) -> 
         picture(
             "Selected model and GNSS", f"Which model was selected over time: {switches}; and when GNSS was there",
             figures.selection_over_time, time, segments, history.stamps_ns, history.paired_share,
-            caption="GNSS: dark where DVL samples had a GNSS velocity beside them.",
+            caption="GNSS: dark where DVL samples had a GNSS velocity at their time.",
         ),
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""What a result says, by its type."""
+"""Document of a result, by the result's type."""
 
 from __future__ import annotations
 

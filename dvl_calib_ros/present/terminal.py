@@ -1,4 +1,4 @@
-"""A document on a terminal of any width: what is too wide is folded, so that no number is cut off."""
+"""Documents on a terminal of any width; wide tables are folded so that no number is cut off."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from rich.padding import Padding
     from rich.text import Text
 
-# Cells up to this width stay on one line; longer ones are sentences, which may be broken between words.
+# Cells up to this width stay on one line; longer ones are sentences, which may break between words.
 SHORT = 20
-# Beside its widest cell a column takes two blanks and a line.
+# two blanks and a line next to a column
 _BESIDE = 3
 
 
 class Folding:
-    """A table as it is if it fits, else in several tables with the first columns in each, else one line per cell."""
+    """Table unchanged if it fits, else split into tables that repeat the first columns, else one line per cell."""
 
     def __init__(self, table: RichTable) -> None:
         self._table = table
@@ -49,7 +49,7 @@ class Folding:
 
 
 def _keep_short(console: Console, options: ConsoleOptions, column: Column) -> int:
-    """Keep a column of short cells on single lines; its least width, with what is beside it, that cuts nothing off."""
+    """Keep a column of short cells on single lines. Return the smallest width, with borders, that cuts nothing off."""
     wide = options.update(width=10_000)
     sizes = [Measurement.get(console, wide, cell) for cell in (column.header, *column.cells)]
     widest = max((size.maximum for size in sizes), default=0)
@@ -59,7 +59,7 @@ def _keep_short(console: Console, options: ConsoleOptions, column: Column) -> in
 
 
 def _groups(columns: Sequence[Column], needed: Sequence[int], width: int) -> list[list[int]] | None:
-    """Places of the columns of each part, which all begin with those that name the rows; None if none is so narrow."""
+    """Return the columns of each part, which all begin with the row names; None if one is too wide."""
     n_names = next((at for at, column in enumerate(columns) if at and column.justify == "right"), 1)
     for names in (range(n_names), range(1)):
         rest = range(len(names), len(columns))
@@ -105,7 +105,7 @@ def _lines(console: Console, table: RichTable) -> RenderResult:
 
 
 def _shown(console: Console, text: Any, style: str = "") -> Text:
-    """A text, with its markup, as rich shows it within a table."""
+    """Render a text with its markup as in a table."""
     return console.render_str(text, style=style) if isinstance(text, str) else text
 
 
@@ -116,12 +116,12 @@ COLOURS = {
     Severity.REJECT: "red",
     Severity.ERROR: "red",
 }
-# Of a cell by its class on a page
+# style of a cell by its class on a page
 _STYLES = {"good": "green", "off": "yellow", "far": "yellow", "bad": "red"}
 
 
 def shown(document: Document) -> Iterator[Any]:
-    """Yield what rich prints of a document, without its warnings."""
+    """Yield rich's renderables of a document, without its warnings."""
     from rich.text import Text
 
     if document.lead:
@@ -129,7 +129,7 @@ def shown(document: Document) -> Iterator[Any]:
     answer = document.answer
     if answer is not None:
         sentences = list(answer.sentences)
-        if answer.advice:  # what to do and why, as one
+        if answer.advice:  # advice and reason on one line
             sentences = [" ".join([answer.advice, *sentences])]
         yield Text.assemble((answer.word, f"bold {COLOURS[answer.severity]}"), ": ", sentences[0])
         yield from map(Text, sentences[1:])
@@ -165,7 +165,7 @@ def _found(reason: Reason) -> Iterator[Padding]:
 
 
 def rich_table(table: Table) -> Folding:
-    """A table as rich prints it, folded where the terminal is too narrow."""
+    """Return a table for rich, folded if the terminal is too narrow."""
     from rich import box
 
     made = RichTable(

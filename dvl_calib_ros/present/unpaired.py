@@ -1,4 +1,4 @@
-"""What a comparison of a simulator's DVL with that of the vehicle says, once or round by round."""
+"""Document of a comparison of a simulator's DVL with the vehicle's, once or by round."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ EFFECTS: Columns[ComparedEffect] = {
     "p, adjusted": lambda each: p_value(each.p),
 }
 EFFECTS_NOTE = (
-    "Each effect is fitted to both logs, whichever was found to have it. p: that both have the same size, adjusted for "
-    "all claims of this page. Adds: beyond what misalignment and scale take in."
+    "Each effect is fitted to both logs, even if only one has it. p: that both have the same size, adjusted for "
+    "all claims of this page. Adds: without the part that misalignment and scale absorb."
 )
 LEVELS = ("noise of the DVL by regime, mm/s", "vehicle", "simulator")
 RUNGS: Columns[Rung] = {
@@ -45,8 +45,8 @@ RUNGS: Columns[Rung] = {
     "p": lambda r: p_value(r.p),
 }
 RUNGS_NOTE = (
-    "On stretches of the vehicle's own motion that were held out; noise of {} mm/s stays in the error. Energy "
-    "distance: between windows of recorded and simulated velocity, each less that of an ideal DVL, by their means and "
+    "On held-out stretches of the vehicle's own motion; the error includes noise of {} mm/s. Energy "
+    "distance: between windows of recorded and simulated velocity, each minus an ideal DVL's, by their means and "
     "scatter on the axes."
 )
 ROUNDS: Columns[tuple[int, Round]] = {
@@ -58,8 +58,8 @@ ROUNDS: Columns[tuple[int, Round]] = {
     "alike: below": lambda each: f"{each[1].comparison.rungs[0].null95:.2f}",
 }
 ROUNDS_NOTE = (
-    "Error: recorded less simulated on the vehicle's own motion, held out; noise of {} mm/s stays in it. In each round "
-    "effects, noise and rate are changed by as much as they differed in the one before. What follows is of round {}."
+    "Error: recorded minus simulated on the vehicle's own motion, held out, with noise of {} mm/s. In each round "
+    "effects, noise and rate are changed by their difference in the previous one. The rest is about round {}."
 )
 NOISE: Columns[ComparedNoise] = {
     "property": lambda each: each.name,
@@ -73,8 +73,10 @@ NOISE: Columns[ComparedNoise] = {
 
 
 def unpaired(found: UnpairedComparison | ClosedGap) -> Document:
-    """What the simulator's DVL lacks, how far the gap shrinks with it, and what could not be told; of rounds the gap by
-    round before that, which then is of the best."""
+    """Lay out what the simulator's DVL lacks, the reduction of the gap, and the unobservable effects.
+
+    With rounds, the gap by round comes first, and the rest is about the best round.
+    """
     closed = found if isinstance(found, ClosedGap) else ClosedGap((Round(found),))
     c, reasons = closed.rounds[closed.best].comparison, found.reasons
     compared = [each for each in enumerate(closed.rounds) if each[1].comparison.rungs]
@@ -86,7 +88,7 @@ def unpaired(found: UnpairedComparison | ClosedGap) -> Document:
     names = sorted({name for side in c.not_shown.values() for name in side})
     unseen = [(name, *(side.get(name, "would have shown") for side in c.not_shown.values())) for name in names]
     return Document(
-        title="The DVL of a simulator against that of the vehicle",
+        title="A simulator's DVL against the vehicle's",
         subtitle="; ".join(f"{side}: {', '.join(name for name, _ in d.recordings)}" for side, d in sides.items()),
         answer=Answer(c.verdict.value, SEVERITIES[c.verdict], [each.full_sentence for each in reasons]),
         warnings=c.notes,
@@ -104,7 +106,7 @@ def unpaired(found: UnpairedComparison | ClosedGap) -> Document:
             section("", Table(LEVELS, levels), where=Where.TERMINAL),
             section("", figures("unpaired_figures.noise_pictures", c), where=Where.PAGE),
             section(
-                "What the motions could not have shown",
+                "Effects not observable from the motions",
                 Table(("effect", *c.not_shown), unseen, words=1 + len(sides)),
             ),
             section(

@@ -1,4 +1,4 @@
-"""Pictures of a simulator's DVL beside that of the vehicle."""
+"""Pictures of a simulator's DVL and the vehicle's."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from .figure_style import FAINT, INK, Picture, legend_above, new_figure, picture
 from .replay_figures import AFTER, BAD
 
 DVL_AXES = ("x", "y", "z")
-# Lines over time are means over this share of the run
+# a line over time is a running mean over this share of the run
 WINDOW_SHARE = 1.0 / 50.0
 MM = 1e3
 
 
 def shrink_pictures(c: UnpairedComparison) -> Iterator[Picture]:
-    """How the error and the distance shrink from the simulator as it is to one with all effects."""
+    """Draw the decrease of error and distance from the original simulator to one with all effects."""
     names = [rung.name for rung in c.rungs if rung.name != NOISE]
     errors = [MM * rung.error_mps for rung in c.rungs if rung.name != NOISE]
     alt = "; ".join(f"{name}: {error:.1f} mm/s" for name, error in zip(names, errors, strict=True))
@@ -32,7 +32,7 @@ def shrink_pictures(c: UnpairedComparison) -> Iterator[Picture]:
         "Energy distance of recorded and simulated",
         "; ".join(f"{rung.name}: {rung.distance:.2f}, alike below {rung.null95:.2f}" for rung in c.rungs),
         distance_bars, [r.name for r in c.rungs], [r.distance for r in c.rungs], [r.null95 for r in c.rungs],
-        caption="Line: what it stays below 19 times in 20 if recorded and simulated are alike.",
+        caption="Line: 95 % quantile of the distance if recorded and simulated are alike.",
     )  # fmt: skip
     shrunk = c.series.get("shrunk")
     if isinstance(shrunk, Shrunk):
@@ -40,13 +40,13 @@ def shrink_pictures(c: UnpairedComparison) -> Iterator[Picture]:
         for axis, name in enumerate(DVL_AXES):
             yield picture(
                 f"Recorded less simulated over time, {name} of the DVL",
-                f"Running means over time of axis {name}: the simulator as it is, and with all effects",
+                f"Running means over time of axis {name}: the original simulator, and with all effects",
                 over_time, shrunk, axis, (AS_IT_IS, last),
             )  # fmt: skip
 
 
 def error_bars(names: Sequence[str], errors: Sequence[float], floor: float) -> Figure:
-    """Error of each model, mm/s, and the noise."""
+    """Draw the error of each model, mm/s, and the noise."""
     figure, axes = new_figure(height=1.2 + 0.36 * len(names))
     colours = [BAD] + [FAINT] * (len(names) - 2) + [AFTER] if len(names) > 1 else [BAD]
     axes.barh(range(len(names)), errors, color=colours, height=0.6)
@@ -60,7 +60,7 @@ def error_bars(names: Sequence[str], errors: Sequence[float], floor: float) -> F
 
 
 def distance_bars(names: Sequence[str], distances: Sequence[float], null95: Sequence[float]) -> Figure:
-    """Energy distance of each model, and what it stays below if both are alike."""
+    """Draw the energy distance of each model, and its 95 % quantile if both sides are alike."""
     figure, axes = new_figure(height=1.2 + 0.36 * len(names))
     rows = np.arange(len(names))
     alike = [d <= n for d, n in zip(distances, null95, strict=True)]
@@ -74,7 +74,7 @@ def distance_bars(names: Sequence[str], distances: Sequence[float], null95: Sequ
 
 
 def over_time(shrunk: Shrunk, axis: int, models: Sequence[str]) -> Figure:
-    """What is left on one axis of the DVL with each model, of the recording where most is left."""
+    """Draw the residual on one axis of the DVL with each model, for the recording with the largest."""
     first = shrunk.errors[models[0]]
     squares = np.bincount(shrunk.recording_of, np.nansum(first**2, axis=1))
     at = shrunk.recording_of == int(np.argmax(squares))
@@ -92,7 +92,7 @@ def over_time(shrunk: Shrunk, axis: int, models: Sequence[str]) -> Figure:
 
 
 def noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
-    """Noise of both by regime and by frequency."""
+    """Draw the noise of both sides by regime and by frequency."""
     if c.levels:
         alt = "; ".join(f"{name}: {MM * v:.1f} and {MM * s:.1f} mm/s" for name, (v, s) in c.levels.items())
         yield picture("Noise of the DVL by regime", f"Vehicle and simulator: {alt}", level_bars, c.levels)
@@ -111,7 +111,7 @@ def noise_pictures(c: UnpairedComparison) -> Iterator[Picture]:
 
 
 def level_bars(levels: Mapping[str, tuple[float, float]]) -> Figure:
-    """Noise of both sides in each regime, m/s."""
+    """Draw the noise of both sides in each regime, m/s."""
     figure, axes = new_figure(height=1.2 + 0.36 * len(levels))
     rows = np.arange(len(levels))
     for i, (side, colour) in enumerate((("vehicle", INK), ("simulator", AFTER))):
@@ -126,13 +126,13 @@ def level_bars(levels: Mapping[str, tuple[float, float]]) -> Figure:
 
 
 def spectrum(values: Array, interval: float) -> tuple[Array, Array]:
-    """Frequency (F,) Hz and amplitude spectral density (F,) of values (N,)."""
+    """Return frequency (F,) Hz and amplitude spectral density (F,) of values (N,)."""
     frequency, power = welch(values, 1.0 / interval, nperseg=min(len(values), max(16, len(values) // 6)))
     return frequency[1:], np.sqrt(power[1:])
 
 
 def spectra(lines: Mapping[str, tuple[Array, Array]]) -> Figure:
-    """Amplitude spectral densities of both sides, m/s/√Hz."""
+    """Draw amplitude spectral densities of both sides, m/s/√Hz."""
     figure, axes = new_figure()
     for (side, (frequency, density)), colour in zip(lines.items(), (INK, AFTER), strict=True):
         axes.plot(frequency, MM * np.maximum(density, 1e-7), color=colour, label=side)

@@ -1,1 +1,1 @@
-"""A recording, opened once: what is in it, and of all that may be the DVL's, a reference or an IMU's the columns."""
+"""Recordings, read once: their topics, and the columns of topics that may be a DVL's, a reference or an IMU's."""

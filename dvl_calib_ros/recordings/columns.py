@@ -1,6 +1,6 @@
-"""What is kept of a topic's messages: columns where the layout is fixed, else bytes.
+"""Storage of a topic's messages: columns if the layout is fixed, else bytes.
 
-Nothing is judged yet, for frames and parameters are known only later: values and stamps are as the messages have them.
+Values and stamps are stored unchanged, because frames and parameters are known only later.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 
 @dataclass(frozen=True)
 class Laid:
-    """N messages of a fixed layout, in their order of arrival.
+    """N messages of a fixed layout, in order of arrival.
 
-    arrival: (N,) places among all that was read. log_ns: (N,). stamps_ns: (N,) of the header, 0 where it has none.
-    values: (N, 3) velocity, m/s, in the message's axes; of an IMU (N, 7) its quaternion (x, y, z, w) and angular
-    velocity, rad/s, nan where not given. frame: (N,) places in frames, of frame_ids. covariance: (N,) places in
-    distinct (C, 3, 3), (m/s)², -1 where not given. broken: (N,) 1 + the first of its type's rules that a message
-    breaks, 0 if none. beside: (N, 3) acceleration, m/s², of an IMU; else as `beside_velocity`.
-    world: frame_id of the first message's header, which of an odometry is that of its pose. heading_variance: that of
-    an IMU's orientation about z, rad², of the first message; nan where none is given.
+    arrival: (N,) positions among all messages read. log_ns: (N,). stamps_ns: (N,) of the header, 0 if missing. values:
+    (N, 3) velocity, m/s, in the message's axes; of an IMU (N, 7) quaternion (x, y, z, w) and angular velocity, rad/s,
+    nan if missing. frame: (N,) indices into frames, the frame_ids. covariance: (N,) indices into distinct (C, 3, 3),
+    (m/s)², -1 if missing. broken: (N,) 1 + index of the first violated rule of the message type, 0 if none. beside: (N,
+    3) acceleration, m/s², of an IMU; else as `beside_velocity`. world: frame_id of the first message's header, which is
+    the pose's frame for an odometry. heading_variance: of an IMU's orientation about z, rad², of the first message; nan
+    if missing.
     """
 
     arrival: Stamps
@@ -56,12 +56,12 @@ class Laid:
         return len(self.arrival)
 
     def part(self, at: slice | Index) -> Laid:
-        """The rows of a slice or of indices."""
+        """Return the rows of a slice or of indices."""
         return replace(self, **{name: getattr(self, name)[at] for name in _DTYPES})
 
     @property
     def covariances(self) -> Covariances:
-        """Of these rows, with no more distinct ones than they have."""
+        """Covariances of these rows, restricted to the distinct ones in use."""
         given = self.covariance[self.covariance >= 0]
         if not len(given):
             return Covariances.none(len(self))
@@ -71,7 +71,7 @@ class Laid:
 
     @property
     def variances(self) -> Array:
-        """(N, 3) (m/s)², nan where not given, or where one of them is no variance."""
+        """Variances (N, 3) (m/s)², nan if missing or if one of them is not a valid variance."""
         variances = np.full((len(self), 3), np.nan)
         given = self.covariance >= 0
         if given.any():
@@ -86,16 +86,16 @@ _DTYPES: Mapping[str, Any] = {
 }  # fmt: skip
 
 
-# Bytes up to the end of a header's stamp: those that say how a message is encoded, seconds and nanoseconds.
+# bytes up to the end of a header's stamp: encoding, seconds and nanoseconds
 STAMP_END = 12
 
 
 @dataclass(frozen=True)
 class Singles:
-    """M messages that are decoded one by one, in their order of arrival.
+    """M messages that are decoded individually, in order of arrival.
 
-    arrival, log_ns: (M,). channel: (M,) places in channels. end: (M,) where each ends in content, which is bytes.
-    is_restamped: whether messages are stamped by log time instead.
+    arrival, log_ns: (M,). channel: (M,) indices into channels. end: (M,) end of each message in content, which is
+    bytes. is_restamped: whether log times replace the stamps.
     """
 
     arrival: Stamps
@@ -111,7 +111,7 @@ class Singles:
         return len(self.arrival)
 
     def messages(self, at: slice | Index = slice(None)) -> Iterator[tuple[int, int, Any, str]]:
-        """Arrival, log time (ns), decoded message (None if it cannot be decoded) and then why, of some."""
+        """Yield arrival, log time (ns), message (None if it cannot be decoded) and the reason for None."""
         places = np.arange(len(self))[at]
         starts = np.where(places > 0, self.end[places - 1], 0) if len(places) else places
         rows = zip(
@@ -142,7 +142,7 @@ class Singles:
 
     @property
     def stamps_ns(self) -> Stamps:
-        """(M,) of the headers, 0 where there is none or a message cannot be decoded."""
+        """Header stamps (M,), 0 if missing or if a message cannot be decoded."""
         if self.is_restamped:
             return self.log_ns
         stamps_ns = np.zeros(len(self), dtype=np.int64)
@@ -156,7 +156,7 @@ class Singles:
         return stamps_ns
 
     def _header_stamps_ns(self, at: Index) -> Stamps:
-        """Return the stamps of messages that begin with a header, which is all that is read of them (CDR)."""
+        """Read only the stamps of messages that begin with a header (CDR)."""
         starts = np.where(at > 0, self.end[at - 1], 0)
         whole = self.end[at] - starts >= STAMP_END
         head = self.content[np.where(whole, starts, 0)[:, None] + np.arange(STAMP_END if whole.any() else 0)]
@@ -185,7 +185,7 @@ class TopicColumns:
 
     @property
     def arrivals(self) -> tuple[Stamps, Stamps]:
-        """Places of all messages among all that was read, in order, and their log times (ns)."""
+        """Positions of all messages among all messages read, in order, and their log times (ns)."""
         if not len(self.singles):
             return self.laid.arrival, self.laid.log_ns
         arrival = np.concatenate([self.laid.arrival, self.singles.arrival])
@@ -194,7 +194,7 @@ class TopicColumns:
 
     @property
     def stamps_ns(self) -> Stamps:
-        """Stamps of all messages in the order of `arrivals`; the log time where there is none."""
+        """Stamps of all messages in the order of `arrivals`; the log time if missing."""
         _, log_ns = self.arrivals
         stamps_ns: Stamps = self.laid.stamps_ns
         if len(self.singles):
@@ -214,7 +214,7 @@ class TopicColumns:
         return replace(self, laid=self.laid.part(laid), singles=self.singles.part(singles))
 
     def arriving(self, renumbered: Callable[[Stamps], Stamps]) -> TopicColumns:
-        """The same, at other places among all that was read."""
+        """Return the messages with renumbered arrivals."""
         return replace(
             self,
             laid=replace(self.laid, arrival=renumbered(self.laid.arrival)),
@@ -223,14 +223,14 @@ class TopicColumns:
 
 
 def is_kept(msgtype: str) -> bool:
-    """Whether messages of this type may be the DVL's, a reference or an IMU's."""
+    """Return whether messages of this type may be a DVL's, a reference or an IMU's."""
     return msgtype == IMU_TYPE or msgtype in VELOCITY_TYPES
 
 
 class Collector:
-    """Collects a topic's messages as they are read.
+    """Collector of a topic's messages while they are read.
 
-    expected: how many there will be. parameters: by which a type's rules judge its messages.
+    expected: number of messages. parameters: used by the type's validity rules.
     """
 
     def __init__(self, topic: str, msgtype: str, expected: int, parameters: Parameters, decoder: Decoder) -> None:
@@ -251,10 +251,11 @@ class Collector:
         self._channels: dict[Channel, int] = {}
 
     def take(self, part: Part) -> None:
-        """Take messages of one channel that follow those before."""
+        """Add the next messages of one channel."""
         try:
             self._take_columns(part)
-        except UNREADABLE:  # of no fixed layout, or its definition has other fields: one by one it is said what lacks
+        # no fixed layout, or a definition with other fields: individual decoding reports the missing field
+        except UNREADABLE:
             self._take_singly(part)
 
     def _take_columns(self, part: Part) -> None:
@@ -278,7 +279,7 @@ class Collector:
             covariances = _covariances(kind, columns)
             broken = _broken(kind, columns, self._parameters)
         self._world = self._world or frame_name(columns.header.frame_id[0].tobytes().decode("ascii"))
-        # nothing is taken before all of it is known to be readable
+        # nothing is stored before everything is known to be readable
         index = np.where(covariances.index < 0, -1, covariances.index + self._n_distinct)
         if len(covariances.distinct):
             self._distinct.append(covariances.distinct)
@@ -288,7 +289,7 @@ class Collector:
             column.add(each)
 
     def _frame(self, frame_ids: Any) -> Index:
-        """Of (N, length) ASCII which frame is a row's."""
+        """Return the frame's index of each row of (N, length) ASCII."""
         n = len(frame_ids)
         if not frame_ids.shape[1] or (frame_ids == frame_ids[0]).all():
             return np.full(n, self._frames.setdefault(frame_ids[0].tobytes(), len(self._frames)))
@@ -306,7 +307,7 @@ class Collector:
             column.add(each)
 
     def columns(self) -> TopicColumns:
-        """All that was taken."""
+        """Return all messages."""
         laid = Laid(
             **{name: column.array() for name, column in self._laid.items()},
             world=self._world,
@@ -314,7 +315,7 @@ class Collector:
             frames=tuple(frame_name(name.decode("ascii")) for name in self._frames),
             distinct=np.concatenate([np.zeros((0, 3, 3)), *self._distinct]),
         )
-        if (laid.arrival[1:] < laid.arrival[:-1]).any():  # of several layouts in turn
+        if (laid.arrival[1:] < laid.arrival[:-1]).any():  # several layouts alternated
             laid = laid.part(np.argsort(laid.arrival, kind="stable"))
         arrival, log_ns, channel, end, content = (column.array() for column in self._singles.values())
         singles = Singles(arrival, log_ns, channel, end, content, tuple(self._channels), self._decoder)
@@ -324,23 +325,22 @@ class Collector:
 
 
 def _columns_of(vector: Any) -> Array:
-    """(N, 3)."""
+    """Stack x, y, z as (N, 3)."""
     return np.column_stack([vector.x, vector.y, vector.z]).astype(float, copy=False)
 
 
 def beside_width(msgtype: str) -> int:
-    """Return how many numbers are kept beside a velocity or an IMU's data."""
+    """Return the number of additional values per velocity or IMU message."""
     return 10 if msgtype == ODOMETRY else 3
 
 
 def beside_velocity(message: Any, msgtype: str) -> Array:
-    """Return the angular velocity of a twist (rad/s), and of an odometry its pose.
+    """Return the angular velocity of a twist (rad/s), or the pose of an odometry.
 
     Returns
     -------
     (N, 3) of columns or (1, 3) of a message; of an odometry (N, 10) with its position (m) and its quaternion (x, y, z,
-    w). nan where a type has none.
-
+    w). nan if a type has none.
     """
     twist = getattr(message, "twist", None)
     if twist is None:
@@ -354,7 +354,7 @@ def beside_velocity(message: Any, msgtype: str) -> Array:
 
 
 def _imu(columns: MessageColumns) -> tuple[Array, Array]:
-    """Quaternion and angular velocity (N, 7), and acceleration (N, 3); nan where not given."""
+    """Return quaternion and angular velocity (N, 7), and acceleration (N, 3); nan if missing."""
     q, w, a = columns.orientation, columns.angular_velocity, columns.linear_acceleration
     values = np.column_stack([q.x, q.y, q.z, q.w, w.x, w.y, w.z]).astype(float, copy=False)
     values[columns.orientation_covariance[:, 0] == NO_DATA, :4] = np.nan
@@ -389,30 +389,30 @@ def _stamp_or_none(message: Any) -> int:
 
 
 def stamped(message: Any, log_ns: int) -> int:
-    """The stamp of a message (ns), the log time where it has none."""
+    """Return the stamp of a message (ns), or the log time if missing."""
     return stamp_ns(message.header.stamp) or log_ns
 
 
-# A column that is larger than this (bytes) is kept on disk: an ordinary recording's are not.
+# a larger column (bytes) is kept on disk; only extraordinary recordings have one
 IN_MEMORY = 128 << 20
 
 
 class GrowingRows:
-    """Rows of one shape and type."""
+    """Growing array of rows with one shape and type."""
 
     def __init__(self, dtype: Any, shape: tuple[int, ...] = (), expected: int = 0) -> None:
-        """shape: of a row. expected: how many there will be, as far as that is known: more are taken as well."""
+        """Set up. shape: of a row. expected: number of rows, if known; more are accepted."""
         self._file: BinaryIO | None = None
         row = np.dtype(dtype).itemsize * max(1, math.prod(shape))
         self._rows = np.empty((max(1, min(expected, IN_MEMORY // row)), *shape), dtype)
         self._n = 0
 
     def add(self, rows: Any) -> None:
-        """Take further rows (N, ...)."""
+        """Append rows (N, ...)."""
         if self._n + len(rows) > len(self._rows):
             if self._rows.nbytes >= IN_MEMORY:
                 self._spill()
-            # grown where it is, not copied: there is no second one at any time
+            # resized in place, which avoids a second copy
             wanted = max(self._n + len(rows), 2 * self._n)
             self._rows.resize((max(wanted, len(self._rows)), *self._rows.shape[1:]), refcheck=False)
         self._rows[self._n : self._n + len(rows)] = rows
@@ -425,12 +425,12 @@ class GrowingRows:
         self._n = 0
 
     def array(self) -> NDArray[Any]:
-        """All rows; they are given once."""
+        """Return all rows. This can be called once."""
         if self._file is None:
             self._rows.resize((self._n, *self._rows.shape[1:]), refcheck=False)
             return self._rows
         self._spill()
         self._file.flush()
         rows = np.asarray(np.memmap(self._file, dtype=self._rows.dtype, mode="r"))
-        self._file.close()  # the map holds it
+        self._file.close()  # the memory map keeps the file
         return rows.reshape(-1, *self._rows.shape[1:])

@@ -1,8 +1,8 @@
-"""Segments of time that the messages of a recording lie in: those that are absurdly far from the data are set aside.
+"""Removal of messages whose times are absurdly far from the rest of a recording.
 
-A computer without a clock battery begins in 1970, and one broken stamp may name any year. Whatever looks at a recording
-later may so rely on it that time does not span decades. Pauses of hours, and clocks that are set, are left as they are:
-in a pause stamps and log times go on together. A log time that alone is elsewhere is wrong, however near it is.
+A computer without a clock battery begins in 1970, and a broken stamp may have any year. After the removal no recording
+spans decades. Pauses of hours and clock steps remain: there stamps and log times change together. A log time that
+changes alone is wrong, even if it is close.
 """
 
 from __future__ import annotations
@@ -21,29 +21,28 @@ from ..calibration.streams.stream_order import SEGMENT_GAP_NS
 from ..verdict.reasons import Reason, finding
 from .columns import TopicColumns
 
-# What is further away is never of use: no recording is as long, and 1970 is where a clock without a battery begins.
+# no recording is this long, and 1970, where a clock without a battery begins, is further away
 FURTHEST_NS = 365 * 86_400 * SECOND_NS
-# A segment with a smaller share of a topic's messages is no second dive in the same recording.
+# a segment with a smaller share of a topic's messages is not a second dive in the same recording
 SMALL_SHARE = 0.1
-# Fewer messages of a topic, all of them far away, are strays and no clock.
+# fewer messages of a topic, all of them far away, are strays rather than another clock
 FEWEST_OF_A_CLOCK = 10
-# A recorder writes what it holds back within seconds, so a log time this far outside the others is not its delay.
+# a recorder writes its buffer within seconds, so a log time this far outside the others is not a delay
 LEAST_PAUSE_NS = 10 * SECOND_NS
-# A delay this many times the typical one (median deviation from the median) differs from the neighbours'.
+# a delay this many times the typical one (median deviation from the median) differs from its neighbours'
 OTHER_DELAY = 10.0
 Span = tuple[int, int]
 
 
 def far(each: Sequence[Stamps]) -> list[Mask]:
-    """Return, per stream, which stamps lie in a segment that is to be set aside.
+    """Return, per stream, which stamps lie in a segment that must be removed.
 
-    Segments are those of all streams together. A stream keeps the segment that most streams are in, of those that hold
-    more than a small share of its own stamps; of the others it loses what is small, or more than a year away.
+    Segments are formed from all streams together. A stream keeps the segment shared by most streams, among those with
+    more than a small share of its own stamps; it loses other segments that are small or more than a year away.
 
     Parameters
     ----------
     each: Stamps (N,) ns of each stream, in any order.
-
     """
     none = [np.zeros(len(stamps_ns), dtype=bool) for stamps_ns in each]
     given = [stamps_ns for stamps_ns in each if len(stamps_ns)]
@@ -69,16 +68,15 @@ def far(each: Sequence[Stamps]) -> list[Mask]:
 
 
 def logged_elsewhere(stamps_ns: Sequence[Stamps], log_ns: Sequence[Stamps]) -> list[Mask]:
-    """Return, per stream, which log times contradict stamps and neighbours, and would stretch the recording.
+    """Return, per stream, which log times contradict stamps and neighbours and would extend the recording.
 
-    The delay from stamp to log time is that of the stream's other messages, but for few. One with another delay is
-    wrongly logged if its log time lies outside all others, and its stamp within.
+    Most messages of a stream have a similar delay from stamp to log time. A message with another delay has a wrong log
+    time if that lies outside all others, and its stamp inside.
 
     Parameters
     ----------
     stamps_ns: Stamps (N,) ns of each stream.
     log_ns: Log times (N,) ns of the same messages.
-
     """
     found, due_ns = [], []
     for stamps, logged in zip(stamps_ns, log_ns, strict=True):
@@ -107,7 +105,7 @@ def logged_elsewhere(stamps_ns: Sequence[Stamps], log_ns: Sequence[Stamps]) -> l
 def without_far(
     columns: Mapping[str, TopicColumns], spans_ns: Sequence[Span]
 ) -> tuple[dict[str, TopicColumns], tuple[Span, ...], list[Reason]]:
-    """Set aside what was recorded, or stamped, absurdly far from the rest of a recording.
+    """Remove messages recorded or stamped absurdly far from the rest of a recording.
 
     Parameters
     ----------
@@ -116,22 +114,21 @@ def without_far(
 
     Returns
     -------
-    columns: The same without those messages.
-    spans_ns: First and last log time of each file that holds others.
-    findings: What was set aside.
-
+    columns: The remaining messages.
+    spans_ns: First and last log time of each file with remaining messages.
+    findings: Descriptions of the removed messages.
     """
     names = [name for name, part in columns.items() if len(part)]
     log_ns = [columns[name].arrivals[1] for name in names]
     joined = np.concatenate([np.zeros(0, dtype=np.int64), *log_ns])
     [by_log] = far([joined])
     of_log = np.split(by_log, np.cumsum([len(own) for own in log_ns])[:-1]) if names else []
-    # a topic that is far as a whole has another clock, which is found and said later
+    # a topic that is far as a whole has another clock, which is detected and reported later
     of_log = [np.zeros_like(own) if len(own) >= FEWEST_OF_A_CLOCK and own.all() else own for own in of_log]
     stamps_ns = [columns[name].stamps_ns for name in names]
     of_log = [own | other for own, other in zip(of_log, logged_elsewhere(stamps_ns, log_ns), strict=True)]
     by_log = np.concatenate([by_log[:0], *of_log])
-    # what was recorded far away may be stamped by the same clock: it has no say
+    # messages with wrong log times may have stamps of the same clock: they do not count
     of_stamps = far([own[~aside] for own, aside in zip(stamps_ns, of_log, strict=True)])
     kept = dict(columns)
     findings: list[Reason] = []
@@ -145,7 +142,7 @@ def without_far(
 
 
 def _named(topic: str, how: str, times_ns: Stamps, aside: Mask) -> Iterator[Reason]:
-    """Yield what is said of the messages (N,) of a topic that are set aside."""
+    """Yield the finding on the removed messages of a topic, from the mask (N,)."""
     if aside.any():
         own = times_ns[aside]
         first, last = _date(int(own.min())), _date(int(own.max()))
@@ -160,10 +157,10 @@ def _date(at_ns: int) -> str:
 
 
 def _within(spans_ns: Sequence[Span], kept_ns: Stamps, aside_ns: Collection[int]) -> Iterator[Span]:
-    """Yield the spans without ends that were set aside, or are further from the times (N,) kept than these span.
+    """Yield the spans without ends that were removed or are far from the times (N,) kept.
 
-    The latter is a message of a topic that nobody reads. aside_ns: times that were set aside; with such, a file that
-    holds nothing else is left out.
+    An end may be far because of a message on an unread topic. aside_ns: removed times; a file with only these is
+    omitted.
     """
     length_ns = int(kept_ns.max() - kept_ns.min()) if len(kept_ns) else 0
     most_ns = min(max(length_ns, LEAST_PAUSE_NS), SEGMENT_GAP_NS)

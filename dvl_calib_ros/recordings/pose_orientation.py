@@ -1,6 +1,6 @@
-"""Orientations of poses as the data of an IMU, for recordings in which no IMU gives an orientation.
+"""Orientations of poses as IMU data, for recordings without an IMU that has an orientation.
 
-A motion capture measures how a vehicle is turned as well as where it is. Its turn rates are the derivative.
+A motion capture measures orientation and position of a vehicle; the turn rates are the orientation's derivative.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from ..messages.drivers import IMU_TYPE, POSE_TYPES
 from .columns import Laid, TopicColumns
 from .topics import ORIENTATION
 
-# Turn rates are means over this time (s): noise of 0.1° from pose to pose then is less than 1 °/s.
+# Turn rates are means over this time (s), so that noise of 0.1° per pose gives less than 1 °/s.
 RATE_WINDOW_S = 0.2
-# Orientations whose components differ by no more than this are a constant that was filled in.
+# orientations whose components differ by no more than this are a constant filled in by the driver
 LEAST_CHANGE = 1e-4
 
 
 def orientations_of(poses: TopicColumns) -> TopicColumns | None:
-    """Return the orientations of a topic of poses as an IMU's; None where it is of another type, or has none."""
+    """Return the orientations of a topic of poses as an IMU's; None for another type or without orientations."""
     if poses.msgtype not in POSE_TYPES or len(poses) < 3:
         return None
     values = np.full((len(poses), 7), np.nan)
@@ -44,7 +44,7 @@ def orientations_of(poses: TopicColumns) -> TopicColumns | None:
 
 
 def hold_orientations(values: Array) -> bool:
-    """Return whether quaternions (N, 4 and more) are orientations that change; nan is left out."""
+    """Return whether quaternions (N, 4 or more) are orientations that change; nan is ignored."""
     given = values[_are_unit(values), :4]
     return len(given) > 2 and float(np.ptp(given, axis=0).max()) > LEAST_CHANGE
 
@@ -54,14 +54,14 @@ def _are_unit(values: Array) -> Mask:
 
 
 def _turn_rates(stamps_ns: Stamps, quaternions: Array) -> Array:
-    """Return angular velocities (N, 3), rad/s, in the body, of orientations (N, 4); nan where stamps stand still."""
+    """Return angular velocities (N, 3), rad/s, in the body, of orientations (N, 4); nan if stamps do not advance."""
     from scipy.spatial.transform import Rotation
 
     order = np.argsort(stamps_ns, kind="stable")
     time = 1e-9 * (stamps_ns[order] - stamps_ns.min())
     first = np.searchsorted(time, time - 0.5 * RATE_WINDOW_S)
     last = np.searchsorted(time, time + 0.5 * RATE_WINDOW_S, side="right") - 1
-    alone = first == last  # of slow streams: from one to the next
+    alone = first == last  # in slow streams, difference to the neighbours
     first, last = np.where(alone, first - 1, first).clip(0), np.where(alone, last + 1, last).clip(max=len(time) - 1)
     turns = Rotation.from_quat(quaternions[order])
     seconds = (time[last] - time[first])[:, None]

@@ -1,7 +1,7 @@
-"""Recordings, opened once: one pass over their bytes gives all that any command asks of them.
+"""Recordings, read once: one pass over the bytes collects everything that any command needs.
 
-Kept are the columns of all topics that may be the DVL's, a reference or an IMU's; of transforms and descriptions the
-first; of all others nothing.
+Columns are kept for all topics that may be a DVL's, a reference or an IMU's; the first messages of transforms and
+descriptions; nothing of other topics.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from .topic_preview import Survey, look_of
 from .topics import Topics, spelled
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
-# Static transforms and descriptions are few; a recording that repeats them needs no more than the first.
+# static transforms and descriptions are few, so the first ones of a recording that repeats them are enough
 MOST_STATIC = 200
-# Of a topic that tells of the water so many messages of each window are read: water changes slowly.
+# number of messages of a water topic that are read per window: water changes slowly
 WATER_OF_WINDOW = 20
 Span = tuple[int, int]
 """First and last log time, ns."""
@@ -50,12 +50,14 @@ Span = tuple[int, int]
 class Recording:
     """One recording, or several as one.
 
-    paths: of it. types: topic -> message type, of all topics; held: topic -> what it holds. counts: topic -> number of
-    messages. file_spans_ns: of each file that holds a message. notes: what the user should know of what was read
-    (damage). columns: of the topics that are kept, a part for each path. transforms: of tf_static; descriptions: of
-    robot_description. parts: the recordings that it is made of; none, if it is one. registrations: how its instruments
-    stand, by what it was registered with, for who asks the same again (`register_as`, `registration`). waters: what
-    it says of its water. field_maps: topic of an unlisted type -> the map that reads what looks like its velocity.
+    paths: paths of the recording. types: topic -> message type, of all topics. held: topic -> all its types. counts:
+        topic
+    -> number of messages. file_spans_ns: of each file with a message. notes: messages to the user on damage. columns:
+        of
+    the topics that are kept, one part per path. transforms: of tf_static. descriptions: of robot_description. parts:
+        the
+    recordings it was joined from, if any. registrations: cached results of `register_as`. waters: its water properties.
+    field_maps: topic of an unlisted type -> field map for its likely velocity.
     """
 
     paths: tuple[Path, ...]
@@ -73,25 +75,25 @@ class Recording:
     field_maps: Mapping[str, str] = field(default_factory=dict)
 
     def register_as(self, found: Registration, topics: Topics, parameters: Parameters) -> None:
-        """Keep what a registration with these topics, mounting, frames and clocks found."""
-        self.registrations[self._asked(topics, parameters)] = found
+        """Cache a registration for these topics and parameters."""
+        self.registrations[self._registration_key(topics, parameters)] = found
 
     def registration(self, topics: Topics, parameters: Parameters) -> Registration | None:
-        """What one with the same found; None without any."""
-        return self.registrations.get(self._asked(topics, parameters))
+        """Return the cached registration for the same topics and parameters, or None."""
+        return self.registrations.get(self._registration_key(topics, parameters))
 
-    def _asked(self, topics: Topics, parameters: Parameters) -> tuple[Topics, Parameters]:
-        # what a calibration starts from, and leaves out of it, is no matter of how instruments stand
+    def _registration_key(self, topics: Topics, parameters: Parameters) -> tuple[Topics, Parameters]:
+        # initial calibration and excluded slow samples do not influence a registration
         return topics.found_in(self.types), parameters.replace(min_speed=0.0, initial_calibration="")
 
     @property
     def each(self) -> tuple[Recording, ...]:
-        """The recordings of each path."""
+        """Recordings, one per path."""
         return self.parts or (self,)
 
     @property
     def where(self) -> str:
-        """Its paths, in words."""
+        """Paths as text."""
         return ", ".join(map(str, self.paths))
 
     @property
@@ -102,12 +104,12 @@ class Recording:
 
     @property
     def path_spans_ns(self) -> tuple[Span | None, ...]:
-        """First and last log time at each path; None where there is no message."""
+        """First and last log time at each path; None without messages."""
         return tuple(one.span_ns if one.file_spans_ns else None for one in self.each)
 
     @property
     def recorded_spans_ns(self) -> list[Span]:
-        """First and last log time of each stretch that was recorded, in order; of those that overlap as one."""
+        """First and last log time of each recorded stretch, in order; overlapping ones are joined."""
         spans: list[Span] = []
         for start_ns, end_ns in sorted(self.file_spans_ns):
             if spans and start_ns <= spans[-1][1]:
@@ -129,11 +131,11 @@ class Recording:
 
     @cached_property
     def survey(self) -> Survey:
-        """A first look at all that may be of use."""
+        """Preview of all topics that are kept."""
         return self._surveyed(self.columns, whole=False)
 
     def whole(self, topics: Topics) -> Survey:
-        """All messages of three topics, for who has to compare streams whose clocks are far apart."""
+        """Return the full messages of three topics, to compare streams whose clocks differ widely."""
         named = (topics.dvl, topics.gnss, topics.imu)
         return self._surveyed({name: self.columns[name] for name in named if name in self.columns}, whole=True)
 
@@ -153,33 +155,33 @@ class Recording:
         return Survey(self.types, self.counts, seen, self.transforms, self.descriptions, unread, self.field_maps)
 
     def water(self, topics: Topics) -> Water | None:
-        """What it says of its water, and the speed of sound that the DVL used; None if nothing."""
+        """Return the water properties and the speed of sound used by the DVL; None if unknown."""
         return water_of(self.waters, topics.found_in(self.types).dvl)
 
     def recorded(self, topic: str, parameters: Parameters) -> Recorded:
-        """All messages of a topic that is kept, as they are."""
+        """Return all messages of a kept topic, unchanged."""
         return recorded(self.columns[topic], parameters)
 
     def stretches(self, topics: Mapping[str, Stream], decoder: MessageDecoder, share: float = 1.0) -> Iterator[Stretch]:
-        """All messages of some topics as samples, stretch by stretch, in their order of arrival.
+        """Yield all messages of some topics as samples, stretch by stretch, in order of arrival.
 
-        share: so many of them, in a few windows.
+        share: read only this share of them, in a few windows.
         """
         return stretches({stream: self.columns.get(name, ()) for name, stream in topics.items()}, decoder, share=share)
 
     def streams(self, topics: Topics, decoder: MessageDecoder) -> Streams:
-        """All messages of three topics as samples."""
+        """Return all messages of three topics as samples."""
         named = {topics.imu: Stream.IMU, topics.gnss: Stream.REFERENCE, topics.dvl: Stream.DVL}
         return _joined(list(self.stretches(named, decoder)))
 
     def forget(self) -> None:
-        """Let go of all messages, for who knows that nobody asks again: those of hours take much memory."""
+        """Free all messages if they are not needed again; hours of them take much memory."""
         for one in (self, *self.parts):
             one.columns.clear()
             vars(one).pop("survey", None)
 
     def of_types(self, topics: Topics, parameters: Parameters) -> Parameters:
-        """The parameters with the message types that the recording has on these topics."""
+        """Return the parameters with the recording's message types of these topics."""
         types = self.types
         return parameters.replace(
             dvl_type=types.get(topics.dvl, parameters.dvl_type), gnss_type=types.get(topics.gnss, parameters.gnss_type)
@@ -188,7 +190,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Held:
-    """What a recording holds on a topic: all the types; whether one of them is of a definition that it lacks."""
+    """Types on a topic of a recording, and whether the definition of one is missing."""
 
     types: frozenset[str]
     lacks_definition: bool
@@ -206,15 +208,15 @@ def open_recording(
     parameters: Parameters | None = None,
     on_progress: Callable[[float], None] = lambda _: None,
 ) -> Recording:
-    """Read recordings once, several as one in order of log time. Raises InputError for what is no bag.
+    """Read recordings once, several as one in order of log time. Raises InputError for a path that is no bag.
 
-    topics: those to keep; all that may be of use by default. parameters: by which messages themselves are judged
-    (max_fom), the default ones if not given. on_progress: told the share (0..1) that is read.
+    topics: the only ones to keep; by default all useful ones. parameters: for messages' own validity rules (max_fom).
+    on_progress: receives the share (0..1) read.
     """
     parameters = parameters or Parameters()
     each = []
     with ExitStack() as stack:
-        # what is wrong with the last is said first
+        # a fault of the last bag is reported before reading the first
         bags = [stack.enter_context(open_bags([path], parameters.dvl_fields)) for path in paths]
         for index, (path, bag) in enumerate(zip(paths, bags, strict=True)):
 
@@ -226,7 +228,7 @@ def open_recording(
 
 
 def together(each: Sequence[Recording]) -> Recording:
-    """Several recordings as one."""
+    """Join several recordings."""
     if len(each) == 1:
         return each[0]
     counts: Counter[str] = Counter()
@@ -249,13 +251,13 @@ def together(each: Sequence[Recording]) -> Recording:
         tuple(transform for one in each for transform in one.transforms),
         tuple(dict.fromkeys(text for one in each for text in one.descriptions)),
         tuple(each),
-        waters=_of_all(each),
+        waters=_joined_waters(each),
         field_maps={topic: text for one in each for topic, text in one.field_maps.items()},
     )
 
 
-def _of_all(each: Sequence[Recording]) -> tuple[OfWater, ...]:
-    """Readings of the same topic as one."""
+def _joined_waters(each: Sequence[Recording]) -> tuple[OfWater, ...]:
+    """Join the readings of the same topic."""
     found: dict[tuple[str, str], list[OfWater]] = {}
     for reading in (reading for one in each for reading in one.waters):
         found.setdefault((reading.topic, reading.kind), []).append(reading)
@@ -266,7 +268,7 @@ def _of_all(each: Sequence[Recording]) -> tuple[OfWater, ...]:
 
 
 def _renumbered(each: Sequence[Recording], names: Collection[str]) -> dict[str, tuple[TopicColumns, ...]]:
-    """Columns of all recordings, which arrive in order of log time; at one time in that of the recordings."""
+    """Renumber the arrivals in all recordings by log time, and by recording at equal times."""
     arrivals, logs = [], []
     for one in each:
         found = [part.arrivals for parts in one.columns.values() for part in parts] or [_NOTHING]
@@ -360,7 +362,7 @@ def _read(
 
 
 def _restamped(columns: Mapping[str, TopicColumns], restamp: str, path: Path) -> list[str]:
-    """Return the topics whose stamps are not believed. Raises InputError for one that is not there."""
+    """Return the topics stamped by log time instead. Raises InputError for a missing topic."""
     if restamp in ("", RESTAMP_ALL):
         return list(columns) if restamp else []
     found = {name.strip(): spelled(name.strip(), columns) for name in restamp.split(",")}
@@ -372,7 +374,7 @@ def _restamped(columns: Mapping[str, TopicColumns], restamp: str, path: Path) ->
 
 
 def _field_maps(bag: BagReader) -> dict[str, str]:
-    """Return of each topic of an unlisted type the map that may read its velocity."""
+    """Return, for each topic of an unlisted type, a field map that may read its velocity."""
     stores = {topic: bag.typestore(topic) for topic, kind in bag.topics.items() if not is_kept(kind)}
     found = {topic: suggested(store, bag.topics[topic]) for topic, store in stores.items() if store is not None}
     return {topic: text for topic, text in found.items() if text}
@@ -383,15 +385,15 @@ def _is_read_in_columns(kind: str) -> bool:
 
 
 def is_static(topic: str, kind: str) -> bool:
-    """Whether messages of a topic say where the sensors sit."""
+    """Return whether a topic describes the positions of the sensors."""
     name = topic.rsplit("/", 1)[-1]
     return (kind == TF_TYPE and name == "tf_static") or (kind == STRING_TYPE and name == "robot_description")
 
 
 def open_bags(paths: Sequence[Path], dvl_fields: str = "") -> BagReader:
-    """A reader of recordings whose types are recognised. Raises InputError for what is no bag, or a map that fits none.
+    """Open recordings and recognise their message types. Raises InputError if that fails or dvl_fields fits no type.
 
-    dvl_fields: as the parameter.
+    dvl_fields: value of the parameter.
     """
     bag = BagReader(paths, KNOWN_DEFINITIONS)
     forget_mapped(dvl_fields)
@@ -408,7 +410,7 @@ def open_bags(paths: Sequence[Path], dvl_fields: str = "") -> BagReader:
 
 
 def _map_types(bag: BagReader, text: str, where: str) -> None:
-    """Make the types known that a map of fields fits. Raises InputError if there is none."""
+    """Register the message types that a field map fits. Raises InputError if there is none."""
     opened = {kind: bag.typestore(topic) for topic, kind in bag.topics.items() if may_be_mapped(kind)}
     stores = {kind: store for kind, store in opened.items() if store is not None}
     said = {kind: misfit(text, store, kind) for kind, store in stores.items()}
@@ -416,6 +418,6 @@ def _map_types(bag: BagReader, text: str, where: str) -> None:
         if not why:
             mapped_type(kind, text)
     if all(said.values()):
-        # the type of which a map of its own is known is more likely meant than any other
+        # a type with a suggested field map is the most likely one
         nearest = min(said, key=lambda kind: not suggested(stores[kind], kind), default="")
         raise InputError(f"{where}: dvl_fields: {said.get(nearest) or 'no topic is of a type that is not listed'}")

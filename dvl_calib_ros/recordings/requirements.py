@@ -1,4 +1,4 @@
-"""What a command needs of recordings, and whether two of them are one."""
+"""Checks of the topics and sensors that a command needs, and of duplicate recordings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .topics import Topics
 
 
 def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> None:
-    """Raise InputError unless there is a DVL to be read; what else is missing is added to `found`."""
+    """Raise InputError unless there is a readable DVL; other missing data are added to `found`."""
     present, where = recording.types, recording.where
     if not present:
         raise InputError(f"{where}: the bag is empty, it has no topics; record it again")
@@ -35,7 +35,7 @@ def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> N
 
 
 def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | None) -> list[Reason]:
-    """What it means that a recording has no IMU. frame: of the reference's messages, None where it is not known."""
+    """Return the consequences of a missing IMU. frame: of the reference's messages, None if unknown."""
     if topics.imu in recording.types:
         return []
     if topics.gnss not in recording.types:
@@ -67,14 +67,14 @@ _WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TY
 
 
 def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
-    """Topics that may be the DVL's: of a type that only DVLs have, else with dvl in the name, else of any fitting."""
+    """Return the likely DVL topics: by a type that only DVLs have, else by name, else any fitting one."""
     fitting = sorted(name for name, kind in present.items() if kind in DVL_TYPES and name != topics.gnss)
     only_dvl = [name for name in fitting if present[name] not in REFERENCE_TYPES]
     return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting
 
 
 def hold_the_same(one: Recorded, other: Recorded) -> bool:
-    """Whether half of the DVL's velocities of one recording are in the other too, at the same stamps."""
+    """Return whether half of one recording's DVL velocities are in the other, at the same stamps."""
     (stamps, values), (its_stamps, its_values) = _velocities(one), _velocities(other)
     if not len(stamps) or not len(its_stamps):
         return False
@@ -84,7 +84,7 @@ def hold_the_same(one: Recorded, other: Recorded) -> bool:
 
 
 def _velocities(topic: Recorded) -> tuple[Stamps, Array]:
-    """(N,) stamps in order and (N, 3) velocities, of each stamp the first."""
+    """Return stamps (N,) in order and velocities (N, 3), the first of each stamp."""
     kept = np.flatnonzero(np.isfinite(topic.values).all(axis=1))
     stamps = np.where(topic.stamps_ns == 0, topic.log_ns, topic.stamps_ns)[kept]
     order = np.argsort(stamps, kind="stable")

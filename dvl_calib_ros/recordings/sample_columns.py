@@ -1,4 +1,4 @@
-"""Kept messages to samples, thousands at once: the same samples, refusals and problems as one by one."""
+"""Vectorised decoding of kept messages to samples, with the same results as individual decoding."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ from ..calibration.numerics.samples import (
 from ..messages.decode import AS_SENT, HALF_TURN, WRONG_FRAME, Axes, MessageDecoder, Refusal
 from .columns import Laid, TopicColumns
 
-# Messages of a stretch: enough for columns to pay, few enough for what is made of them to stay in the caches.
+# messages of a stretch: enough for columns to be efficient, few enough for the caches
 STRETCH_MESSAGES = 4096
-# A share of a recording comes from so many places of it, each in so many stretches at least.
+# a share of a recording is read in this number of windows, each of at least this number of stretches
 WINDOWS, STRETCHES_OF_A_WINDOW = 3, 10
 Decoded = DvlSample | ReferenceSample | ImuSample | Refusal
 Row = tuple[int, int, Any, str]
-"""Arrival, log time (ns), message (None if it cannot be decoded) and then why."""
+"""Arrival, log time (ns), message (None if it cannot be decoded) and the reason for None."""
 
 
 class Stretch(NamedTuple):
-    """What messages that follow each other in a recording are. log_ns: of the last of them."""
+    """Samples of consecutive messages of a recording. log_ns: log time of the last one."""
 
     streams: Streams
     log_ns: int
@@ -49,15 +49,15 @@ def stretches(
     size: int | None = None,
     share: float = 1.0,
 ) -> Iterator[Stretch]:
-    """All messages of streams, so many at a time; `SampleBlock.arrival` has their order of log time.
+    """Yield all messages of streams, `size` at a time; `SampleBlock.arrival` has their order of log time.
 
-    columns: of each stream's topic, a part for each recording. share: of them, in `WINDOWS`; the last ends with the
+    columns: of each stream's topic, one part per recording. share: of them, in `WINDOWS`; the last window ends with the
     recording.
     """
     at_once = STRETCH_MESSAGES if size is None else size
     all_parts = [part for parts in columns.values() for part in parts]
     arrival = np.sort(np.concatenate([np.zeros(0, dtype=np.int64), *(part.arrivals[0] for part in all_parts)]))
-    if share < 1.0:  # what follows a gap goes row by row, which is to be little of a window
+    if share < 1.0:  # samples after a gap are processed individually, which must be a small part of a window
         at_once = min(at_once, 1 + int(len(arrival) * share / (WINDOWS * STRETCHES_OF_A_WINDOW)))
     ends = [*arrival[at_once::at_once].tolist(), int(arrival[-1]) + 1] if len(arrival) else []
     cut = {stream: [_Cut(part, ends) for part in columns.get(stream, ())] for stream in Stream}
@@ -78,10 +78,10 @@ def stretches(
 
 
 class _Cut:
-    """A topic's messages, cut where stretches end."""
+    """A topic's messages, cut at the ends of stretches."""
 
     def __init__(self, part: TopicColumns, ends: Sequence[int]) -> None:
-        """ends: arrivals, of each stretch the first that it does not hold."""
+        """Set up. ends: for each stretch, the first arrival after it."""
         self._part = part
         self._laid = [0, *np.searchsorted(part.laid.arrival, ends).tolist()]
         self._singles = [0, *np.searchsorted(part.singles.arrival, ends).tolist()]
@@ -93,7 +93,7 @@ class _Cut:
         return self._part.singles.messages(slice(self._singles[index], self._singles[index + 1]))
 
     def newest_ns(self, index: int) -> int:
-        """Log time of the last message of this stretch or of those before; 0 without any."""
+        """Return the log time of the last message up to the end of this stretch; 0 without any."""
         both = (self._part.laid, self._laid[index + 1]), (self._part.singles, self._singles[index + 1])
         return max(int(each.log_ns[end - 1]) if end else 0 for each, end in both)
 
@@ -101,8 +101,8 @@ class _Cut:
 def _block(
     stream: Stream, laid: Sequence[Laid], singles: Sequence[Iterator[Row]], decoder: MessageDecoder
 ) -> SampleBlock:
-    """The messages of one stream, in their order of arrival."""
-    # a frame is judged when the first message of it arrives: the DVL's first is its own
+    """Return the samples of one stream, in order of arrival."""
+    # a frame is judged at its first message: the DVL's first frame is the DVL's own
     pending = deque(sorted(first for each in laid for first in _first_of_frames(each)))
     judge: Callable[[str], object] = {
         Stream.DVL: decoder.accepts_dvl_frame, Stream.REFERENCE: decoder.reference_frame,
@@ -129,7 +129,7 @@ def _block(
 
 
 def _first_of_frames(laid: Laid) -> list[tuple[int, str]]:
-    """Arrival of the first message of each frame, and the frame's name."""
+    """Return the arrival of the first message of each frame, and the frame's name."""
     if (laid.frame == laid.frame[0]).all():
         places = [int(laid.frame[0])]
     else:
@@ -138,7 +138,7 @@ def _first_of_frames(laid: Laid) -> list[tuple[int, str]]:
 
 
 def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:
-    """Of the DVL or of the reference, once all frames are judged."""
+    """Return the samples of DVL or reference, after all frames were judged."""
     refused = np.zeros(len(laid), dtype=np.uint8)
     reasons: list[str] = []
     frames = np.zeros(len(laid), dtype=np.uint8)
@@ -165,7 +165,7 @@ def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBloc
     for reason, is_broken in [(WRONG_FRAME, is_other[laid.frame]), *broken]:
         new = is_broken & (refused == 0)
         if new.any():
-            refused[new] = 1 + _place(reasons, reason)
+            refused[new] = 1 + _index_of_reason(reasons, reason)
     if stream is Stream.DVL and not refused.all():
         decoder.note_axes()
         if decoder.turns_dvl:
@@ -177,7 +177,7 @@ def _velocity(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBloc
 
 
 def _turned(axes: Axes, values: Array, covariances: Covariances, which: Mask) -> tuple[Array, Covariances]:
-    """Turn those of N velocities that are sent in other axes (N,), with their covariances."""
+    """Convert the velocities (N, 3) marked by `which` (N,) from other axes, with their covariances."""
     turned = axes.covariance(covariances.distinct)
     if which.all():
         return axes.velocity(values), Covariances(turned, covariances.index)
@@ -188,7 +188,7 @@ def _turned(axes: Axes, values: Array, covariances: Covariances, which: Mask) ->
 
 
 def _imu(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:
-    """Attitudes and angular velocities."""
+    """Return attitudes and angular velocities."""
     refused = np.zeros(len(laid), dtype=np.uint8)
     stamps_ns = _stamped(stream, laid, decoder, refused)
     block = sample_block(stream, stamps_ns, laid.values, arrival=laid.arrival, refused=refused)
@@ -196,7 +196,7 @@ def _imu(stream: Stream, laid: Laid, decoder: MessageDecoder) -> SampleBlock:
 
 
 def _stamped(stream: Stream, laid: Laid, decoder: MessageDecoder, refused: Any) -> Stamps:
-    """Stamps, with the log time where there is none."""
+    """Return stamps, with the log time for missing ones."""
     is_zero = (laid.stamps_ns == 0) & (refused == 0)
     if is_zero.any():
         decoder.note_zero_stamps(stream, int(np.count_nonzero(is_zero)))
@@ -204,7 +204,7 @@ def _stamped(stream: Stream, laid: Laid, decoder: MessageDecoder, refused: Any) 
 
 
 def _of_rows(stream: Stream, rows: list[tuple[int, Decoded]]) -> SampleBlock:
-    """Messages that were decoded one by one."""
+    """Return the samples that were decoded individually."""
     n = len(rows)
     reasons: list[str] = []
     refused, frames = np.zeros(n, dtype=np.uint8), np.zeros(n, dtype=np.uint8)
@@ -214,7 +214,7 @@ def _of_rows(stream: Stream, rows: list[tuple[int, Decoded]]) -> SampleBlock:
     index = np.full(n, -1, dtype=np.intp)
     for row, (_, decoded) in enumerate(rows):
         if isinstance(decoded, Refusal):
-            refused[row] = 1 + _place(reasons, decoded.reason)
+            refused[row] = 1 + _index_of_reason(reasons, decoded.reason)
             continue
         stamps_ns[row] = decoded.stamp_ns
         if isinstance(decoded, ImuSample):
@@ -236,7 +236,7 @@ def _of_rows(stream: Stream, rows: list[tuple[int, Decoded]]) -> SampleBlock:
     )  # fmt: skip
 
 
-def _place(reasons: list[str], reason: str) -> int:
+def _index_of_reason(reasons: list[str], reason: str) -> int:
     if reason not in reasons:
         reasons.append(reason)
     return reasons.index(reason)

@@ -1,4 +1,4 @@
-"""All messages of a topic as they are: nothing left out, nothing turned."""
+"""All messages of a topic, unfiltered and in their own axes."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from ..messages.positions import SELDOM_S, FixDifference, PositionType
 from .columns import Laid, TopicColumns, stamped
 from .topic_preview import FASTEST
 
-# Of an IMU
+# of an IMU
 NOTHING = np.zeros((0, 3)), np.zeros(0, dtype=np.uint8)
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """A topic's messages, N of them, in order of log time.
+    """N messages of a topic, in order of log time.
 
-    stamps_ns: (N,) of the header, 0 where it has none. log_ns: (N,). values: (N, 3) m/s; of an IMU (N, 4) its
-    quaternion. variances: (N, 3) (m/s)², nan where not given; (0, 3) of an IMU. unmeasured: (N,) axes that a
-    message says not to measure, as of `screening.Screened`; (0,) of an IMU. refused: by counter of the driver's
-    rules, of how many. unreadable: messages that could not be read, and why the first could not. window_s: over which
-    positions became these velocities, 0 of what is measured as a velocity.
+    stamps_ns: (N,) of the header, 0 if missing. log_ns: (N,). values: (N, 3) m/s; of an IMU its quaternion (N, 4).
+    variances: (N, 3) (m/s)², nan if missing; (0, 3) of an IMU. unmeasured: (N,) codes of axes that a message marks as
+    not measured, see `screening.Screened`; (0,) of an IMU. refused: number of messages by counter of the driver's
+    rules. unreadable: number of unreadable messages. unreadable_because: reason of the first. window_s: averaging time
+    of velocities from positions, 0 for measured velocities.
     """
 
     topic: str
@@ -59,7 +59,7 @@ class _Row(NamedTuple):
 
 
 def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
-    """All messages of a topic, of which each recording has a part."""
+    """Return all messages of a topic, of which each recording has a part."""
     topic, msgtype = parts[0].topic, parts[0].msgtype
     refused: Counter[str] = Counter()
     unread: list[str] = []
@@ -101,26 +101,26 @@ def recorded(parts: Sequence[TopicColumns], parameters: Parameters) -> Recorded:
 
 
 def _claimed(laid: Laid) -> tuple[Array, Codes]:
-    """Variances (N, 3), and axes that are said not to be measured (N,)."""
+    """Return variances (N, 3), and codes of axes marked as not measured (N,)."""
     return laid.variances, screen_columns(laid.covariances).unmeasured
 
 
 def _in_order(columns: Sequence[tuple[Any, ...]]) -> tuple[Any, ...]:
-    """Rows of several, by arrival, which comes first."""
+    """Join rows and sort them by arrival, the first column."""
     joined = [np.concatenate(each) for each in zip(*columns, strict=True)]
     order = np.argsort(joined[0], kind="stable")
     return tuple(each[order] if len(each) == len(order) else each for each in joined)
 
 
 def _plausible(values: Array, most: float) -> Array:
-    """With nan for what nothing measures."""
+    """Replace implausibly large values by nan."""
     if not len(values) or (values.max() < most and values.min() > -most):
         return values
     return np.where(np.abs(values) < most, values, np.nan)
 
 
 def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Parameters) -> tuple[_Row, list[str]]:
-    """A message, and under which rule's counter it is refused. Raises what is `UNREADABLE`."""
+    """Convert a message; return it with the counters of the rules that refuse it. Raises `UNREADABLE`."""
     at_ns = stamp_ns(message.header.stamp)
     if msgtype == IMU_TYPE:
         q = message.orientation
@@ -141,14 +141,14 @@ def _row(arrival: int, log_ns: int, message: Any, msgtype: str, parameters: Para
 
 
 def _window_s(singly: Sequence[tuple[int, int, Any, str]], parameters: Parameters) -> float:
-    """Over which positions are differenced."""
+    """Return the time over which positions are differenced."""
     log_ns = np.array([log_ns for _, log_ns, message, _ in singly if message is not None], dtype=np.int64)
     every_s = 1e-9 * float(np.median(np.diff(log_ns))) if len(log_ns) > 1 else 0.0
     return every_s if every_s > SELDOM_S else parameters.position_window
 
 
 def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType, window_s: float) -> list[_Row]:
-    """Positions as the velocities between them."""
+    """Convert positions to velocities between them."""
     difference = FixDifference(window_s, kind.between)
     rows = []
     for arrival, at_log_ns, message, _ in singly:
@@ -159,7 +159,7 @@ def _differences(singly: Sequence[tuple[int, int, Any, str]], kind: PositionType
         if found is not None:
             claimed = None if found.covariance is None else np.diag(found.covariance)
             variances = np.full(3, np.nan) if claimed is None or not (claimed > 0.0).all() else claimed
-            # by the log time of the middle of its window, as if it had been measured then
+            # log time of the middle of the window, as for a measurement at that time
             rows.append(_Row(arrival, at_log_ns - (at_ns - found.stamp_ns), found.stamp_ns, found.velocity, variances))
     return rows
 

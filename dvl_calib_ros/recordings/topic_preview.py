@@ -1,7 +1,7 @@
-"""A first look at a topic: some of its messages, to choose topics by and to find frames.
+"""Preview of a topic: some of its messages, to choose topics and to find frames.
 
-They are taken in bursts spread over the recording, so that a look at hours costs no more than one at minutes, and yet
-the streams have samples at the same times, which can be compared.
+The messages come in bursts spread over the recording. So a preview of hours costs no more than one of minutes, and the
+streams have samples at the same times, which can be compared.
 """
 
 from __future__ import annotations
@@ -26,31 +26,30 @@ from ..messages.drivers import IMU_TYPE, VELOCITY_TYPES
 from ..messages.positions import SELDOM_S, FixDifference, PositionType
 from .columns import ODOMETRY, TopicColumns, beside_velocity, stamped
 
-# Bursts: so many over the recording, each so long, of each topic at most so often. 24 bursts of 6 s show turns and
-# straights, and stamps that are late by seconds; 10 Hz is what a DVL gives at most.
+# Number, length and shortest sampling interval of the bursts. 24 bursts of 6 s contain turns and straights, and reveal
+# clock offsets of seconds; a DVL has at most 10 Hz.
 BURSTS, BURST_NS, BURST_EVERY_NS = 24, 6_000_000_000, 95_000_000
-# Clocks of instruments differ by parts per million, intervals between stamps by jitter. A clock that differs from the
-# log's by more than this share is a simulator's.
+# Clocks of instruments differ by parts per million, intervals between stamps by jitter. A clock whose rate differs from
+# the log's by more than this share is a simulator's.
 SIMULATED_TIME = 0.1
-# Of all messages of a topic no more than about so many, evenly: of one that is fast for hours, as many as it takes.
+# largest number of messages of a fast, long topic, evenly spread
 MOST = 100_000
-# What is faster (m/s) is garbage, whose square may be no number any more; millimetres per second still pass.
+# faster values (m/s) are garbage, whose square may overflow; velocities in mm/s still pass
 FASTEST = 1e5
 
 
 @dataclass(frozen=True)
 class Look:
-    """Some messages of one topic, N of them.
+    """N messages of one topic.
 
-    count: messages in the recording. rate_hz: over the whole of it, 0 if that is an instant. frame_id: of the velocity
-    or of the IMU's data, the first. stamps_s: (N,) s since the first log time of the recordings, of the header; of the
-    log where it is zero. ahead_s: by how much they are ahead of the log, in the median; in simulated time, at its
-    start. values: velocity (N, 3) m/s, as in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s
-    and acceleration m/s², nan where not given. rates: angular velocity (N, 3) rad/s of a twist, in the axes of its
-    velocity; zero where it has none. world: frame_id of the header, which of an odometry is that of its pose.
-    claimed_std: noise per axis that the messages claim, m/s, of an IMU that of its heading, rad, in the median; nan
-    where they claim none. clock_rate: seconds of stamps per second of log, other than 1 in simulated time alone.
-    pose: (N, 7) position, m, and quaternion x y z w of an odometry.
+    count: messages in the recording. rate_hz: average, 0 for a recording of an instant. frame_id: of the velocity or
+    the IMU's data, the first. stamps_s: (N,) s since the first log time of the recordings, of the header, or of the log
+    if zero. ahead_s: median of stamp minus log time; in simulated time, at its start. values: velocity (N, 3) m/s, as
+    in the message; of an IMU (N, 10): quaternion x y z w, angular velocity rad/s and acceleration m/s², nan if missing.
+    rates: angular velocity (N, 3) rad/s of a twist, in the axes of its velocity; zero if missing. world: frame_id of
+    the header, which is the pose's frame for an odometry. claimed_std: median of the claimed noise per axis, m/s, or of
+    an IMU's heading, rad; nan if not claimed. clock_rate: seconds of stamps per second of log; 1 except in simulated
+    time. pose: (N, 7) position, m, and quaternion x y z w of an odometry.
     """
 
     topic: str
@@ -74,7 +73,7 @@ class Look:
 
     @property
     def has_orientation(self) -> bool:
-        """Whether an IMU gives an orientation: most quaternions are of unit length, and they are not all the same."""
+        """Whether an IMU has orientations: most quaternions have unit length, and they change."""
         q = self.values[:, :4]
         if len(q) < 2 or np.isnan(q).any(axis=1).mean() > 0.5:
             return False
@@ -85,10 +84,9 @@ class Look:
 
 @dataclass(frozen=True)
 class Survey:
-    """What was seen. looks: by topic. transforms: messages of tf_static; descriptions: of robot_description.
+    """Previews of a recording's topics. transforms: messages of tf_static. descriptions: of robot_description.
 
-    unread: topic -> why none of its messages can be decoded.
-    field_maps: as of `Recording`.
+    unread: topic -> why none of its messages can be decoded. field_maps: see `Recording`.
     """
 
     topics: Mapping[str, str]
@@ -108,10 +106,10 @@ def look_of(
     *,
     whole: bool = False,
 ) -> Look | None:
-    """A look at a topic, of which each recording has a part; None where no message of it can be read.
+    """Return the preview of a topic, of which each recording has a part; None if no message can be read.
 
-    start_ns: first log time of the recordings. spans_ns: from and to when was recorded, in order. whole: all of its
-    messages, up to MOST, and no bursts.
+    start_ns: first log time of the recordings. spans_ns: start and end of each recorded stretch, in order. whole: all
+    messages, up to MOST, instead of bursts.
     """
     topic, msgtype = parts[0].topic, parts[0].msgtype
     seconds = 1e-9 * sum(end - start for start, end in spans_ns)
@@ -119,9 +117,9 @@ def look_of(
     is_seldom = every_s > SELDOM_S and is_position(msgtype)
     numbers = _Numbers(msgtype, every_s if is_seldom else 1.0)
     taken = np.zeros(0, dtype=np.int64) if whole or is_seldom else in_bursts(parts, spans_ns)
-    if not len(taken):  # no burst may hold a message of a topic: a recording is long where one log time is wrong
+    if not len(taken):  # bursts may miss all messages if one wrong log time makes the recording long
         taken = np.sort(np.concatenate([part.arrivals[0] for part in parts]))
-        if not is_position(msgtype):  # of which velocities are made, from one to the next
+        if not is_position(msgtype):  # positions are kept, because velocities are differences of successive ones
             taken = taken[:: -(-len(taken) // MOST) or 1]
     for part in parts:
         numbers.add_columns(part, _places(part.laid.arrival, taken))
@@ -150,7 +148,7 @@ def look_of(
 
 
 def _clock_rate(stamps_ns: Stamps, log_ns: Stamps) -> float:
-    """Return seconds of stamps per second of log, of simulated time; 1 where that is no more than jitter.
+    """Return seconds of stamps per second of log in simulated time; 1 if the difference may be jitter.
 
     stamps_ns, log_ns: (N,), in any order.
     """
@@ -162,7 +160,7 @@ def _clock_rate(stamps_ns: Stamps, log_ns: Stamps) -> float:
 
 
 def _places(arrival: Stamps, taken: Stamps) -> Index:
-    """Which rows, in order of arrival, are among those taken."""
+    """Return the indices of rows, in order of arrival, that are among those taken."""
     if not len(arrival) or not len(taken):
         return np.zeros(0, dtype=np.intp)
     at = np.minimum(np.searchsorted(arrival, taken), len(arrival) - 1)
@@ -170,9 +168,9 @@ def _places(arrival: Stamps, taken: Stamps) -> Index:
 
 
 def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]) -> Stamps:
-    """Arrivals of the messages of a topic that are looked at.
+    """Return the arrivals of a topic's messages in the bursts.
 
-    spans_ns: from and to when was recorded, in order.
+    spans_ns: start and end of each recorded stretch, in order.
     """
     both = [part.arrivals for part in parts]
     arrival, log_ns = (np.concatenate(each) for each in zip(*both, strict=True))
@@ -198,16 +196,16 @@ def in_bursts(parts: Sequence[TopicColumns], spans_ns: Sequence[tuple[int, int]]
 
 
 def is_position(msgtype: str) -> bool:
-    """Whether messages of a type hold positions, of which velocities are made."""
+    """Return whether messages of a type have positions, from which velocities are computed."""
     kind = VELOCITY_TYPES.get(msgtype)
     return kind is not None and kind.position is not None
 
 
 class _Numbers:
-    """Collects what a look is made of: of each message arrival, log time, stamp and numbers."""
+    """Collector of a preview's numbers: arrival, log time, stamp and values of each message."""
 
     def __init__(self, msgtype: str, window_s: float) -> None:
-        """window_s: over which positions become velocities."""
+        """Set up. window_s: averaging time of velocities from positions."""
         self._msgtype, self._kind, self._window_s = msgtype, VELOCITY_TYPES.get(msgtype), window_s
         self._rows: list[tuple[Stamps, Stamps, Stamps, Array, Array]] = []
         self._names: list[tuple[int, str]] = []
@@ -216,7 +214,7 @@ class _Numbers:
 
     @property
     def claimed_std(self) -> float:
-        """Per axis, m/s, in the median of messages that are measured, if any are; nan where none is claimed."""
+        """Median claimed noise per axis, m/s, of valid messages if any; nan if none is claimed."""
         of_each = np.concatenate([*self._variances, np.zeros(0)])
         given = of_each[np.isfinite(of_each) & (of_each > 0.0)]
         measured = given[given < NOT_MEASURED_VARIANCE]
@@ -225,7 +223,7 @@ class _Numbers:
 
     @property
     def frame_id(self) -> str:
-        """Of the first message that names one."""
+        """Frame of the first message that has one."""
         return min(self._names)[1] if self._names else ""
 
     def add_columns(self, part: TopicColumns, at: Index) -> None:
@@ -244,7 +242,7 @@ class _Numbers:
         ][:1]
 
     def add_messages(self, messages: list[tuple[int, int, Any]]) -> None:
-        """Arrival, log time (ns) and message of each."""
+        """Add arrival, log time (ns) and message of each."""
         if self._kind is not None and self._kind.position is not None:
             messages = _differences(messages, self._kind.position, self._window_s)
         for arrival, log_ns, message in messages:
@@ -258,7 +256,7 @@ class _Numbers:
                 self.world = self.world or frame_name(str(message.header.frame_id))
 
     def _of(self, message: Any) -> tuple[list[float], Array]:
-        """A velocity, or quaternion and angular velocity of an IMU; and what is kept beside."""
+        """Return a velocity, or an IMU's quaternion and angular velocity; and the additional values."""
         if self._kind is not None:
             v = message.velocity if self._kind.position else self._kind.velocity(message)
             return [v.x, v.y, v.z], beside_velocity(message, self._msgtype)
@@ -279,20 +277,20 @@ class _Numbers:
             return math.nan
         flat = np.asarray(given, dtype=float).ravel()
         variance = flat[[0, 4, 8] if len(flat) == 9 else [0, 7, 14]]
-        # of positions without a height the vertical is claimed to be anywhere
+        # positions without height have a huge vertical variance
         return float(median(variance) if self._kind.position else variance.mean())
 
     def in_order(self) -> tuple[Stamps, Stamps, Array, Array, Index] | None:
-        """Stamps, log times, values, what is beside; which of them are of use, in order of stamps."""
+        """Return stamps, log times, values, additional values, and the indices of valid rows in order of stamps."""
         if not self._rows:
             return None
         arrival, log_ns, stamps_ns, values, beside = (np.concatenate(each) for each in zip(*self._rows, strict=True))
         whole = np.ones(len(values), dtype=bool)
         if self._msgtype != IMU_TYPE:
-            values[(values == 0.0).all(axis=1)] = np.nan  # what drivers send for want of a measurement
+            values[(values == 0.0).all(axis=1)] = np.nan  # sent by drivers without a measurement
             whole = (np.abs(values) < FASTEST).all(axis=1)
         for each in (values, beside[:, :3]):
-            each[~(np.abs(each) < FASTEST)] = np.nan  # so that their squares are numbers
+            each[~(np.abs(each) < FASTEST)] = np.nan  # so that squares are finite
         order = np.lexsort((arrival, stamps_ns))
         return stamps_ns, log_ns, values, beside, order[whole[order]]
 
@@ -300,7 +298,7 @@ class _Numbers:
 def _differences(
     messages: Iterable[tuple[int, int, Any]], kind: PositionType, window_s: float
 ) -> list[tuple[int, int, Any]]:
-    """Positions as the velocities between them, at the middle of each window."""
+    """Convert positions to velocities between them, at the middle of each window."""
     difference = FixDifference(window_s, kind.between)
     found = []
     for arrival, log_ns, message in messages:

@@ -1,1 +1,1 @@
-"""The simulator: nonlinear and down to the beams, kept apart from the linear models it is meant to test."""
+"""The simulator: nonlinear, with individual beams, and independent of the linear models that it tests."""

@@ -1,4 +1,4 @@
-"""A scenario with the DVL that was found."""
+"""A scenario with a diagnosed DVL."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from ..simulator_export.dvl_description import NOT_EXPLAINED, DvlDescription, Ot
 from .scenario import Scenario
 from .sensors import JANUS_FROM_VERTICAL, DvlErrors
 
-# Findings that are no effect with a size: noise_std holds the one already, of the other nobody knows how much
+# findings that are not simulated as effects: included in noise_std, or of unknown size
 _NOT_TAKEN = ("noise_inflation", "coloured_reference_noise", "reported_covariance", NOT_EXPLAINED)
 
 
 def with_dvl(scenario: Scenario, description: DvlDescription) -> tuple[Scenario, tuple[str, ...]]:
-    """The scenario with mounting, scale, noise, rate and effects as found, its own on top; and what is not in it.
+    """Return the scenario with the diagnosed mounting, scale, noise, rate and effects, and the names omitted.
 
-    Raises InputError for values outside an effect's bounds.
+    The scenario's own effects are applied in addition. Raises InputError for values outside an effect's bounds.
     """
     std = scenario.errors.beam_std
     if description.noise_std is not None:

@@ -1,4 +1,4 @@
-"""Effects with their parameters, as given to the simulator, and what they do to a motion and to samples."""
+"""Effects with parameters for the simulator, and their application to motions and samples."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FORM = "NAME:PARAMETER=VALUE,PARAMETER=VALUE"
 
 
 def injection(text: str) -> Injection:
-    """What ``lever_arm:x_m=0.3,z_m=-0.1`` says; parameters not given keep their defaults. Raises InputError."""
+    """Parse ``lever_arm:x_m=0.3,z_m=-0.1``; missing parameters keep their defaults. Raises InputError."""
     name, _, rest = text.strip().partition(":")
     effect = _effect(name.strip())
     given: dict[str, str] = {}
@@ -33,7 +33,7 @@ def injection(text: str) -> Injection:
 
 
 def injection_of(name: str, given: Mapping[str, float | str]) -> Injection:
-    """An effect with some of its parameters, in its units; the others keep their defaults. Raises InputError."""
+    """Return an effect with the given parameters, in its units; others keep their defaults. Raises InputError."""
     effect = _effect(name)
     if not given:
         raise InputError(f"effect {effect.name} without parameters does nothing; give some of {_listed(effect)}")
@@ -85,7 +85,7 @@ def disturbed(
     motion: EffectInput,
     acts_on: ActsOn,
 ) -> Array:
-    """Samples (N, 3) m/s of a sensor at `motion.time`, after the effects on its noise in the order given."""
+    """Apply the effects on a sensor's noise, in order, to samples (N, 3) m/s at `motion.time`."""
     for each, seed in injections:
         if isinstance(each.effect, NoiseEffect) and each.effect.acts_on is acts_on:
             velocity = each.effect.disturb(velocity, motion, each.values, np.random.default_rng(seed))
@@ -93,6 +93,6 @@ def disturbed(
 
 
 def injection_document(each: Injection) -> dict[str, object]:
-    """Plain data, as in the diagnosis' JSON; null is no limit."""
+    """Return plain data as in the diagnosis' JSON; null means no limit."""
     values = {name: value if math.isfinite(value) else None for name, value in each.values.items()}
     return {"name": each.effect.name, "parameters": values}

@@ -1,8 +1,8 @@
-"""A simulation that follows a motion as it comes, sample by sample: the composed model of `scenario` on a short window.
+"""Simulation that follows a motion sample by sample: the model of `scenario` on a short window.
 
-A sample is computed when the motion is known up to one sample after the time at which it is measured (slopes, as a
-lag needs them, are taken across), and handed out when the motion has reached its stamp: a late stamp is what a driver
-gives that stamps on arrival. Nothing depends on a clock, so the same motion gives the same samples.
+A sample is computed when the motion is known up to one sample after the time of measurement, because slopes for a lag
+are taken across it. It is returned when the motion reaches its stamp, as from a driver that stamps on arrival. No clock
+is used, so the same motion gives the same samples.
 """
 
 from __future__ import annotations
@@ -25,16 +25,18 @@ from .scenario import GNSS_PHASE_S, START_NS, Run, Scenario, Seeds, dvl_at, gnss
 from .trajectories import Motion
 
 Sample = DvlSample | ReferenceSample | ImuSample
-# Across longer gaps nothing is known of the motion, and nothing is measured
+# across longer gaps the motion is unknown, and nothing is measured
 MAX_GAP_S = 1.0
-# A filter has forgotten what was so many time constants before, to 1e-13
+# after this number of time constants a filter's memory has decayed to 1e-13
 REMEMBERED_CONSTANTS = 30.0
 
 
 @dataclass(frozen=True)
 class MotionSample:
-    """The vehicle at one time. time: s since the beginning. velocity_body: (3,) m/s over ground of the reference point.
-    rotation_enu_from_body: (3, 3). angular_velocity: (3,) rad/s, body frame, forward-left-up.
+    """Motion of the vehicle at one time.
+
+    time: s since the beginning. velocity_body: (3,) m/s over ground of the reference point. rotation_enu_from_body: (3,
+    3). angular_velocity: (3,) rad/s, body frame, forward-left-up.
     """
 
     time: float
@@ -44,10 +46,10 @@ class MotionSample:
 
 
 class Follower:
-    """The sensors of a scenario on a motion that is handed on; stamps are `start_ns` and the time of the motion.
+    """Sensors of a scenario that follow a given motion; stamps are `start_ns` plus the time of the motion.
 
-    Equal to `simulate` of the same motion, but for what is drawn for outliers and for the IMU's noise. Raises
-    InputError for an effect of the noise that cannot be made sample by sample.
+    Samples equal those of `simulate` for the same motion, except for the random outliers and the IMU's noise. Raises
+    InputError for a noise effect that cannot be generated sample by sample.
     """
 
     def __init__(self, scenario: Scenario, start_ns: int = START_NS) -> None:
@@ -72,7 +74,7 @@ class Follower:
         self._number = itertools.count()
 
     def add(self, sample: MotionSample) -> list[Sample]:
-        """Samples, in order of stamps, that the motion up to this one brings. Times must increase (ValueError)."""
+        """Add motion and return the new samples, in order of stamps. Times must increase (ValueError)."""
         window = self._window
         if window and sample.time <= window[-1].time:
             raise ValueError(f"time {sample.time} does not come after {window[-1].time}")
@@ -92,7 +94,7 @@ class Follower:
         return all(sensor.taken == 0 for sensor in self._sensors)
 
     def _measure(self, after: float, until: float) -> None:
-        """Samples of what is measured in (after, until]."""
+        """Measure the samples due in (after, until]."""
         is_gap = np.isfinite(after) and until - after > MAX_GAP_S
         due = [(sensor, sensor.times(until)) for sensor in self._sensors]
         if is_gap or not any(len(at) for _, at in due):
@@ -118,14 +120,14 @@ class Follower:
 
 
 class _Sensor:
-    """One that measures at phase, phase + 1 / rate, ... s. make: of `scenario`. taken: how many have been."""
+    """A sensor that measures at phase, phase + 1 / rate, ... s. make: of `scenario`. taken: samples so far."""
 
     def __init__(self, make: Callable[..., Any], phase: float, rate: float, rng: np.random.Generator) -> None:
         self.make, self.rng, self.taken = make, rng, 0
         self._phase, self._step = phase, (phase + 1.0 / rate) - phase  # as numpy.arange counts
 
     def times(self, until: float) -> Array:
-        """The times (N,) s up to one that have not been taken yet."""
+        """Return the sampling times (N,) s up to `until` that are still due."""
         at = []
         while (time := self._phase + self.taken * self._step) <= until:
             at.append(time)
@@ -138,10 +140,10 @@ def _longest_time_constant(effects: tuple[Injection, ...]) -> float:
 
 
 def in_order(run: Run) -> list[Sample]:
-    """All samples of a run, in order of stamps."""
+    """Return all samples of a run, in order of stamps."""
     return sorted([*run.imu, *run.gnss, *run.dvl], key=attrgetter("stamp_ns"))
 
 
 def shifted(samples: list[Sample], late_ns: int) -> list[Sample]:
-    """The same samples, stamped so much later."""
+    """Return the samples with later stamps."""
     return [sample._replace(stamp_ns=sample.stamp_ns + late_ns) for sample in samples]

@@ -1,4 +1,4 @@
-"""The motion of a recorded vehicle, to simulate sensors on: reference velocity and attitude of a bag."""
+"""Motion of a recorded vehicle for simulated sensors: reference velocity and attitude of a bag."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from ..recordings.recording import open_recording
 from ..recordings.topics import Topics
 from .trajectories import Motion
 
-# Across longer gaps nothing is known of the motion
+# across longer gaps the motion is unknown
 MAX_GAP_S = 2.5
 SHORTEST_S = 10.0
-# Attitude is thinned to this: noise of faster samples would pass for angular velocity
+# attitude is thinned to this interval, because noise of faster samples would look like angular velocity
 ATTITUDE_STEP_S = 0.05
 
 
 @dataclass(frozen=True)
 class MotionSource:
-    """Where a bag's motion is to be found.
+    """Location of a bag's motion.
 
-    gnss_frame: as the parameter. smoothing: s, standard deviation of the window that takes the receiver's noise off
+    gnss_frame: as the parameter. smoothing: s, standard deviation of the window that removes the receiver's noise from
     the velocity (in the body frame, so turns keep their speed).
     """
 
@@ -56,19 +56,22 @@ class MotionSource:
 
     @property
     def topics(self) -> Topics:
-        """Where reference and IMU are."""
+        """Topics of reference and IMU."""
         return Topics(gnss=self.gnss_topic, imu=self.imu_topic)
 
     @cached_property
     def opened(self) -> Opened:
-        """What is recorded. Raises InputError."""
+        """The opened recording. Raises InputError."""
         return open_recording([self.path], self.topics)
 
 
 @dataclass(frozen=True)
 class _Samples:
-    """Times (N,) s and velocities (N, 3) m/s with their frames (N), places in `FRAMES`; times (M,) s and quaternions
-    (M, 4) xyzw."""
+    """Recorded samples.
+
+    Times (N,) s and velocities (N, 3) m/s with their frames (N), indices into `FRAMES`; times (M,) s and quaternions
+    (M, 4) xyzw.
+    """
 
     velocity_time: Array
     velocity: Array
@@ -78,9 +81,10 @@ class _Samples:
 
 
 def recorded_motion(recording: MotionSource, rate_hz: float, seconds: float | None = None) -> Motion:
-    """Motion of a bag, sampled at a rate from time 0: its longest stretch without a gap, or the first part of that.
+    """Return the motion of a bag's longest stretch without a gap, sampled at a rate from time 0.
 
-    Raises InputError if it holds no reference velocity with attitude for long enough.
+    seconds: use only this long a start of it. Raises InputError if reference velocity and attitude do not overlap for
+    long enough.
     """
     samples = _read(recording)
     start, end = _longest_stretch(recording, samples)
@@ -127,7 +131,7 @@ def _read(recording: MotionSource) -> _Samples:
 
 
 def _last_of_each(blocks: Sequence[SampleBlock]) -> tuple[Stamps, Index]:
-    """The stamps that rows have, in order, and the last row of each, counted over all blocks."""
+    """Return the unique stamps, in order, and the last row of each, counted over all blocks."""
     stamps_ns = np.concatenate([each.stamps_ns for each in blocks])
     found, from_the_end = np.unique(stamps_ns[::-1], return_index=True)
     return found, len(stamps_ns) - 1 - from_the_end
@@ -144,7 +148,7 @@ def _check_topics(recording: MotionSource, topics: Topics, present: Mapping[str,
 
 
 def _longest_stretch(recording: MotionSource, samples: _Samples) -> tuple[float, float]:
-    """The longest time (from, to) in which neither velocity nor attitude has a gap."""
+    """Return the longest time (from, to) without a gap in velocity or attitude."""
     common = [
         (max(a, c), min(b, d))
         for a, b in _stretches(samples.velocity_time)
@@ -171,7 +175,7 @@ def _thinned(time: Array, values: Array) -> tuple[Array, Array]:
 
 
 def _in_body(samples: _Samples, attitude: RotationSpline) -> Array:
-    """Velocities (N, 3) m/s in the body frame."""
+    """Return velocities (N, 3) m/s in the body frame."""
     earth = samples.velocity.copy()
     is_ned = samples.frames == FRAME_CODES[VelocityFrame.NED]
     is_body = samples.frames == FRAME_CODES[VelocityFrame.BODY]

@@ -1,4 +1,4 @@
-"""A simulated run, from a trajectory and errors to a bag."""
+"""Simulation of a run, from a trajectory and errors to a bag."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ GNSS_PHASE_S = 0.037
 
 @dataclass(frozen=True)
 class Scenario:
-    """Everything about a simulated run. Rates in Hz, standard deviations in m/s, times in s from the start.
+    """Configuration of a simulated run. Rates in Hz, standard deviations in m/s, times in s from the start.
 
-    recording: a bag whose motion it is, instead of a trajectory. seconds: None is 600, or all of the recording.
-    outages: (from, to) without GNSS. gnss_frame: BODY or ENU. effects: what is added beside the errors.
+    recording: a bag that gives the motion instead of a trajectory. seconds: None is 600, or all of the recording.
+    outages: (from, to) without GNSS. gnss_frame: BODY or ENU. effects: in addition to the errors.
     """
 
     trajectory: str = "box"
@@ -76,8 +76,9 @@ class Run:
 
 @dataclass(frozen=True)
 class World:
-    """What all sensors share: the motion, or as much of it as is known; the same as effects see it; how samples of a
-    sensor are disturbed. Made by `world_of`.
+    """Common input of all sensors, from `world_of`.
+
+    motion: the known motion. input: the same for effects. disturbed: applies the noise effects to a sensor's samples.
     """
 
     motion: Motion
@@ -87,7 +88,7 @@ class World:
 
 @dataclass(frozen=True)
 class Seeds:
-    """Of what is by chance: one for each sensor, for the motion and for each effect."""
+    """Seeds of random numbers: one per sensor, for the motion and per effect."""
 
     dvl: np.random.SeedSequence
     gnss: np.random.SeedSequence
@@ -97,7 +98,7 @@ class Seeds:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Seeds:
-        """Every kind of noise has a random stream of its own: what is added leaves that of the others as it was."""
+        """Derive an independent random stream per kind of noise, so that adding one does not change the others."""
         dvl, gnss, imu, motion, *effects = np.random.SeedSequence(scenario.seed).spawn(4 + len(scenario.effects))
         return cls(dvl, gnss, imu, motion, tuple(effects))
 
@@ -122,12 +123,12 @@ def simulate(scenario: Scenario) -> Run:
 
 
 def motion_of(scenario: Scenario) -> tuple[Motion, float]:
-    """The motion of a scenario, and its length in s. Raises InputError for a recording without one."""
+    """Return a scenario's motion and its length in s. Raises InputError for a recording without one."""
     return _motion(scenario, Seeds.of(scenario).motion)
 
 
 def _motion(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Motion, float]:
-    """The motion, and its length in s."""
+    """Return the motion and its length in s."""
     free_seed, wave_seed = seed.spawn(2)
     if scenario.recording:
         motion = recorded_motion(scenario.recording, MOTION_RATE_HZ, scenario.seconds)
@@ -141,7 +142,7 @@ def _motion(scenario: Scenario, seed: np.random.SeedSequence) -> tuple[Motion, f
 
 
 def world_of(scenario: Scenario, motion: Motion, disturbed_by: Callable[[Array, EffectInput, ActsOn], Array]) -> World:
-    """The world of sensors over a motion, whose times are since the beginning of the run."""
+    """Return the sensors' input for a motion, whose times are since the beginning of the run."""
     seen = EffectInput(
         motion.time,
         motion.velocity_body,
@@ -157,7 +158,7 @@ def world_of(scenario: Scenario, motion: Motion, disturbed_by: Callable[[Array, 
 def write_bag(
     scenario: Scenario, path: Path, storage: Storage, compression: Compression, with_truth: bool = False
 ) -> None:
-    """Simulate a run into a new bag, with everything that was simulated attached if asked for. Raises InputError."""
+    """Simulate a run into a new bag, optionally with the truth attached. Raises InputError."""
     writer = BagWriter(path, storage, compression)
     if with_truth:
         text = json.dumps(truth_document(scenario), indent=1, allow_nan=False)
@@ -168,7 +169,7 @@ def write_bag(
 
 
 def truth_document(scenario: Scenario) -> dict[str, Any]:
-    """Everything that was simulated, as plain data: options, errors in the calibration's terms, effects."""
+    """Return the simulated truth as plain data: options, errors in the calibration's terms, effects."""
     phi, delta_k = equivalent_error_terms(scenario.errors)
     document = asdict(replace(scenario, effects=()))
     document["gnss_frame"] = scenario.gnss_frame.value
@@ -184,7 +185,7 @@ def truth_document(scenario: Scenario) -> dict[str, Any]:
 
 
 def dvl_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator) -> list[DvlSample]:
-    """What the DVL measures at times (N,) s."""
+    """Simulate the DVL at times (N,) s."""
     moved = at_dvl(scenario.effects, world.input)
     velocity = _interpolate(at, moved.time, moved.velocity_body)
     turn = turns(scenario.effects, moved)
@@ -199,7 +200,7 @@ def dvl_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator
 
 
 def gnss_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator) -> list[ReferenceSample]:
-    """What the receiver measures at times (N,) s, outages left out."""
+    """Simulate the receiver at times (N,) s, without outages."""
     if not len(at):
         return []
     motion = world.motion
@@ -218,7 +219,7 @@ def gnss_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generato
 
 
 def imu_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator) -> list[ImuSample]:
-    """What the IMU measures at times (N,) s."""
+    """Simulate the IMU at times (N,) s."""
     if not len(at):
         return []
     motion = world.motion
@@ -237,7 +238,7 @@ def imu_at(scenario: Scenario, world: World, at: Array, rng: np.random.Generator
 
 
 def _input_at(world: World, at: Array) -> EffectInput:
-    """The motion at a sensor's times, to the nearest sample: what effects on the noise go by."""
+    """Return the motion at a sensor's times, by the nearest sample, for effects on the noise."""
     motion = world.motion
     nearest = _nearest(motion.time, at)
     return replace(
@@ -250,7 +251,7 @@ def _input_at(world: World, at: Array) -> EffectInput:
 
 
 def _nearest(time: Array, at: Array) -> NDArray[np.intp]:
-    """(N,) index of the time that is nearest to each of `at` (N,), the earlier of two."""
+    """Return the index of the nearest time for each of `at` (N,), the earlier of two."""
     after = np.clip(np.searchsorted(time, at), 1, max(len(time) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(time) - 1)

@@ -1,4 +1,4 @@
-"""What sensors make of a motion: a DVL down to its four beams, and GNSS velocity."""
+"""Simulated sensors: a DVL with four beams, GNSS velocity and an IMU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..calibration.numerics.frames import Array, rotation_from_rpy
 JANUS_FROM_VERTICAL = np.deg2rad(20.0)
 JANUS_AZIMUTHS = np.deg2rad([45.0, 135.0, 225.0, 315.0])
 
-# Unit vectors of the beams (4, 3): velocity along each beam = BEAMS @ velocity (protocol.md)
+# unit vectors of the beams (4, 3): velocity along each beam = BEAMS @ velocity
 BEAMS: Array = np.column_stack(
     [
         np.cos(JANUS_AZIMUTHS) * np.sin(JANUS_FROM_VERTICAL),
@@ -47,11 +47,11 @@ class ImuErrors:
 
 
 def equivalent_error_terms(errors: DvlErrors) -> tuple[Array, Array]:
-    """φ (3,) rad and δk (3,) of the calibration's error model that stand for these errors: the truth to compare with.
+    """Return the equivalent φ (3,) rad and δk (3,) of the calibration's error model, as truth for comparison.
 
-    A rotation is not I + [φ×]: with B = (I + scale) rotation, δk is B's diagonal less one and φ the skew part of
-    diag(1 + δk)⁻¹ B. A turn by θ about one axis is φ = tanθ and, on the two axes that it turns, δk = cosθ - 1. What is
-    left, the symmetric part, is 0.2 per cent of the speed at 5 degrees about several axes.
+    A rotation is not I + [φ×]: with B = (I + scale) rotation, δk is B's diagonal minus one and φ the skew part of
+    diag(1 + δk)⁻¹ B. A rotation by θ about one axis is φ = tanθ and, on the other two axes, δk = cosθ - 1. The
+    neglected symmetric part is 0.2 per cent of the speed at 5 degrees about several axes.
     """
     b = np.diag(1.0 + np.asarray(errors.scale)) @ rotation_from_rpy(errors.misalignment_rpy).T
     c = b / np.diag(b)[:, None]
@@ -66,7 +66,7 @@ def measure_dvl(
     rng: np.random.Generator,
     turn: Array | None = None,
 ) -> Array:
-    """Velocities (N, 3) m/s that the DVL reports, in its own frame: turned, scaled, beam by beam, least squares.
+    """Simulate DVL velocities (N, 3) m/s in its own frame: rotated, scaled, measured by beams, solved by least squares.
 
     turn: (3,) or (N, 3) rad, added to the rotation vector of the misalignment.
     """
@@ -83,19 +83,19 @@ def measure_dvl(
 
 
 def axis_covariance(beam_std: float) -> Array:
-    """Covariance (3, 3) (m/s)² of the axes for white noise on the beams."""
+    """Return the covariance (3, 3) (m/s)² of the axes for white noise on the beams."""
     return beam_std**2 * AXES_FROM_BEAMS @ AXES_FROM_BEAMS.T
 
 
 def measure_gnss(velocity: Array, std: float, rng: np.random.Generator) -> Array:
-    """GNSS velocities (N, 3) m/s with white noise per axis."""
+    """Simulate GNSS velocities (N, 3) m/s with white noise per axis."""
     return velocity + rng.normal(0.0, std, velocity.shape)
 
 
 def measure_imu(
     rotation_enu_from_body: Array, angular_velocity: Array, errors: ImuErrors, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Attitudes (N, 3, 3) and angular velocities (N, 3) rad/s, body frame, that an IMU reports."""
+    """Simulate an IMU's attitudes (N, 3, 3) and angular velocities (N, 3) rad/s, body frame."""
     shape = angular_velocity.shape
     tilted = rotation_from_rpy(rng.normal(0.0, errors.attitude_std, shape))
     gyro_noise = rng.normal(0.0, errors.gyro_std, shape)

@@ -1,4 +1,4 @@
-"""Vehicle motion to simulate: legs and turns, and the waves on top of them."""
+"""Simulated vehicle motion: legs and turns, and waves."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from ..calibration.numerics.frames import Array, rotation_from_rpy
 
 SPEED_MPS = 1.5
 TURN_RATE = np.deg2rad(9.0)
-# Sway in a turn: a vehicle without keel skids outward in proportion to centripetal acceleration (0.25 s: 3.5 degrees
-# of sideslip at 9 degrees per second)
+# sway in a turn: a vehicle without keel skids outward in proportion to centripetal acceleration (0.25 s: 3.5 degrees of
+# sideslip at 9 degrees per second)
 SKID_S = 0.25
 WAVE_PERIOD_S = 6.0
 WAVE_ROLL, WAVE_PITCH = np.deg2rad(2.0), np.deg2rad(1.0)
@@ -21,7 +21,7 @@ WAVE_ROLL, WAVE_PITCH = np.deg2rad(2.0), np.deg2rad(1.0)
 
 @dataclass(frozen=True)
 class Motion:
-    """What the vehicle does at N times.
+    """Motion of the vehicle at N times.
 
     time: (N,) s from 0. velocity_body: (N, 3) m/s of the reference point over ground, forward-left-up.
     rotation_enu_from_body: (N, 3, 3). angular_velocity: (N, 3) rad/s, body frame.
@@ -35,7 +35,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Leg:
-    """A stretch of constant speed (m/s) and yaw rate (rad/s)."""
+    """A leg of constant speed (m/s) and yaw rate (rad/s)."""
 
     seconds: float
     speed: float
@@ -54,7 +54,7 @@ def _full(sign: float, speed: float) -> Leg:
     return Leg(2 * np.pi / TURN_RATE, speed, sign * TURN_RATE)
 
 
-# One round each, repeated for as long as wanted.
+# one round each, repeated for the requested time
 ROUNDS: Mapping[str, Callable[[], list[Leg]]] = {
     "straight": lambda: [Leg(60.0, SPEED_MPS)],
     "box": lambda: [
@@ -65,15 +65,15 @@ ROUNDS: Mapping[str, Callable[[], list[Leg]]] = {
 }
 FREE = "free"
 TRAJECTORIES = (*ROUNDS, FREE)
-# Free manoeuvres: a leg's length, speed and yaw rate are drawn from these; three legs in ten are straight
+# Free manoeuvres: length, speed and yaw rate of each leg are drawn from these; three legs in ten are straight.
 FREE_SECONDS, FREE_SPEEDS_MPS, FREE_YAW_RATE = (5.0, 40.0), (0.6, 2.2), np.deg2rad(12.0)
 FREE_STRAIGHT = 0.3
-# Changes of speed and yaw rate are spread over so long
+# time over which changes of speed and yaw rate are spread
 INERTIA_S = 3.0
 
 
 def make_motion(trajectory: str, seconds: float, rate_hz: float, rng: np.random.Generator | None = None) -> Motion:
-    """Motion along one of `TRAJECTORIES` for so long, sampled at a rate. rng: of free manoeuvres; seed 0 if None."""
+    """Return the motion along one of `TRAJECTORIES`, sampled at a rate. rng: of free manoeuvres; seed 0 if None."""
     time = np.arange(0.0, seconds, 1.0 / rate_hz)
     free = trajectory == FREE
     legs = _free_legs(rng or np.random.default_rng(0)) if free else cycle(ROUNDS[trajectory]())
@@ -88,7 +88,7 @@ def make_motion(trajectory: str, seconds: float, rate_hz: float, rng: np.random.
 
 
 def body_rates(time: Array, roll: Array, pitch: Array, yaw_rate: Array) -> Array:
-    """Angular velocity (N, 3) rad/s in the body frame of roll and pitch (N,) rad over time and a yaw rate (N,)."""
+    """Return body angular velocity (N, 3) rad/s from roll and pitch (N,) rad over time and a yaw rate (N,)."""
     roll_rate, pitch_rate = np.gradient(roll, time), np.gradient(pitch, time)
     # Euler angle rates to body rates, Z-Y-X order
     return np.column_stack(
@@ -108,7 +108,7 @@ def _free_legs(rng: np.random.Generator) -> Iterator[Leg]:
 
 
 def _smoothed(legs: Iterator[Leg], seconds: float, time: Array) -> tuple[Array, Array]:
-    """Speed (N,) and yaw rate (N,), with changes spread over 3 s: a vehicle has inertia."""
+    """Return speed (N,) and yaw rate (N,), with changes spread over 3 s by the vehicle's inertia."""
     ends, speeds, yaw_rates = [], [], []
     end = 0.0
     for leg in legs:
@@ -122,7 +122,7 @@ def _smoothed(legs: Iterator[Leg], seconds: float, time: Array) -> tuple[Array, 
     lengths = np.diff(edges)
 
     def mean(values: list[float]) -> Array:
-        """Over the 3 s about each time, as if the first and the last leg went on for ever."""
+        """Return the mean over 3 s around each time, with the first and last leg extended."""
         travelled = np.concatenate([[0.0], np.cumsum(lengths * np.array(values))])
 
         def until(at: Array) -> Array:
@@ -142,7 +142,7 @@ def _integral(time: Array, rate: Array) -> Array:
 
 GRAVITY = 9.81
 COMPONENTS = 12
-# Angular frequencies of the components over that of the peak, and spread of their directions
+# range of angular frequencies relative to the peak, and spread of directions
 BAND = (0.7, 2.0)
 SPREAD = np.deg2rad(20.0)
 
@@ -156,9 +156,9 @@ class Waves:
 
 
 def add_waves(motion: Motion, waves: Waves, rng: np.random.Generator) -> Motion:
-    """The motion of a vehicle small against the waves: it goes round with the water and tilts with its surface.
+    """Return the motion of a small vehicle, which follows the water's orbital motion and tilts with its surface.
 
-    Airy waves in deep water, of a Bretschneider spectrum, phases and directions by chance. With θ = k x - ω t + φ the
+    Airy waves in deep water with a Bretschneider spectrum, random phases and directions. With θ = k x - ω t + φ the
     surface is a cos θ, its slope -a k sin θ and the water moves at aω cos θ along and aω sin θ upwards.
     """
     steps = np.diff(motion.time, prepend=motion.time[0])
@@ -177,7 +177,7 @@ def add_waves(motion: Motion, waves: Waves, rng: np.random.Generator) -> Motion:
 
 
 def _components(waves: Waves, rng: np.random.Generator) -> list[tuple[float, float, float, float]]:
-    """Amplitude (m), angular frequency (rad/s), direction (rad, east to north) and phase (rad) of each."""
+    """Draw amplitude (m), angular frequency (rad/s), direction (rad, east to north) and phase (rad) per component."""
     ratio = np.linspace(*BAND, COMPONENTS)
     energy = ratio**-5 * np.exp(-1.25 * ratio**-4)
     amplitudes = np.sqrt(2.0 * energy / energy.sum()) * waves.height / 4.0
@@ -188,7 +188,7 @@ def _components(waves: Waves, rng: np.random.Generator) -> list[tuple[float, flo
 
 
 def _tilted(motion: Motion, orbital_enu: Array, slope_enu: Array) -> Motion:
-    """The motion with a velocity (N, 3) m/s added, lying on a surface of this slope (N, 2) east and north."""
+    """Return the motion with an added velocity (N, 3) m/s, tilted by a surface slope (N, 2) east and north."""
     rotation = motion.rotation_enu_from_body
     ahead = np.einsum("ni,ni->n", slope_enu, rotation[:, :2, 0])
     to_port = np.einsum("ni,ni->n", slope_enu, rotation[:, :2, 1])

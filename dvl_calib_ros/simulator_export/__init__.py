@@ -1,1 +1,1 @@
-"""Settings of other simulators, written from what was found of a DVL."""
+"""Export of a diagnosed DVL as settings of other simulators."""

@@ -1,4 +1,4 @@
-"""One description of a DVL for all writers, from a diagnosis, a calibration's result file or a parameter file."""
+"""Description of a DVL for all writers, from a diagnosis, a calibration's result file or a parameter file."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ from ..files.parameter_files import load_parameters
 from ..files.result_file import FORMAT
 
 Three = tuple[float, float, float]
-# What a description holds as numbers, and simulators may have settings for; everything else is `others`
+# effects with their own number in a description, for which simulators may have settings; all others are `others`
 GIVEN_AS_NUMBERS = ("lever_arm", "velocity_bias")
 _OF_THE_REFERENCE = (ActsOn.REFERENCE, ActsOn.REFERENCE_CLOCK, ActsOn.ATTITUDE_CLOCK)
-# A diagnosis has some ten thousand bytes; what is much larger is none, and is not read to find out
+# a diagnosis has about 10 kB; a much larger file is none, and is not read
 LARGEST_FILE = 1 << 24
 RESULT, PARAMETERS = "result", "parameters"
-# Name of what is left of a diagnosis whose verdict is `unknown`
+# name of the residual of a diagnosis whose verdict is `unknown`
 NOT_EXPLAINED = "not_explained"
 
 
 @dataclass(frozen=True)
 class Other:
-    """An effect that was found and that is no number of the description.
+    """A diagnosed effect without its own number in the description.
 
-    size: RMS, m/s, of what it changes; None where that is not known. of_the_reference: it is in the reference or the
-    attitude, not in the DVL. of_another_day: it is what one recording has against the first, which is described.
+    size: rms, m/s, of its effect; None if unknown. of_the_reference: it affects the reference or the attitude, not the
+    DVL. of_another_day: difference of a recording from the first one, which is described.
     """
 
     name: str
@@ -48,16 +48,15 @@ class Other:
 
 @dataclass(frozen=True)
 class DvlDescription:
-    """A DVL as it is: SI, forward-left-up.
+    """Description of a DVL: SI, forward-left-up.
 
     mounting_rpy: (3,) rad, `dvl_link` in the body as a URDF origin, misalignment included. lever_arm: (3,) m, of the
     DVL from the reference point, body frame. scale: (3,) errors δk, and velocity_bias: (3,) m/s, of its axes.
-    noise_std: (3,) m/s, of its axes; rate_hz: None where not known. speed: (3,) m/s, RMS along its axes.
-    others: effects that are none of these. source: file that it is from.
-    ambiguous: sets of effects that the data could not tell apart, of which the first is taken. doubts: what is to be
-    known before it is used, in sentences.
+    noise_std: (3,) m/s, of its axes. rate_hz: None if unknown. speed: (3,) m/s, rms along its axes. others: other
+    effects. source: file of origin. ambiguous: sets of indistinguishable effects, of which the first is used. doubts:
+    warnings, in sentences.
 
-    Raises InputError for numbers that are not finite, or no rate or noise.
+    Raises InputError for numbers that are not finite, or a rate or noise that is not positive.
     """
 
     source: str
@@ -83,7 +82,7 @@ class DvlDescription:
 
 
 def load_description(path: Path) -> DvlDescription:
-    """Of a diagnosis (JSON), a result file or a parameter file (YAML). Raises InputError."""
+    """Load from a diagnosis (JSON), a result file or a parameter file (YAML). Raises InputError."""
     document = _document(path)
     if isinstance(document, str):
         return _of_result(path) if document == RESULT else _of_parameters(path)
@@ -101,7 +100,7 @@ def load_description(path: Path) -> DvlDescription:
 
 
 def _document(path: Path) -> Any:
-    """Content of a JSON file; of another what it is, RESULT or PARAMETERS. Raises InputError."""
+    """Return the content of a JSON file, or the kind of another file: RESULT or PARAMETERS. Raises InputError."""
     try:
         text = read_file(path, "diagnosis", LARGEST_FILE).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -120,7 +119,7 @@ def _document(path: Path) -> Any:
 
 
 def _finite(word: str) -> float:
-    """A number of JSON, which knows none that is not finite; what is without a limit is written as null."""
+    """Parse a number of JSON, which must be finite; no limit is written as null."""
     number = float(word)
     if not math.isfinite(number):
         raise ValueError(f"{word} is not finite")
@@ -185,7 +184,7 @@ def _is_of_reference(name: str) -> bool:
 
 
 def _values(parameters: Mapping[str, Any]) -> dict[str, float]:
-    """Values of a diagnosis' parameters; null is no limit."""
+    """Return the values of a diagnosis' parameters; null means no limit."""
     values = {name: each["value"] for name, each in parameters.items()}
     return {name: math.inf if value is None else float(value) for name, value in values.items()}
 
@@ -215,7 +214,7 @@ def _of_result(path: Path) -> DvlDescription:
 
 
 def _of_parameters(path: Path) -> DvlDescription:
-    """Of what calibration compensates, as diagnose --apply writes it."""
+    """Build from the parameters that compensate effects, as written by diagnose --apply."""
     parameters = load_parameters(path, [])
     east, north = parameters.reference_velocity_offset
     effects: dict[str, dict[str, float]] = {

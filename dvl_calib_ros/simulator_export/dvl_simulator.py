@@ -1,9 +1,9 @@
-"""DVL-Simulator (RWTH Aachen): parameters of its ROS 2 node, YAML.
+"""Export to DVL-Simulator (RWTH Aachen): parameters of its ROS 2 node, YAML.
 
-Its settings, as its sources use them, are not what their names say in three places. `rotation_body_to_sensor_frame` is
-turned in the order z, y, x: yaw comes first. `lever_arm_body_to_sensor_frame` is taken in the sensor's axes. Scale and
-biases are drawn uniformly from ± an interval; with a constant seed the draws are known (C++ fixes mt19937; two words
-make a double in libstdc++), and the interval is chosen so that what is drawn is what was found.
+In three places its sources use a setting differently from its name. `rotation_body_to_sensor_frame` is applied in the
+order z, y, x: yaw comes first. `lever_arm_body_to_sensor_frame` is in the sensor's axes. Scale and biases are drawn
+uniformly from ± an interval; with a constant seed the draws are known (C++ defines mt19937; libstdc++ makes a double of
+two words), and the interval is chosen to give the wanted value.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .dvl_description import DvlDescription
 from .writer import Settings, Simulator, beams_of, comment, mixed_scale, split
 
 TITLE = "DVL-Simulator"
-# Of the seeds from 1 on the first whose draws are all far from the middle, where an interval would have to be large
+# first seed whose draws are all far from zero, because a small draw would need a large interval
 SEED = 1
 BEAM_ANGLE_DEG = 22.5
 DEFAULTS: dict[str, Any] = {
@@ -43,12 +43,12 @@ DEFAULTS: dict[str, Any] = {
 ENABLED = ("beam_velocity_noise", "scale_factor", "beam_bias", "gyroscope_noise", "quantization", "altitude_limit",
            "velocity_limit")  # fmt: skip
 GENERAL = ("sample_time", "seed", "use_constant_seed")
-# A bias that is to stay must not fade: 30 years
+# correlation time of a bias that must stay constant: 30 years
 FOR_EVER_S = 1.0e9
 
 
 def write(description: DvlDescription) -> Settings:
-    """The richest: scale and bias of beams as well."""
+    """Write all properties, including scale and beam biases."""
     beams = beams_of(description.noise_std, math.radians(BEAM_ANGLE_DEG))
     scale = mixed_scale(description)
     drawn = draws(SEED)
@@ -99,13 +99,13 @@ def write(description: DvlDescription) -> Settings:
 
 
 def draws(seed: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """(5,) of -1 .. 1: what the first five uniform draws from ± an interval are in parts of it; scale, then beams."""
+    """Return the first five uniform draws (5,) in -1 .. 1 for a seed, as shares of ± an interval; scale, then beams."""
     words = np.random.RandomState(seed).randint(0, 1 << 32, size=10, dtype=np.uint32).astype(float)
     return 2.0 * (words[::2] + words[1::2] * 2.0**32) / 2.0**64 - 1.0
 
 
 def directions(angle: float) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """(4, 3) directions of its beams; velocity along each = directions @ velocity."""
+    """Return beam directions (4, 3); velocity along each = directions @ velocity."""
     azimuth = np.deg2rad([45.0, 135.0, 225.0, 315.0])
     across = math.sin(angle)
     return np.column_stack([np.cos(azimuth) * across, np.sin(azimuth) * across, np.full(4, math.cos(angle))])

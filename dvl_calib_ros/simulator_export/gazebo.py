@@ -1,4 +1,4 @@
-"""Gazebo (gz-sensors `DopplerVelocityLog`): an SDF sensor of gz:type dvl."""
+"""Export to Gazebo (gz-sensors `DopplerVelocityLog`): an SDF sensor of gz:type dvl."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DEFAULTS = {
 
 
 def write(description: DvlDescription) -> Settings:
-    """Noise is that of each beam; velocities are solved from the beams by least squares."""
+    """Write the sensor. Its noise is per beam; velocities are solved from the beams by least squares."""
     beams = beams_of(description.noise_std, math.radians(TILT_DEG))
     known = {
         "pose": numbers((*description.lever_arm, *description.mounting_rpy)),

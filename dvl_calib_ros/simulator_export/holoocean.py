@@ -1,4 +1,4 @@
-"""HoloOcean: a `DVLSensor` of a scenario's agent, as JSON."""
+"""Export to HoloOcean: a `DVLSensor` of a scenario's agent, as JSON."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ DEFAULTS = {
 
 
 def write(description: DvlDescription) -> Settings:
-    """Noise is that of each beam. Rotations in degrees about fixed axes, roll, pitch, yaw."""
+    """Write the sensor. Its noise is per beam. Rotations are in degrees about fixed axes: roll, pitch, yaw."""
     beams = beams_of(description.noise_std, math.radians(ELEVATION_DEG))
     known = {
         "location": description.lever_arm,

@@ -1,4 +1,4 @@
-"""All simulators by name; another one is a file like its neighbours and an entry here."""
+"""Simulators by name. A new one needs a module like the existing ones and an entry here."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ SIMULATORS: Mapping[str, Simulator] = {
 
 
 def missing_beside(output: Path) -> Path | None:
-    """Where what a simulator cannot represent is written to; None beside a stream."""
+    """Return the path of the list of missing effects, next to the output; None for a stream."""
     return None if own_stream(output) is not None else output.with_name(f"{output.name}.missing.json")
 
 
 def write_settings(simulator: str, source: Path, output: Path) -> Export:
-    """Write what a source says of a DVL as the settings of a simulator, and beside it what that cannot represent.
+    """Write a source's DVL as the settings of a simulator, and next to it the list of missing effects.
 
-    source: a diagnosis (JSON), a result or a parameter file (YAML). Both files are written or none. Raises InputError.
+    source: a diagnosis (JSON), a result or a parameter file (YAML). Either both files are written or none. Raises
+    InputError.
     """
     if simulator not in SIMULATORS:
         raise InputError(f"{simulator!r} is none of {', '.join(SIMULATORS)}")

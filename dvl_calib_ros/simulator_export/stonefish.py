@@ -1,4 +1,4 @@
-"""Stonefish: a `<sensor type="dvl">` of a scenario."""
+"""Export to Stonefish: a `<sensor type="dvl">` of a scenario."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ DEFAULTS = {
 
 
 def write(description: DvlDescription) -> Settings:
-    """Bodies are forward-right-down; the sensor, whose beams look along its -z, stays forward-left-up."""
+    """Write the sensor. Bodies are forward-right-down; the sensor, whose beams look along -z, stays forward-left-up."""
     rotation = FLU_FROM_FRD @ rotation_from_rpy(description.mounting_rpy)
     std = None if description.noise_std is None else equal_std(description.noise_std)
     known = {
@@ -49,7 +49,7 @@ def write(description: DvlDescription) -> Settings:
         found,
         own,
         None if std is None else (std, std, std),
-        remarks=("velocity_percent stays 0: its noise would shrink going astern, as it goes by the signed velocity",),
+        remarks=("velocity_percent stays 0: its noise follows the signed velocity, and would decrease astern",),
     )
 
 

@@ -1,4 +1,4 @@
-"""What a simulator can be told of a DVL, and what stays: the form that every writer has."""
+"""Common form of all simulator writers: settings, and effects that a simulator cannot represent."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 
 from .dvl_description import NOT_EXPLAINED, DvlDescription
 
-# Noise of one axis that is off by less is not worth telling, as a share of the noise of all
+# smallest reported error of one axis' noise, as a share of the noise of all
 SAME_NOISE = 0.2
-# DVLs have beams of 20 to 30 degrees from vertical; noise that would tell of others is not that of equal beams
+# beams are 20 to 30 degrees from vertical; noise that implies an angle outside this range is not due to equal beams
 PLAUSIBLE_ANGLES = (math.radians(12.0), math.radians(40.0))
 _WHY_NOT = "{} has no setting for it"
 
 
 @dataclass(frozen=True)
 class Missing:
-    """Something that was found and that a simulator cannot be told. error: m/s that stay, RMS; None: not known."""
+    """A diagnosed effect that a simulator cannot represent. error: remaining m/s, rms; None if unknown."""
 
     name: str
     says: str
@@ -30,11 +30,11 @@ class Missing:
 
 @dataclass(frozen=True)
 class Settings:
-    """What a writer makes of a description.
+    """Output of a writer.
 
-    text: the file. found: settings by name that are from what was found; defaults: those that are the simulator's own.
-    noise_std: (3,) m/s of its axes with these settings; None at the default noise. scale: the one error of all axes.
-    remarks: for the user of the file. represented: which of `scale` and `velocity_bias` are in the file.
+    text: the file. found: settings by name from the description. defaults: the simulator's own ones. noise_std: (3,)
+    m/s of its axes with these settings; None at the default noise. scale: the common error of all axes. remarks: for
+    the user of the file. represented: which of `scale` and `velocity_bias` are in the file.
     """
 
     text: str
@@ -57,7 +57,7 @@ class Simulator:
 
 @dataclass(frozen=True)
 class Export:
-    """Settings for one simulator, and what it cannot represent, the largest first."""
+    """Settings for one simulator, and the effects that it cannot represent, the largest first."""
 
     simulator: str
     settings: Settings
@@ -66,7 +66,7 @@ class Export:
 
 
 def export(name: str, simulator: Simulator, description: DvlDescription) -> Export:
-    """Settings of a simulator for a DVL."""
+    """Return the settings of a simulator for a DVL."""
     settings = simulator.write(description)
     missing = sorted(_missing(simulator.title, settings, description), key=lambda each: -(each.error or 0.0))
     ambiguous = tuple(
@@ -76,7 +76,7 @@ def export(name: str, simulator: Simulator, description: DvlDescription) -> Expo
 
 
 def export_document(export: Export, description: DvlDescription, version: str) -> dict[str, Any]:
-    """Plain data for the list beside the file."""
+    """Return plain data for the list next to the file."""
     return {
         "simulator": export.simulator,
         "source": description.source,
@@ -107,13 +107,13 @@ def _missing(title: str, settings: Settings, description: DvlDescription) -> lis
         elif other.name == NOT_EXPLAINED:
             reason = "no effect of the library explains it"
         elif "factor" in other.parameters:
-            reason = "noise is set as it is; that messages claim less is no setting"
+            reason = "the noise is set to its true level; there is no setting for the smaller claim of messages"
         found.append(Missing(other.name, f"{values_said}; {reason}".lstrip("; "), other.size))
     return found
 
 
 def _scale(title: str, settings: Settings, description: DvlDescription) -> list[Missing]:
-    """What is left of the scale-factor errors, where the simulator has none or one for all axes."""
+    """Report the remaining scale-factor errors, if the simulator has no scale or one for all axes."""
     left = np.array(description.scale) - settings.scale
     if not np.any(np.abs(left) > 1e-9):
         return []
@@ -124,7 +124,7 @@ def _scale(title: str, settings: Settings, description: DvlDescription) -> list[
 
 
 def _noise(settings: Settings, description: DvlDescription) -> list[Missing]:
-    """Noise of axes that differs from what was found."""
+    """Report axes whose noise differs from the description."""
     if description.noise_std is None or settings.noise_std is None:
         return []
     has, wanted = np.array(settings.noise_std), np.array(description.noise_std)
@@ -138,21 +138,18 @@ def _noise(settings: Settings, description: DvlDescription) -> list[Missing]:
     return [Missing("noise", says, error)]
 
 
-# ------------------------------------------------------------------ what several writers need
-
-
 def mixed_scale(description: DvlDescription) -> float:
-    """The one scale-factor error that stands best for those of the three axes, at the speeds that were driven."""
+    """Return the single scale-factor error that best replaces those of the three axes, at the speeds driven."""
     scale = np.array(description.scale)
     if description.speed is None:
-        return float(scale[0])  # ahead, where vehicles go
+        return float(scale[0])  # ahead, the main direction of vehicles
     weight = np.square(description.speed)
     return float(scale @ weight / max(float(weight.sum()), 1e-12))
 
 
 @dataclass(frozen=True)
 class Beams:
-    """Four equal Janus beams. angle: rad, from vertical; is_found: from the noise, else as given. std: m/s, each."""
+    """Four equal Janus beams. angle: rad, from vertical. is_found: derived from the noise. std: m/s, each."""
 
     angle: float
     is_found: bool
@@ -166,9 +163,9 @@ class Beams:
 
 
 def beams_of(noise_std: tuple[float, float, float] | None, default_angle: float) -> Beams | None:
-    """Beams whose least squares have this noise along the axes, None where it is not known.
+    """Return beams whose least squares have this noise along the axes, None if unknown.
 
-    The flatter the beams, the less is the noise across against that along z: their ratio is √2 / tan(angle).
+    The flatter the beams, the smaller the horizontal noise relative to z: their ratio is √2 / tan(angle).
     """
     if noise_std is None:
         return None
@@ -180,38 +177,38 @@ def beams_of(noise_std: tuple[float, float, float] | None, default_angle: float)
 
 
 def equal_std(noise_std: tuple[float, float, float]) -> float:
-    """The noise of three equal axes with as much in all."""
+    """Return the noise per axis of three equal axes with the same total."""
     return float(np.linalg.norm(noise_std)) / math.sqrt(3.0)
 
 
 def tidy(value: Any) -> Any:
-    """Numbers to nine digits, which is more than any is known to; and no -0.0."""
+    """Round numbers to nine digits, more than any is known to, and remove -0.0."""
     if isinstance(value, list | tuple):
         return [tidy(each) for each in value]
     return float(f"{value:.9g}") + 0.0 if isinstance(value, float) else value
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Numbers in a row."""
+    """Format numbers in a row."""
     return " ".join(str(tidy(float(value))) for value in values)
 
 
 def split(
     known: Mapping[str, Any], defaults: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Settings in all, those found, and those at the simulator's own. known: None where it was not found."""
+    """Return all settings, the known ones, and the simulator's defaults. known: None if not found."""
     found = {name: tidy(value) for name, value in known.items() if value is not None}
     own = {name: value for name, value in defaults.items() if name not in found}
     return {**defaults, **found}, found, own
 
 
 def comment(title: str, description: DvlDescription, found: Mapping[str, Any], own: Mapping[str, Any]) -> str:
-    """Where a file comes from, for its first lines; as XML comments may be, without two hyphens in a row."""
+    """Return the origin of a file for its first lines, without two hyphens in a row, as XML comments need."""
     lines = [
         f"DVL for {title}, from {description.source} (dvl-calib export).",
         f"From what was found: {', '.join(found)}.",
         f"At {title}'s defaults: {', '.join(own) or 'nothing'}.",
-        "What cannot be represented is listed in the .missing.json beside it.",
+        "The .missing.json next to it lists the effects that cannot be represented.",
     ]
     text = "\n".join(" ".join(line.split()) for line in lines)
     while "--" in text:
@@ -220,6 +217,6 @@ def comment(title: str, description: DvlDescription, found: Mapping[str, Any], o
 
 
 def xml_text(root: ET.Element) -> str:
-    """A document with a declaration, indented."""
+    """Return an indented document with a declaration."""
     ET.indent(root, space="  ")
     return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"

@@ -1,1 +1,1 @@
-"""A vehicle's recordings against those of a simulator, from other motions: what the simulator's DVL lacks."""
+"""Comparison of a simulator's DVL with a vehicle's, from recordings of different motions."""

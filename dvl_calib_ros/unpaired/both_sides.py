@@ -1,4 +1,4 @@
-"""Both sides of a comparison: recordings of a vehicle or of a simulator, explained by themselves."""
+"""The two sides of a comparison: recordings of a vehicle or of a simulator, each diagnosed by itself."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from ..recordings.recording import Recording as Opened
 from ..recordings.topics import Topics
 from .stream_properties import StreamFacts, stream_facts
 
-# No DVL is so quiet (m/s): its resolution is 1 mm/s. One that is, is the simulator's truth
+# a DVL with less noise (m/s) is a simulator's truth: the resolution of a real one is 1 mm/s
 NOISE_FREE_MPS = 2e-4
-# Noise that is laid over such a DVL, so that what interpolation leaves is not taken for an effect: a DVL's resolution
+# noise added to such a DVL, so that interpolation errors are not mistaken for an effect: a DVL's resolution
 DITHER_MPS = 1e-3
-# A DVL that follows its reference with less than this share of its own noise has the same noise: it is no second sensor
+# a DVL that follows its reference with less than this share of its own noise is a copy with the same noise
 COPIED = 0.3
 
 
 @dataclass(frozen=True)
 class RecordedSide:
-    """What was recorded on one side, and how to read it."""
+    """Recordings of one side, and how to read them."""
 
     opened: Opened
     parameters: Parameters
@@ -40,10 +40,10 @@ class RecordedSide:
 
 @dataclass(frozen=True)
 class Log:
-    """One side, explained by itself.
+    """Diagnosis of one side.
 
-    residuals: (N, 3) m/s per recording, recorded DVL velocity less that of the model that explains it, DVL frame, at
-    the DVL's stamps. exact: the DVL has no noise of its own. copied: it has the noise of its reference.
+    residuals: (N, 3) m/s per recording, recorded DVL velocity minus the fitted model's, DVL frame, at the DVL's stamps.
+    exact: the DVL has no noise of its own. copied: it has the noise of its reference.
     """
 
     diagnosis: Diagnosis
@@ -55,7 +55,7 @@ class Log:
 
     @property
     def selection(self) -> EffectSelection | None:
-        """The fits behind the diagnosis; None where it could not make any."""
+        """The fits behind the diagnosis; None without any."""
         return self.diagnosis.selection
 
 
@@ -65,7 +65,7 @@ def read_log(
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> Log:
-    """Read and diagnose one side. Raises InputError for what cannot be compared at all."""
+    """Read and diagnose one side. Raises InputError if it cannot be compared."""
     loaded = load_recordings(source.opened, source.parameters, source.topics)
     facts = tuple(stream_facts(each, source.parameters, source.topics) for each in source.opened.each)
     on_progress(0.5)
@@ -76,19 +76,19 @@ def read_log(
     residuals: tuple[Array, ...] = ()
     if diagnosis.selection is not None:
         residuals = dvl_residuals(diagnosis.selection)
-        recordings = diagnosis.selection.fitter.problem.recordings  # without samples that were left out
+        recordings = diagnosis.selection.fitter.problem.recordings  # without rejected samples
     return Log(diagnosis, recordings, facts, residuals, exact, not exact and is_copied(recordings, residuals))
 
 
 def dithered(recording: RecordedStreams) -> RecordedStreams:
-    """The recording with white noise over its DVL, the same at every call."""
+    """Return the recording with white noise added to its DVL, the same at every call."""
     dvl = recording.dvl
     noise = DITHER_MPS * np.random.default_rng(0).standard_normal(dvl.values.shape)
     return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.claimed, claims=dvl.claims))
 
 
 def dvl_residuals(selection: EffectSelection) -> tuple[Array, ...]:
-    """(N, 3) m/s per recording: recorded less simulated by the fit, DVL frame, on a reference without its noise."""
+    """Return (N, 3) m/s per recording: recorded minus fitted, DVL frame, with a noise-free reference."""
     problem = with_quiet_reference(selection.fitter.problem)
     return tuple(
         recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
@@ -97,7 +97,7 @@ def dvl_residuals(selection: EffectSelection) -> tuple[Array, ...]:
 
 
 def is_copied(recordings: Sequence[RecordedStreams], residuals: Sequence[Array]) -> bool:
-    """Whether what is left of the DVL has much less noise than the DVL itself: it has that of its reference."""
+    """Return whether the DVL's residual has much less noise than the DVL itself, which then shares its reference's."""
     if not residuals:
         return False
     left = [

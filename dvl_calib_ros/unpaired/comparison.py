@@ -1,4 +1,4 @@
-"""The comparison: from both sides' recordings to an answer."""
+"""Comparison of a simulator with a vehicle, from both sides' recordings to the answer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from .results import ComparedEffect, ComparedNoise, ComparisonStatus, Rung, Simu
 from .stream_comparison import compare_streams
 from .welch_tests import Candidate
 
-# Family-wise, of all that is claimed to differ
+# family-wise level over all claimed differences
 LEVEL = 0.01
 ORDER = (
     ComparisonStatus.MISSING,
@@ -54,7 +54,7 @@ def compare(
 ) -> UnpairedComparison:
     """Compare bags of a vehicle with bags of a simulator, from any motions.
 
-    Raises InputError for what cannot be compared at all.
+    Raises InputError if they cannot be compared.
     """
     real = read_log(vehicle, lambda share: on_progress(0.4 * share), effects, with_series)
     made = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
@@ -64,7 +64,7 @@ def compare(
 
 
 def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> UnpairedComparison:
-    """`compare`, of sides that are read and explained already."""
+    """Run `compare` for sides that are already read and diagnosed."""
     selections = vehicle.selection, simulator.selection
     if selections[0] is None or selections[1] is None:
         return _nothing_to_compare(vehicle.diagnosis, simulator.diagnosis)
@@ -106,7 +106,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
 
 
 def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
-    """What pictures show."""
+    """Return the data of the figures."""
     return {
         "shrunk": shrunk,
         "residuals": {"vehicle": vehicle.residuals, "simulator": simulator.residuals},
@@ -115,9 +115,6 @@ def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
             for side, log in (("vehicle", vehicle), ("simulator", simulator))
         },
     }
-
-
-# ------------------------------------------------------------------ effects
 
 
 class _Compared:
@@ -147,7 +144,7 @@ class _Compared:
         self.p = {name: p_alike(*both) for name, both in self.sizes.items()}
 
     def effect(self, name: str, p: float) -> ComparedEffect:
-        """One that both sides were tested for. p: adjusted."""
+        """Compare an effect that both sides can be tested for. p: adjusted."""
         vehicle, simulator = self.sizes[name]
         there = is_there(vehicle, simulator), is_there(simulator, vehicle)
         status = _status(there, p < LEVEL)
@@ -169,7 +166,7 @@ class _Compared:
         )
 
     def untested(self, name: str) -> ComparedEffect:
-        """One that the recordings of one side cannot be tested for, or of which they show other parts."""
+        """Report an effect that one side cannot be tested for, or whose observable parts differ between the sides."""
         shown = [side[name].intervals() if name in side else {} for side in self._per_side]
         effect = self._effects[name]
         needs = f"the two logs show nothing of it that is the same: {effect.manoeuvre}"
@@ -209,11 +206,8 @@ def _noise(candidate: Candidate, p: float) -> ComparedNoise:
     )
 
 
-# ------------------------------------------------------------------ words
-
-
 def _not_shown(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str, str]:
-    """Effects that a side could not have shown at sizes that matter -> what it could have, or what it lacks."""
+    """Return effects unobservable on a side at relevant sizes -> the smallest detectable size, or the missing data."""
     found = {name: f"needs {needs}" for name, needs in diagnosis.untestable.items()}
     named = {each.name for each in diagnosis.effects}
     for name, least in diagnosis.minimum_detectable.items():
@@ -251,7 +245,7 @@ def _reasons(
     vehicle: Diagnosis,
     simulator: Diagnosis,
 ) -> tuple[Reason, ...]:
-    """The verdict, and what is left."""
+    """Return the verdict's reasons, and the unexplained remainder."""
     reasons = []
     for status, code in _CLAIMED.items():
         named = [" or ".join((each.name, *each.equivalent_to)) for each in effects if each.status is status]

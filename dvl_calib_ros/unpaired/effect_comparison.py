@@ -1,9 +1,9 @@
-"""Effect by effect: the size on both sides, whether they differ, and where the difference lies.
+"""Comparison by effect: its size on both sides, the significance of the difference, and its location.
 
-All effects that either side was found to have are fitted to both, together: so the other side gives an interval for an
-effect that it was not found to have, which is wide where its motions do not show it. Each side has an effect as it was
-found there: a leap that came once or twice, a lever arm without what is not shown of it. Sizes are compared by Wald's
-test with the covariance that the scatter of blocks of time shows on each side.
+All effects found on either side are fitted to both, jointly. So the other side also gets an interval, which is wide if
+its motions do not make the effect observable. Each side keeps its own form of an effect: one or two clock steps, or a
+lever arm without its unobservable part. Sizes are compared by Wald's test with the covariance from the scatter between
+blocks of time on each side.
 """
 
 from __future__ import annotations
@@ -29,22 +29,23 @@ from ..effects.registry import EFFECTS
 from .both_sides import Log
 from .results import Lies, Triple
 
-# An effect that a side was not found to have is there nevertheless if it is sure at this level ...
+# an effect not found on a side is still present there if it is significant at this level ...
 THERE = 1e-3
-# ... and at least this share of the other side's: less is what interpolation and noise in the regressors leave
+# ... and at least this share of the other side's; less may be due to interpolation and noise in the regressors
 WORTH_IT = 0.1
-# A regime is named if it holds this share of an effect, and so many times as much as its share of the time
+# a regime is named if it has at least this share of an effect, and this multiple of its share of the time
 MOST, DENSER = 0.4, 1.2
-# Parameters of the calibration beside the effects; degrees of freedom that an interval is given at least
+# number of calibration parameters fitted jointly; smallest degrees of freedom of an interval
 CALIBRATION, FEWEST_DOF = 6, 4
 
 
 @dataclass(frozen=True)
 class Size:
-    """An effect on one side. values: (p,) its parameters with a derivative, of the day's the mean of the days'.
+    """An effect's size on one side. values: (p,) its linear parameters, averaged over recordings if they differ.
 
-    stacked: (r, p) of each recording that has its own, else (1, p), with covariance (r p, r p). dof: of that.
-    found: the side's own diagnosis named it. recordings: names of those that have their own, none if they share it.
+    stacked: (r, p) of each recording that has its own, else (1, p), with covariance (r p, r p). dof: of that
+    covariance. found: the side's own diagnosis named it. recordings: names of those with their own size, none if they
+    share it.
     """
 
     effect: Effect
@@ -56,16 +57,16 @@ class Size:
 
     @property
     def names(self) -> list[str]:
-        """Of its parameters."""
+        """Names of the parameters."""
         return [spec.name for spec in amplitudes(self.effect)]
 
     def taking(self, names: Sequence[str]) -> Array:
-        """(q, p) that makes parameters of other names of its own; one that it has not is 0."""
+        """Return the matrix (q, p) that maps its parameters to other names; missing ones become 0."""
         return np.array([[float(name == own) for own in self.names] for name in names])
 
     @property
     def mean(self) -> tuple[Array, Array]:
-        """(p,) weighted mean over recordings and its covariance (p, p)."""
+        """Weighted mean (p,) over recordings and its covariance (p, p)."""
         r, p = self.stacked.shape
         design = np.tile(np.eye(p), (r, 1))
         weight = np.linalg.inv(self.covariance)
@@ -73,8 +74,8 @@ class Size:
         return covariance @ design.T @ weight @ self.stacked.ravel(), np.asarray(covariance)
 
     def intervals(self) -> dict[str, Triple]:
-        """95 per cent, by name; of the days of several recordings by name and recording."""
-        # the covariance is estimated from as many blocks, which have to tell the calibration and these parameters
+        """Return 95 per cent intervals by name, and by recording if they differ."""
+        # the covariance is estimated from this number of blocks, which also determine the calibration
         dof = max(self.dof - CALIBRATION - len(self.covariance), FEWEST_DOF)
         reach = t.ppf(0.975, dof) * np.sqrt(np.diag(self.covariance))
         whose = [f" of {name}" for name in self.recordings] or [""]
@@ -85,21 +86,23 @@ class Size:
         }
 
     def p_absent(self) -> float:
-        """p of there being none of it."""
+        """Return the p-value of its absence."""
         defaults = np.array([spec.default for spec in amplitudes(self.effect)])
         return _wald(self.stacked.ravel() - np.tile(defaults, len(self.stacked)), self.covariance, self.dof)
 
 
 def compared_names(vehicle: Size, simulator: Size) -> list[str]:
-    """Parameters by which both sides are compared: what both have; where both were found to have the effect and one of
-    them twice, also those of the second time, of which the other has none."""
+    """Return the compared parameters: those of both sides and, for an effect found on both, of a second occurrence.
+
+    A side without the second occurrence has 0 for it.
+    """
     own = [*dict.fromkeys([*vehicle.names, *simulator.names])]
     again = vehicle.effect.again if vehicle.found and simulator.found else ()
     return [name for name in own if name in again or (name in vehicle.names and name in simulator.names)]
 
 
 def p_alike(vehicle: Size, simulator: Size) -> float:
-    """p of an effect having one size on both sides; of the day's, of every day having the simulator's."""
+    """Return the p-value of equal sizes on both sides; with sizes per recording, of each equalling the simulator's."""
     names = compared_names(vehicle, simulator)
     mean, covariance = simulator.mean
     n = len(vehicle.stacked)
@@ -116,7 +119,7 @@ def _wald(values: Array, covariance: Array, dof: int) -> float:
 
 
 def is_there(own: Size, other: Size) -> bool:
-    """Whether a side has an effect: it was named there, or is sure and not small against the other side's."""
+    """Return whether a side has an effect: found there, or significant and not small against the other side's."""
     if own.found:
         return True
     value, against = own.mean[0], other.mean[0]
@@ -125,20 +128,17 @@ def is_there(own: Size, other: Size) -> bool:
 
 
 def smallest_difference(vehicle: Size, simulator: Size, n_claims: int) -> dict[str, float]:
-    """Difference of each parameter that would be found in four of five recordings, where so many are claimed."""
+    """Return the difference of each parameter detected in four of five recordings, for this number of claims."""
     names = compared_names(vehicle, simulator)
     std = np.sqrt(sum(side.taking(names) @ np.diag(side.mean[1]) for side in (vehicle, simulator)))
     factor = float(norm.isf(0.005 / max(n_claims, 1)) + norm.ppf(0.8))
     return {name: factor * float(s) for name, s in zip(names, std, strict=True)}
 
 
-# ------------------------------------------------------------------ the same names on both sides
-
-
 def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str, str]]:
-    """Per side, names found -> the name under which they are compared.
+    """Return per side the names found -> the name under which they are compared.
 
-    An effect that one side cannot tell from the one that the other side has is taken for that.
+    An effect that one side cannot distinguish from one found on the other side gets that name.
     """
     own = [{each.name: each.equivalent_to for each in log.diagnosis.effects} for log in (vehicle, simulator)]
     names: list[dict[str, str]] = [{name: name for name in side} for side in own]
@@ -153,7 +153,7 @@ def common_names(vehicle: Log, simulator: Log) -> tuple[dict[str, str], dict[str
 
 
 def union(vehicle: Mapping[str, str], simulator: Mapping[str, str]) -> list[str]:
-    """Names to compare. Of three clocks only two differences matter, so the third is left out."""
+    """Return the names to compare. Of three clocks only two differences are observable, so the third is omitted."""
     both = {*vehicle.values(), *simulator.values()}
     if set(CLOCKS) <= both:
         both.discard(ATTITUDE_CLOCK)
@@ -161,8 +161,7 @@ def union(vehicle: Mapping[str, str], simulator: Mapping[str, str]) -> list[str]
 
 
 def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:
-    """All effects of these names that the recordings can be tested for, fitted together: as they were found, and others
-    as they were looked for."""
+    """Fit all testable effects of these names jointly: in the form found, else in the form of the search."""
     fitter, fit = selection.fitter, selection.fit
     found = {effect.name: effect for effect in fit.effects}
     known = {**selection.testable, **found}
@@ -174,7 +173,7 @@ def fitted(selection: EffectSelection, names: Sequence[str]) -> Fit:
 
 
 def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[str, Size]:
-    """Every effect of a fit by name. found: names (as compared) that the side's own diagnosis has."""
+    """Return every effect of a fit by name. found: compared names in the side's own diagnosis."""
     block = blocks_of(selection.fitter.problem)
     covariance = fit.covariance(block)
     dof = int(block.max()) + 1
@@ -186,7 +185,7 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
         p, r = len(amplitudes(effect)), len(whose)
         part = slice(at, at + p * r)
         at += p * r
-        if not p:  # nothing of it is shown
+        if not p:  # no part is observable
             continue
         stacked = vector[part].reshape(r, p)
         own = tuple(selection.fitter.problem.recordings[i].name for i in whose if i is not None)
@@ -194,18 +193,15 @@ def sizes(selection: EffectSelection, fit: Fit, found: Sequence[str]) -> dict[st
     return result
 
 
-# ------------------------------------------------------------------ where it lies
-
-
 def trace_of(selection: EffectSelection, fit: Fit, effect: Effect) -> Array:
-    """(M, A) m/s that an effect adds, without what misalignment, scale and the other effects would take in of it."""
+    """Return (M, A) m/s that an effect adds, without the part absorbed by misalignment, scale and other effects."""
     others = [other for other in fit.effects if other is not effect]
     without = selection.fitter.fit(fit.hypothesis.with_effects(others, len(fit.seen), {}), fit.noise, 4)
     return without.residual - fit.residual
 
 
 def lies(selection: EffectSelection, fit: Fit, trace: Array) -> Lies:
-    """Axis, regime and band that hold most of a trace (M, A); of the regimes the one where it is densest."""
+    """Return axis, regime and band with most of a trace (M, A); the regime by energy per time."""
     problem = selection.fitter.problem
     energy = trace**2
     total = max(float(energy.sum()), 1e-300)

@@ -1,10 +1,10 @@
-"""How far the gap shrinks: the vehicle's motion through the simulator's model as it is, and with what it lacks added.
+"""Reduction of the gap by adding the missing effects to the simulator's model, on the vehicle's motion.
 
-Everything is judged on stretches of the vehicle's recordings that were held out: misalignment and scale (which take in
-a part of every effect) and the effects that are added are fitted to the rest. Two figures: the rms of what recorded and
-simulated DVL velocity differ by, and an energy distance between windows of both, each less what an ideal DVL would have
-measured by the clocks and the lag that the vehicle has, the simulated one with noise. If both were drawn alike, each
-pair of windows of the same time could be exchanged, which gives the distance's distribution.
+All models are evaluated on held-out stretches of the vehicle's recordings: misalignment and scale (which absorb a part
+of every effect) and the added effects are fitted to the rest. One measure is the rms difference of recorded and
+simulated DVL velocity. The other is an energy distance between windows of both velocities, each minus an ideal DVL with
+the vehicle's clocks and lag; the simulated one has noise. If both velocities had the same distribution, two windows of
+the same time could be exchanged, which gives the distribution of the distance.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from .both_sides import Log
 from .effect_comparison import Size
 from .results import ComparisonStatus, Rung
 
-# Windows of the two-sample test: long enough that neighbours are nearly independent
+# windows of the two-sample test, long enough that neighbours are nearly independent
 WINDOW_S, PERMUTATIONS = 10.0, 500
-# Noise of a simulator is drawn from stretches of so many residuals, so that its colour is in it
+# number of successive residuals per draw of a simulator's noise, to keep its colour
 STRETCH = 8
-# The colour of a vehicle's noise is that of so many made-up references, the mean over so many bands of frequency
+# number of simulated references, and of frequency bands, for the colour of a vehicle's noise
 MADE_UP, BANDS = 8, 40
-# Errors count no more than so many standard deviations: an outlier is noise, of which there is a figure
+# errors are limited to this number of standard deviations: outliers are part of the noise comparison
 FAR = 5.0
 AS_IT_IS, ALL, NOISE = "as it is", "all effects", "all effects, and the vehicle's noise"
 
 
 @dataclass(frozen=True)
 class SimulatedModel:
-    """What is simulated. added: effects fitted to the vehicle; kept: those of the simulator, with their values."""
+    """A simulated model. added: effects fitted to the vehicle. kept: the simulator's effects with their values."""
 
     name: str
     added: tuple[Effect, ...]
@@ -50,7 +50,7 @@ class SimulatedModel:
 
 
 def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Sequence[Effect]) -> list[SimulatedModel]:
-    """The ladder. sizes: of both sides by name, and how they compare. vehicle: effects that the vehicle has."""
+    """Return the ladder of models. sizes: of both sides by name, and their comparison. vehicle: its effects."""
     kept = {
         name: (simulator.effect, _values(simulator))
         for name, (_, simulator, status) in sizes.items()
@@ -72,12 +72,12 @@ def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Se
 
 
 def is_of_every_run(effect: Effect) -> bool:
-    """Whether what a simulator has of it, it has on every run."""
+    """Return whether a simulator's effect has the same size in every run."""
     return not effect.relative_to_first and not any(is_time_of_run(spec) for spec in effect.parameters)
 
 
-def _is_of_time(effect: Effect) -> bool:
-    """Whether an effect says when a velocity was, or that it lags."""
+def _is_time_shift(effect: Effect) -> bool:
+    """Return whether an effect is a time shift of a velocity or a lag."""
     of_clock = isinstance(effect, ClockEffect) and effect.acts_on is not ActsOn.ATTITUDE_CLOCK
     return of_clock or isinstance(effect, EffectWithMemory)
 
@@ -89,8 +89,10 @@ def _values(size: Size) -> Values:
 
 @dataclass(frozen=True)
 class Shrunk:
-    """rungs: of the ladder. floor: m/s. errors: (F, 3) m/s held out, DVL frame, by name of the model, nan where nothing
-    is known. time: (F,) s since the start of the recording (F,).
+    """Result of the ladder.
+
+    rungs: of the ladder. floor: m/s. errors: (F, 3) m/s held out, DVL frame, by name of the model, nan if unknown.
+    time: (F,) s since the start of the recording recording_of (F,).
     """
 
     rungs: tuple[Rung, ...]
@@ -101,7 +103,7 @@ class Shrunk:
 
 
 def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed: int = 0) -> Shrunk:
-    """Climb the ladder on the vehicle's recordings."""
+    """Evaluate the ladder on the vehicle's recordings."""
     selection = vehicle.selection
     if selection is None:
         raise ValueError("nothing was fitted to the vehicle's recordings")
@@ -112,11 +114,12 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
     recording_of = np.repeat(np.arange(len(truth), dtype=np.intp), [len(each) for each in truth])
     windows = np.floor(time / WINDOW_S).astype(int) + recording_of * 1_000_000
     everything = _held_out(selection, ladder[-1])
-    # at other times, or without a lag, the reference has other noise, which were in both, and in one of them twice
-    ideal = _held_out(selection, SimulatedModel("", tuple(each for each in ladder[-1].added if _is_of_time(each)), {}))
-    # the vehicle's residual holds its reference's noise; that of a simulator, whose reference is the truth, does not
+    # a time shift or lag changes the reference's noise, which must not be counted twice
+    shifts = tuple(each for each in ladder[-1].added if _is_time_shift(each))
+    ideal = _held_out(selection, SimulatedModel("", shifts, {}))
+    # the vehicle's residual includes its reference's noise; the simulator's reference is noise-free
     of_reference = _reference_noise(problem, selection.fit.hypothesis, rng)
-    drawn = [_drawn(simulator.residuals, a, rng) + b[0] for a, b in zip(truth, of_reference, strict=True)]
+    drawn = [_random_noise(simulator.residuals, a, rng) + b[0] for a, b in zip(truth, of_reference, strict=True)]
     own = [
         turned_over(a - b, noise_spectrum(of_it, one.dvl.noise), rng)
         for a, b, of_it, one in zip(truth, everything, of_reference, problem.recordings, strict=True)
@@ -137,27 +140,27 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
 
 
 def _rms(values: Array) -> float:
-    """Of the vectors' lengths, outliers drawn in."""
-    return float(np.sqrt((_drawn_in(values) ** 2).sum(axis=1).mean()))
+    """Return the rms length of vectors, with limited outliers."""
+    return float(np.sqrt((_limited(values) ** 2).sum(axis=1).mean()))
 
 
-def _drawn_in(values: Array) -> Array:
-    """Values (N, 3), no farther out than FAR standard deviations of most of them."""
+def _limited(values: Array) -> Array:
+    """Limit values (N, 3) to FAR robust standard deviations."""
     far = FAR * np.maximum(robust_std(values), 1e-9)
     return np.clip(values, -far, far)
 
 
 def _floor(values: Array, recording_of: NDArray[np.intp]) -> float:
-    """The same of what values (N, 3) show from sample to sample: noise, which no simulator can take off."""
+    """Return the rms noise in values (N, 3) by differences between samples, which no simulator can remove."""
     parts = [values[recording_of == index] for index in np.unique(recording_of)]
     second = np.concatenate([part[2:] - 2.0 * part[1:-1] + part[:-2] for part in parts])
     return _rms(second[np.isfinite(second).all(axis=1)]) / float(np.sqrt(6.0))
 
 
 def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
-    """(N, 3) m/s per recording: what a model, fitted without the fold that a sample is in, says the DVL measures.
+    """Return the predicted DVL velocity (N, 3) m/s per recording, each sample by a fit without its fold.
 
-    Of several recordings stretches are held out as well: the model's days must have been seen for their own delays.
+    With several recordings stretches are held out as well, because a fit needs each recording for its own delay.
     """
     fitter, fit = selection.fitter, selection.fit
     problem = fitter.problem
@@ -169,7 +172,7 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     bins = stretch_of(problem.time) % SETTINGS.folds
     sample_folds = [_fold_of(problem, index) for index in range(n)]
     predicted = [np.full_like(each.dvl.values, np.nan) for each in problem.recordings]
-    # at the times that a delay looks at, a reference's noise is another: taken twice it would be too much
+    # at shifted times the reference's noise is different, so it would count twice
     quiet = with_quiet_reference(problem)
     for fold, (fitted,) in fitted_without(fitter, [start], fit.noise, bins, fixed):
         for index in range(n):
@@ -179,7 +182,7 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
 
 
 def _fold_of(problem: Problem, index: int) -> Array:
-    """(N,) fold of every DVL sample of a recording: stretches of time in turn; -1 outside of what was fitted."""
+    """Return the fold (N,) of each DVL sample of a recording: stretches of time in turn; -1 outside the fit."""
     time = problem.recordings[index].dvl.time - problem.grids[index].late
     of = problem.grids[index].bin_time
     fold = stretch_of(time) % SETTINGS.folds
@@ -188,8 +191,9 @@ def _fold_of(problem: Problem, index: int) -> Array:
 
 
 def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Generator) -> list[Array]:
-    """(MADE_UP, N, 3) m/s per recording: what made-up noise of the reference makes in the DVL's frame, where it is not
-    taken off: slow, where the motion is.
+    """Return the slow noise (MADE_UP, N, 3) m/s per recording that simulated reference noise adds to the DVL.
+
+    Fast reference noise is excluded, because `with_quiet_reference` subtracts it.
     """
     quiet = with_quiet_reference(problem)
     noisy = [
@@ -208,8 +212,9 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
 
 
 def noise_spectrum(of_reference: Array, white: Array) -> Array:
-    """(N // 2 + 1, 3) power of noise by frequency, in (m/s)²: of references (R, N, 3) in bands, beside white noise of
-    standard deviations (3,).
+    """Return the noise power (N // 2 + 1, 3) by frequency, in (m/s)².
+
+    of_reference: (R, N, 3) m/s, whose power is averaged in bands. white: standard deviations (3,) of white noise.
     """
     power = (np.abs(np.fft.rfft(of_reference, axis=1)) ** 2).mean(axis=0) / of_reference.shape[1]
     edges = np.unique(np.concatenate([[0], np.geomspace(1.0, len(power), BANDS)]).astype(int))
@@ -219,23 +224,23 @@ def noise_spectrum(of_reference: Array, white: Array) -> Array:
 
 
 def turned_over(residual: Array, spectrum: Array, rng: np.random.Generator) -> Array:
-    """(N, 3) m/s: a residual, made white, turned over by chance and made as coloured again as its noise is: so it is as
-    loud at every turn as it is there, and what lasts longer than noise of this spectrum is lost.
+    """Return a residual (N, 3) m/s with random signs while whitened, and the spectrum restored.
 
-    Drawn from elsewhere, it would be too loud where the vehicle goes straight on, and windows were told apart by that.
+    So its level depends on time as in the original, and structure slower than this noise is removed. Noise drawn from
+    elsewhere would be too large on straight legs, which would distinguish the windows.
     """
     n = len(residual)
     values = np.nan_to_num(residual - np.nanmedian(residual, axis=0))
     signs = rng.choice([-1.0, 1.0], n)[:, None]
-    near = _drawn_in(values)  # outliers are not coloured
+    near = _limited(values)  # outliers are not coloured
     gain = np.sqrt(spectrum)
     white = np.fft.irfft(np.fft.rfft(near, axis=0) / gain, n, axis=0)
     made = np.fft.irfft(np.fft.rfft(white * signs, axis=0) * gain, n, axis=0)
     return np.asarray(made + (values - near) * signs)
 
 
-def _drawn(pool: Sequence[Array], like: Array, rng: np.random.Generator) -> Array:
-    """(N, 3) m/s: noise put together of stretches of residuals."""
+def _random_noise(pool: Sequence[Array], like: Array, rng: np.random.Generator) -> Array:
+    """Return noise (N, 3) m/s composed of stretches of residuals."""
     joined = np.concatenate(list(pool))
     joined = joined - np.nanmedian(joined, axis=0)
     n = len(like)
@@ -244,11 +249,8 @@ def _drawn(pool: Sequence[Array], like: Array, rng: np.random.Generator) -> Arra
     return np.asarray(np.nan_to_num(joined[at]))
 
 
-# ------------------------------------------------------------------ two samples
-
-
 def features(values: Array, windows: Array) -> Array:
-    """(W, 6) of each window: mean and logarithm of the scatter on every axis."""
+    """Return (W, 6) per window: mean and logarithm of the scatter on every axis."""
     _, index = np.unique(windows, return_inverse=True)
     count = np.bincount(index).astype(float)
     mean = np.stack([np.bincount(index, column) for column in values.T], axis=1) / count[:, None]
@@ -259,7 +261,7 @@ def features(values: Array, windows: Array) -> Array:
 
 
 def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generator) -> tuple[float, float, float]:
-    """Energy distance of the windows of two series (N, 3), its 95 per cent quantile if both are alike, and p."""
+    """Return the energy distance of two series' windows (N, 3), its 95 per cent quantile if both are alike, and p."""
     a, b = features(one, windows), features(other, windows)
     scale = np.maximum(robust_std(np.concatenate([a, b])), 1e-9)
     both = np.concatenate([a, b]) / scale
@@ -270,7 +272,7 @@ def two_samples(one: Array, other: Array, windows: Array, rng: np.random.Generat
     sign = np.concatenate([np.ones(w), -np.ones(w)])
 
     def energy(signs: Array) -> Array:
-        """-s'Ds / w² is 2 E|X-Y| - E|X-X'| - E|Y-Y'|."""
+        """Return -s'Ds / w², which is 2 E|X-Y| - E|X-X'| - E|Y-Y'|."""
         return -np.einsum("...i,ij,...j->...", signs, apart, signs) / w**2
 
     swap = rng.choice([-1.0, 1.0], (PERMUTATIONS, w))

@@ -1,8 +1,8 @@
-"""The noise of both sides: level per axis, what it grows with, tails, colour.
+"""Comparison of both sides' noise: level per axis, growth with motion, tails, colour.
 
-The level of a DVL that is fast enough is what its samples show against their own neighbours, to which motion and
-reference are nothing; that of a slow one is of its residual, in which the reference's noise is too. Levels are compared
-over blocks of as many samples on both sides, so whatever the noise's distribution is, it is in the scatter of blocks.
+The level of a fast DVL is estimated from differences between neighbouring samples, which exclude motion and reference;
+for a slow one from its residual, which includes the reference's noise. Levels are compared over blocks of equal size on
+both sides, so the scatter between blocks accounts for any distribution of the noise.
 """
 
 from __future__ import annotations
@@ -26,26 +26,27 @@ from .both_sides import Log
 from .stream_comparison import OUTLIER
 from .welch_tests import BLOCK, FEWEST_BLOCKS, Candidate, mean_of, shares_of, welch
 
-# Levels that are closer than this do not matter
+# smaller ratios of levels are irrelevant
 WORTH_TELLING = 1.15
-# Tails: beyond so many standard deviations, and no outlier
+# limit of the tails in standard deviations, below outliers
 TAIL = 3.7
-# A vehicle that goes astern so often shows what its noise does then
+# smallest share of samples with motion astern to estimate its noise
 ASTERN_SHARE, ASTERN_MPS = 0.05, 0.1
-# Growth of the noise is of the logarithm: it is compared where one side shows it at this level, and so is its colour
+# significance level for growth of the log level, and for colour, on either side
 GROWS = 1e-4
-# Standard deviations of speed, m/s, turn rate, rad/s, and speed astern, m/s, over which a growth can be seen
+# smallest standard deviations of speed, m/s, turn rate, rad/s, and speed astern, m/s, to estimate growth
 SPREAD = {"speed": 0.1, "turn_rate": 0.01, "astern": 0.05}
 
 Slopes = dict[str, tuple[float, float]]
-"""Growth of the logarithm and its standard deviation, by what it grows with."""
+"""Growth of the log level and its standard deviation, by covariate."""
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Samples of one recording's noise. values: (N, 3) m/s, white if the DVL's noise is, of its standard deviation.
+    """Noise samples of one recording. values: (N, 3) m/s, white if the DVL's noise is, of its standard deviation.
 
-    motion: at the samples. thin: every so many are independent. of_reference: m/s, of it the reference's at most.
+    motion: at the samples. thin: step between independent samples. of_reference: m/s, upper limit of the reference's
+    part.
     """
 
     values: Array
@@ -55,7 +56,7 @@ class Scatter:
 
 
 def compare_noise(vehicle: Log, simulator: Log) -> list[Candidate]:
-    """All properties that both sides show."""
+    """Compare all properties observable on both sides."""
     found: list[Candidate | None] = []
     both = [scatter(log) for log in (vehicle, simulator)]
     if all(both) and not (vehicle.exact or simulator.exact):
@@ -68,11 +69,8 @@ def compare_noise(vehicle: Log, simulator: Log) -> list[Candidate]:
     return [each for each in found if each is not None]
 
 
-# ------------------------------------------------------------------ level
-
-
 def scatter(log: Log) -> list[Scatter]:
-    """The noise of the samples of each recording; empty where there are too few."""
+    """Return the noise samples of each recording; empty if there are too few."""
     if log.selection is None:
         return []
     problem, hypothesis = log.selection.fitter.problem, log.selection.fit.hypothesis
@@ -95,7 +93,7 @@ def scatter(log: Log) -> list[Scatter]:
 def _differences(
     time: Array, values: Array, interval: float, weights: Sequence[float]
 ) -> tuple[Array, NDArray[np.intp], float]:
-    """Differences (K, 3) of neighbours without a gap, the middle sample of each, and their norm for white noise."""
+    """Return differences (K, 3) of neighbours without a gap, their middle samples, and their norm for white noise."""
     w, reach = np.array(weights), len(weights) // 2
     n = len(time) - 2 * reach
     if n < 1:
@@ -107,7 +105,7 @@ def _differences(
 
 
 def block_levels(scattered: Sequence[Scatter], axis: int) -> Array:
-    """(B,) log standard deviation of one axis in blocks of as many samples."""
+    """Return the log standard deviation (B,) of one axis in blocks of equal size."""
     levels = []
     for each in scattered:
         values = each.values[:, axis]
@@ -117,7 +115,7 @@ def block_levels(scattered: Sequence[Scatter], axis: int) -> Array:
 
 
 def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) -> Candidate | None:
-    """Level of one axis of the DVL. What of a slow DVL may be the reference's is given the benefit of the doubt."""
+    """Compare the level of one DVL axis. The possible part of the reference in a slow DVL's level is not claimed."""
     blocks = [block_levels(side, axis) for side in (vehicle, simulator)]
     if min(map(len, blocks)) < FEWEST_BLOCKS:
         return None
@@ -140,7 +138,7 @@ def _level(vehicle: Sequence[Scatter], simulator: Sequence[Scatter], axis: int) 
 
 
 def levels_by_regime(log: Log) -> dict[str, float]:
-    """Regime of motion -> m/s, root of the sum of squares over the axes of the noise's level there."""
+    """Return regime of motion -> m/s, root of the sum over axes of the squared noise level."""
     scattered = scatter(log)
     if not scattered or log.selection is None:
         return {}
@@ -160,12 +158,10 @@ def levels_by_regime(log: Log) -> dict[str, float]:
     }
 
 
-# ------------------------------------------------------------------ growth
-
-
 def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
-    """Slopes of the log level with speed, turn rate, and speed astern: the level that a simulator's σ, in which speed
-    stands with its sign, has astern is below that ahead.
+    """Compare slopes of the log level with speed, turn rate, and speed astern.
+
+    If a simulator's σ depends on the signed speed, its level astern is below that ahead.
     """
     units = {"speed": "1/(m/s)", "turn_rate": "1/(rad/s)", "astern": "1/(m/s)"}
     found: list[Candidate | None] = []
@@ -173,7 +169,7 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
         if not all(name in each for each in slopes):
             continue
         (a, std_a), (b, std_b) = (each[name] for each in slopes)
-        there = tuple(_grows(each, name) for each in slopes)
+        there = tuple(_is_significant(each, name) for each in slopes)
         p = float(2.0 * norm.sf(abs(a - b) / np.hypot(std_a, std_b)))
         found.append(
             Candidate(
@@ -189,23 +185,23 @@ def _growth(slopes: Sequence[Slopes]) -> list[Candidate | None]:
     return found
 
 
-def _grows(slopes: Slopes, name: str) -> bool:
-    """Whether a slope is sure."""
+def _is_significant(slopes: Slopes, name: str) -> bool:
+    """Return whether a slope is significant."""
     value, std = slopes[name]
     return bool(2.0 * norm.sf(abs(value) / std) < GROWS)
 
 
 def at_one_motion(both: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
-    """The noise as loud as it would be if both sides moved alike, by the growth that is sure."""
+    """Scale the noise to a common motion of both sides, by the significant growth."""
     columns = [[_covariates(each) for each in side] for side in both]
-    names = [name for name in SPREAD if any(name in of and _grows(of, name) for of in slopes)]
+    names = [name for name in SPREAD if any(name in of and _is_significant(of, name) for of in slopes)]
     even = [list(side) for side in both]
     for name in names:
         if not all(name in each for side in columns for each in side):
             continue
         usual = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
         for side, of, own in zip(even, slopes, columns, strict=True):
-            if name in of and _grows(of, name):
+            if name in of and _is_significant(of, name):
                 for index, each in enumerate(side):
                     quieter = np.exp(-of[name][0] * (own[index][name] - usual))
                     side[index] = replace(each, values=each.values * quieter[:, None])
@@ -213,7 +209,7 @@ def at_one_motion(both: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -
 
 
 def _covariates(scattered: Scatter) -> dict[str, Array]:
-    """(N,) each: speed m/s, turn rate rad/s where it is known, speed astern m/s."""
+    """Return speed m/s, turn rate rad/s if known, and speed astern m/s; each (N,)."""
     motion = scattered.motion
     found = {"speed": motion.speed}
     if motion.angular_velocity is not None:
@@ -222,7 +218,7 @@ def _covariates(scattered: Scatter) -> dict[str, Array]:
 
 
 def slopes_of(scattered: Sequence[Scatter]) -> Slopes:
-    """Slope and standard deviation by covariate, of log squares, with the scatter of blocks (a sandwich)."""
+    """Fit slope and standard deviation by covariate to log squares, with the scatter of blocks (sandwich estimate)."""
     each = [_covariates(one) for one in scattered]
     names = [name for name in SPREAD if all(name in one for one in each)]
     columns = {name: np.concatenate([one[name] for one in each]) for name in names}
@@ -246,11 +242,8 @@ def slopes_of(scattered: Sequence[Scatter]) -> Slopes:
     return {name: (0.5 * float(parameters[i]), 0.5 * float(std[i])) for i, name in enumerate(columns, start=1)}
 
 
-# ------------------------------------------------------------------ shape
-
-
 def _tails(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> Candidate | None:
-    """Share of independent samples beyond TAIL standard deviations; those beyond OUTLIER are outliers."""
+    """Compare shares of independent samples beyond TAIL standard deviations; those beyond OUTLIER are outliers."""
     counts = []
     for side in (vehicle, simulator):
         far = n = 0
@@ -263,16 +256,16 @@ def _tails(vehicle: Sequence[Scatter], simulator: Sequence[Scatter]) -> Candidat
 
 
 def _colour(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Slow noise: means over blocks, against what white noise of the same level would have.
+    """Compare slow noise: means over blocks, against white noise of the same level.
 
-    Where one side surely has any: what reaches these means of the reference's noise, or of its motion between samples,
-    differs between the sides as well.
+    Only if it is significant on one side: the reference's noise, and its motion between samples, also contribute to
+    these means and differ between the sides.
     """
     findings = [_finding(log, "coloured_reference_noise") for log in (vehicle, simulator)]
     findings = [each if each is not None and each.p < GROWS else None for each in findings]
     if findings[0] is None and findings[1] is None:
         return None
-    slow = [_slow(log) for log in (vehicle, simulator)]
+    slow = [_block_means(log) for log in (vehicle, simulator)]
     if min(len(each) for each in slow) < 3 * FEWEST_BLOCKS:
         return None
     ratio = float(np.mean(slow[0] ** 2) / np.mean(slow[1] ** 2))
@@ -289,8 +282,8 @@ def _finding(log: Log, name: str) -> NoiseFinding | None:
     return next((each for each in log.diagnosis.noise if each.name == name), None)
 
 
-def _slow(log: Log) -> Array:
-    """(B,) means of blocks of residuals, in standard deviations that they would have if these were white."""
+def _block_means(log: Log) -> Array:
+    """Return block means (B,) of residuals, in standard deviations expected for white noise."""
     means = []
     for residual in log.residuals:
         size = max(BLOCK, 1)

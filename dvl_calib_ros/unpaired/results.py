@@ -1,4 +1,4 @@
-"""What a comparison says, as data, and as the JSON of `diagnose --simulator --json`."""
+"""Results of a comparison, and the JSON of `diagnose --simulator --json`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Triple = tuple[float, float, float]
 
 
 class ComparisonStatus(str, Enum):
-    """How an effect, or a property of the noise, compares."""
+    """Comparison of an effect, or of a property of the noise."""
 
     MISSING = "missing_in_simulator"
     OTHER_SIZE = "other_size"
@@ -26,12 +26,12 @@ class ComparisonStatus(str, Enum):
 
     @property
     def is_claim(self) -> bool:
-        """Whether it says that the two differ."""
+        """Whether it is a difference."""
         return self in (ComparisonStatus.MISSING, ComparisonStatus.OTHER_SIZE, ComparisonStatus.ONLY_SIMULATOR)
 
     @property
     def words(self) -> str:
-        """As people read it."""
+        """Displayed text."""
         return {
             ComparisonStatus.MISSING: "the simulator lacks it",
             ComparisonStatus.OTHER_SIZE: "another size",
@@ -42,7 +42,7 @@ class ComparisonStatus(str, Enum):
 
 
 class SimulatorVerdict(str, Enum):
-    """The answer in a word."""
+    """The answer as a word."""
 
     DIFFERENT = "different"
     ONLY_NOISE = "only_noise"
@@ -52,7 +52,7 @@ class SimulatorVerdict(str, Enum):
 
 @dataclass(frozen=True)
 class Lies:
-    """Where most of an effect is: axis, regime of motion, band of frequency; each with its share of the energy."""
+    """Location of most of an effect: axis, regime of motion, frequency band; each with its share of the energy."""
 
     axis: str
     axis_share: float
@@ -68,11 +68,11 @@ class Lies:
 
 @dataclass(frozen=True)
 class ComparedEffect:
-    """One effect on both sides. equivalent_to: others that the data cannot tell from it, on the side that has it.
+    """One effect on both sides. equivalent_to: effects that the data cannot distinguish from it.
 
-    vehicle, simulator: parameters; empty where that side's recordings cannot show it. p: that both are alike, adjusted
-    (Holm) over all claims; nan where not tested. adds_mps: rms of what it adds to the vehicle's DVL (or, if only in the
-    simulator, to that), beyond what misalignment and scale take in. needs: what would show what could not be told.
+    vehicle, simulator: parameters; empty if not observable on that side. p: of equal sizes, adjusted (Holm) over all
+    claims; nan if not tested. adds_mps: rms of its addition to the vehicle's DVL (or, if only in the simulator, to
+    that), without the part absorbed by misalignment and scale. needs: what would make it observable.
     """
 
     name: str
@@ -88,7 +88,7 @@ class ComparedEffect:
 
 @dataclass(frozen=True)
 class ComparedNoise:
-    """One property of the noise or of the stream. vehicle, simulator: value and interval in unit; p: adjusted."""
+    """One property of the noise or of the stream. vehicle, simulator: value and interval in unit. p: adjusted."""
 
     name: str
     status: ComparisonStatus
@@ -101,9 +101,11 @@ class ComparedNoise:
 
 @dataclass(frozen=True)
 class Rung:
-    """One model of the vehicle's DVL. name: the simulator as it is, or with what added. error_mps: rms of recorded less
-    simulated without noise, outliers drawn in, on held-out stretches. distance: energy distance of windows of both,
-    with noise, in units of their spread; null95: what it stays below 19 times in 20 if both are alike; p.
+    """One model of the vehicle's DVL. name: the original simulator, or the added effects.
+
+    error_mps: rms of recorded minus simulated without noise, with limited outliers, on held-out stretches. distance:
+    energy distance between windows of both, with noise, in units of their spread. null95: its 95 % quantile if both are
+    alike. p: its p-value.
     """
 
     name: str
@@ -115,10 +117,11 @@ class Rung:
 
 @dataclass(frozen=True, repr=False)
 class UnpairedComparison(Answering):
-    """The whole answer. reasons: the verdict first. effects and noise: claims first, the strongest first. levels: per
-    regime, m/s rms over the axes: vehicle and simulator. floor_mps: noise that no simulator can take off, of `rungs`.
-    not_shown: for each side the effects that its motions could not have shown at sizes that matter, with the smallest
-    size that they would.
+    """The whole answer.
+
+    reasons: the verdict first. effects and noise: claims first, the most significant first. levels: by regime, m/s rms
+    over the axes: vehicle and simulator. floor_mps: noise in `rungs` that no simulator can remove. not_shown: for each
+    side the effects not observable from its motions at relevant sizes, with their smallest detectable size.
     """
 
     verdict: SimulatorVerdict
@@ -136,17 +139,17 @@ class UnpairedComparison(Answering):
 
     @property
     def sentence(self) -> str:
-        """The verdict in words."""
+        """The verdict as a sentence."""
         return " ".join(reason.full_sentence for reason in self.reasons)
 
     @property
     def missing(self) -> tuple[ComparedEffect, ...]:
-        """Effects that the vehicle has and the simulator has not, the strongest first."""
+        """Effects of the vehicle that the simulator lacks, the most significant first."""
         return tuple(each for each in self.effects if each.status is ComparisonStatus.MISSING)
 
 
 def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
-    """The JSON; with the diagnosis of each side as `diagnose --json` has it."""
+    """Return the JSON, with the diagnosis of each side as in `diagnose --json`."""
     return {
         "verdict": comparison.verdict.value,
         "sentence": comparison.sentence,

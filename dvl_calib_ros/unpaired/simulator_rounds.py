@@ -1,7 +1,7 @@
-"""The loop closed: a simulator's DVL put right by what a comparison found, simulated on its own motion, compared again.
+"""Iterative correction of a simulator's DVL: correct the differences, simulate its motion again, compare again.
 
-What is put right from round to round is the document of the vehicle's diagnosis, as `export` and `simulate --diagnosis`
-read it: so every round's is a DVL that can be given to a simulator.
+The corrected object is the document of the vehicle's diagnosis, as read by `export` and `simulate --diagnosis`. So each
+round's DVL can be given to a simulator.
 """
 
 from __future__ import annotations
@@ -36,45 +36,45 @@ from .gap_ladder import is_of_every_run
 from .results import ComparedEffect, SimulatorVerdict, Triple, UnpairedComparison, unpaired_document
 
 MOST_ROUNDS = 9
-# The simulator's velocity is its truth: no more is taken off it than the corners between its samples
+# the simulator's velocity is exact: only the corners between its samples are smoothed
 SMOOTHING_S = 0.2
 TRUTH_HZ = 10.0
 
 
 @dataclass(frozen=True)
 class Round:
-    """One time round. dvl: document of the DVL that was simulated; None of the simulator as it was recorded."""
+    """One round. dvl: document of the simulated DVL; None for the simulator as recorded."""
 
     comparison: UnpairedComparison
     dvl: Mapping[str, Any] | None = None
 
     @property
     def error_mps(self) -> float:
-        """RMS, m/s, of recorded less simulated on the vehicle's own motion, held out; nan of nothing compared."""
+        """Rms, m/s, of recorded minus simulated on the vehicle's own motion, held out; nan without a comparison."""
         rungs = self.comparison.rungs
         return rungs[0].error_mps if rungs else float("nan")
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Those of the DVL that was simulated."""
+        """Effects of the simulated DVL."""
         return () if self.dvl is None else tuple(each["name"] for each in self.dvl["effects"])
 
     @property
     def claims(self) -> tuple[str, ...]:
-        """Effects and properties of the noise in which it differs from the vehicle."""
+        """Effects and properties of the noise that differ from the vehicle's."""
         effects = [each.name for each in self.comparison.effects if each.status.is_claim]
         return (*effects, *(each.name for each in self.comparison.noise if each.status.is_claim))
 
 
 @dataclass(frozen=True, repr=False)
 class ClosedGap(Answering):
-    """A simulator put right, round by round. rounds: the first is the simulator as it was recorded."""
+    """Simulator corrected in rounds. rounds: the first is the simulator as recorded."""
 
     rounds: tuple[Round, ...]
 
     @property
     def best(self) -> int:
-        """The round with the fewest differences in effects, of these with the smallest error."""
+        """Index of the round with the fewest differences in effects and, among these, the smallest error."""
 
         def worth(index: int) -> tuple[int, float]:
             each = self.rounds[index]
@@ -84,12 +84,12 @@ class ClosedGap(Answering):
 
     @property
     def verdict(self) -> SimulatorVerdict:
-        """The verdict on the best round."""
+        """Verdict of the best round."""
         return self.rounds[self.best].comparison.verdict
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """The answer: how far the gap shrank, and what the best round still lacks."""
+        """The answer: reduction of the gap, and remaining differences of the best round."""
         first, best = self.rounds[0], self.rounds[self.best]
         if len(self.rounds) == 1:
             return (*first.comparison.reasons, finding("SIMULATOR_NO_ROUNDS"))
@@ -110,24 +110,23 @@ def close_gap(
     on_progress: Callable[[float], None] = lambda _: None,
     effects: Mapping[str, Effect] = EFFECTS,
 ) -> ClosedGap:
-    """Compare, and so many times put right what differs, simulate it on the simulator's motion, compare again.
+    """Compare; then repeatedly correct the differences, simulate the simulator's motion and compare again.
 
-    It ends early where nothing differs that can be put right. In the folder, which must exist, are then of each round
-    ROUND.json, the DVL as `export` and `simulate --diagnosis` take it, and ROUND, or ROUND_NUMBER of several, its bags.
+    It stops early if no correctable difference remains. The existing folder then has, for each round, ROUND.json (the
+    DVL for `export` and `simulate --diagnosis`) and ROUND, or ROUND_NUMBER with several bags.
 
     Parameters
     ----------
     vehicle, simulator: Both sides.
-    rounds: At most so many.
-    folder: Where bags are simulated to.
-    on_progress: Called with the share that is done.
+    rounds: Largest number of rounds.
+    folder: Folder for simulated bags.
+    on_progress: Receives the finished share.
     effects: By name.
 
     Raises
     ------
     InputError
-        For what cannot be compared at all, or a simulator's log without attitude, which has no motion.
-
+        If the sides cannot be compared, or the simulator's log has no attitude and so no motion.
     """
     topics = simulator.topics.found_in(simulator.opened.types)
     for path, one in zip(simulator.opened.paths, simulator.opened.each, strict=True):
@@ -158,7 +157,7 @@ def close_gap(
 
 
 def check_rounds(rounds: int | None, keep: Path | None) -> None:
-    """Raise InputError for a number of rounds that cannot be, and for a folder that is there or belongs to none."""
+    """Raise InputError for an invalid number of rounds, or a folder that exists or has no rounds."""
     if rounds is not None and not 1 <= rounds <= MOST_ROUNDS:
         raise InputError(f"rounds: {rounds} is outside 1 .. {MOST_ROUNDS}")
     if keep is None:
@@ -177,9 +176,9 @@ def against(
     on_progress: Callable[[float], None] = lambda _: None,
     with_series: bool = False,
 ) -> UnpairedComparison | ClosedGap:
-    """Compare both sides once, or with rounds as `close_gap`, in a new folder that is kept or in one that is not.
+    """Compare both sides once, or in rounds as `close_gap`, in a new folder (`keep`) or a temporary one.
 
-    Raises InputError, as `check_rounds`, `compare` and `close_gap`.
+    Raises InputError, see `check_rounds`, `compare` and `close_gap`.
     """
     check_rounds(rounds, keep)
     if rounds is None:
@@ -194,13 +193,13 @@ def against(
 def put_right(
     document: Mapping[str, Any], comparison: UnpairedComparison, effects: Mapping[str, Effect] = EFFECTS
 ) -> dict[str, Any]:
-    """The document of a DVL with what differs changed by as much as it differs: effects, noise and rate."""
+    """Return a DVL's document corrected by the differences in effects, noise and rate."""
     corrected: dict[str, Any] = deepcopy(dict(document))
     by_name = {each["name"]: each for each in corrected["effects"]}
     for compared in (each for each in comparison.effects if each.status.is_claim):
         effect = effects[compared.name]
         if not is_of_every_run(effect) or any(" of " in key for key in compared.vehicle):
-            continue  # another size every day, or at a time of a run that may be none of the simulator's
+            continue  # differs per recording, or happens at a time of a run that the simulator's may not have
         entry = by_name.get(effect.name)
         if entry is None:
             entry = {"name": effect.name, "equivalent_to": [], "parameters": {}}
@@ -224,7 +223,7 @@ def put_right(
 
 
 def _difference(compared: ComparedEffect, name: str) -> float:
-    """By how much the vehicle has more of a parameter; of several recordings by their means. 0 where one shows none."""
+    """Return vehicle minus simulator for a parameter, averaged over recordings; 0 if one side does not have it."""
 
     def of(side: Mapping[str, Triple]) -> list[float]:
         return [value for key, (value, _, _) in side.items() if key == name or key.startswith(f"{name} of ")]
@@ -236,7 +235,7 @@ def _difference(compared: ComparedEffect, name: str) -> float:
 def _simulated(
     document: Mapping[str, Any], number: int, simulator: RecordedSide, folder: Path, vehicle: Diagnosis
 ) -> RecordedSide:
-    """Bags of a DVL on the motions of the simulator's, and how to read them."""
+    """Simulate bags of a DVL on the simulator's motions, and return how to read them."""
     source = folder / f"round_{number}.json"
     write_json(source, document)
     paths = simulator.opened.paths
@@ -262,7 +261,7 @@ def _simulated(
 
 
 def closed_gap_document(closed: ClosedGap) -> dict[str, Any]:
-    """The JSON of `diagnose --simulator --rounds --json`: the comparison of each round, and the DVL that it was of."""
+    """Return the JSON of `diagnose --simulator --rounds --json`: comparison and DVL of each round."""
     return {
         "sentence": " ".join(each.full_sentence for each in closed.reasons),
         "reasons": [each.as_dict() for each in closed.reasons],

@@ -1,4 +1,4 @@
-"""The streams of both sides: truth that leaks, outliers, dropouts, repeats, rate, jitter, latency."""
+"""Comparison of both sides' streams: leaked truth, outliers, dropouts, repeats, rate, jitter, latency."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .results import Triple
 from .stream_properties import DROPOUT_INTERVALS
 from .welch_tests import BLOCK, FEWEST_BLOCKS, Candidate, mean_of, shares_of, welch
 
-# Outliers: beyond so many standard deviations
+# outliers are beyond this number of standard deviations
 OUTLIER = 7.0
-# Rates that differ by less, relative; jitter and latency that do, s: nobody needs to know
+# smaller differences are irrelevant: rate (relative), jitter and latency (s)
 RATE_SHARE, JITTER_S, LATENCY_S = 0.03, 0.002, 0.01
 
 
 def compare_streams(vehicle: Log, simulator: Log) -> list[Candidate]:
-    """All properties that both sides show."""
+    """Compare all properties observable on both sides."""
     functions = (_exact, _outliers, _dropouts, _zeros, _repeats, _rate, _jitter, _latency)
     found = [function(vehicle, simulator) for function in functions]
     return [each for each in found if each is not None]
@@ -38,13 +38,13 @@ def _outliers(vehicle: Log, simulator: Log) -> Candidate | None:
             else:
                 size = np.abs(residual) / np.maximum(robust_std(residual), 1e-9)
                 far, n = far + int((size > 2.0 * OUTLIER).any(axis=1).sum()), n + len(residual)
-                far, n = far + recording.spikes, n + recording.spikes  # left out already
+                far, n = far + recording.spikes, n + recording.spikes  # already excluded
         counts.append((far, n))
     return shares_of("outliers", counts[0], counts[1])
 
 
 def _spikes(values: Array) -> int:
-    """Samples far from where four neighbours tell them to be, and farther than these."""
+    """Count samples far from the prediction by four neighbours, and farther than these."""
     if len(values) < 10:
         return 0
     off = deviation_from_neighbours(values)
@@ -54,7 +54,7 @@ def _spikes(values: Array) -> int:
 
 
 def _exact(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Ground truth that leaks through: a DVL without noise, or one that has the noise of its reference."""
+    """Detect leaked ground truth: a DVL without noise, or with the noise of its reference."""
     leaks = [log.exact or log.copied for log in (vehicle, simulator)]
     if not any(leaks):
         return None
@@ -74,7 +74,7 @@ def _dropouts(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _zeros(vehicle: Log, simulator: Log) -> Candidate | None:
-    """Dropouts sent as a velocity of zero."""
+    """Compare dropouts sent as a velocity of zero."""
     counts = [(sum(f.zero for f in log.facts), sum(f.received for f in log.facts)) for log in (vehicle, simulator)]
     return shares_of("zeros_on_dropout", counts[0], counts[1])
 
@@ -103,7 +103,7 @@ def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _usual(steps: Array) -> Array:
-    """Steps between stamps that are no gap."""
+    """Return the steps between stamps that are no gap."""
     usual = float(np.median(steps)) if len(steps) else 0.0
     return steps[steps < DROPOUT_INTERVALS * usual]
 

@@ -1,4 +1,4 @@
-"""What the stamps of a DVL's messages and their contents show without any model: rate, jitter, latency, dropouts."""
+"""Model-free properties of a DVL's messages: rate, jitter, latency, dropouts."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from ..messages.decode import MessageDecoder
 from ..recordings.recording import Recording
 from ..recordings.topics import Topics
 
-# Log times further from the stamps belong to another clock (simulated time beside the host's) and say no latency, s
+# log times further from the stamps belong to another clock (simulated time), so the latency is unknown, s
 OTHER_CLOCK_S = 60.0
-# Intervals longer than so many usual ones are dropouts
+# longer intervals, in typical ones, are dropouts
 DROPOUT_INTERVALS = 1.6
 
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """Of one recording's DVL messages, N in order of stamps.
+    """Properties of one recording's DVL messages, N in order of stamps.
 
-    steps: (N - 1,) s between stamps. latency: (N,) s from stamp to log time; empty where these are of two clocks.
-    values: (N, 3) m/s of valid messages, zeros while moving left out. received: messages. missing, refused, zero:
-    events (runs) of missing messages, of those that say they are not valid, of exact zeros while moving; lost: samples
-    in all of these. repeats: valid messages with the very velocity of the one before.
+    steps: (N - 1,) s between stamps. latency: (N,) s from stamp to log time; empty if these are of different clocks.
+    values: (N, 3) m/s of valid messages, without zeros while moving. received: number of messages. missing, refused,
+    zero: number of events (runs) of missing messages, of messages marked invalid, of exact zeros while moving. lost:
+    number of samples in all of these. repeats: valid messages that repeat the previous velocity exactly.
     """
 
     steps: Array
@@ -43,12 +43,12 @@ class StreamFacts:
 
     @property
     def interval(self) -> float:
-        """Usual time between stamps, s."""
+        """Typical time between stamps, s."""
         return float(np.median(self.steps)) if len(self.steps) else np.nan
 
 
 def stream_facts(recording: Recording, parameters: Parameters, topics: Topics) -> StreamFacts:
-    """Of the DVL's stream of one recording, with log times."""
+    """Return the properties of one recording's DVL stream."""
     chosen = topics.found_in(recording.types)
     streams = recording.streams(chosen, MessageDecoder(recording.of_types(chosen, parameters)))
     (columns,) = recording.columns[chosen.dvl]
@@ -56,7 +56,7 @@ def stream_facts(recording: Recording, parameters: Parameters, topics: Topics) -
 
 
 def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Stamps) -> StreamFacts:
-    """From all messages of a DVL and of its reference, each in order of arrival; log_ns: (N,) of the DVL's."""
+    """Compute from all messages of a DVL and of its reference, in order of arrival; log_ns: (N,) of the DVL's."""
     refused = dvl.refused > 0
     order = np.argsort(reference.stamps_ns, kind="stable")
     zero = zeros_while_moving(dvl, reference.part(order)) & ~refused
@@ -86,5 +86,5 @@ def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Stamps) -> Stream
 
 
 def _runs(mask: NDArray[np.bool_]) -> int:
-    """Number of stretches that are true."""
+    """Return the number of runs of true values."""
     return int(np.count_nonzero(np.diff(mask.astype(int), prepend=0) > 0))

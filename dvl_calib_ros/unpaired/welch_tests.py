@@ -1,4 +1,4 @@
-"""Properties of the noise of two sides, and the tests by which they are compared."""
+"""Noise properties of both sides, and tests to compare them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from scipy.stats import fisher_exact, t
 from ..calibration.numerics.frames import Array
 from .results import Triple
 
-# Samples of a block, and blocks that a level needs
+# samples per block, and smallest number of blocks for a level
 BLOCK, FEWEST_BLOCKS = 40, 4
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A property on both sides, with the p of both being alike, not adjusted yet. claims: whether it may be claimed.
+    """A property on both sides with the unadjusted p of equality.
 
-    there: whether vehicle and simulator have any of it; of a level, both.
+    there: whether vehicle and simulator have it; true for a level. matters: whether the difference is large enough to
+    be claimed.
     """
 
     name: str
@@ -32,13 +33,13 @@ class Candidate:
 
 
 def mean_of(values: Array) -> Array:
-    """(3,) mean and its 95 per cent interval."""
+    """Return the mean and its 95 per cent interval (3,)."""
     reach = t.ppf(0.975, max(len(values) - 1, 1)) * float(values.std(ddof=1)) / np.sqrt(len(values))
     return np.array([values.mean(), values.mean() - reach, values.mean() + reach])
 
 
 def welch(one: Array, other: Array) -> float:
-    """p of two samples having one mean, whatever their scatter."""
+    """Return the p-value of equal means of two samples with any scatter."""
     a, b = (float(each.var(ddof=1)) / len(each) for each in (one, other))
     if a + b <= 0.0:
         return 1.0 if one.mean() == other.mean() else 0.0
@@ -47,13 +48,13 @@ def welch(one: Array, other: Array) -> float:
 
 
 def shares_of(name: str, vehicle: tuple[int, int], simulator: tuple[int, int]) -> Candidate | None:
-    """Counts of events among samples on both sides."""
+    """Compare numbers of events among samples on both sides."""
     if not vehicle[1] or not simulator[1] or vehicle[0] + simulator[0] == 0:
         return None
     table = [[k, max(n - k, 0)] for k, n in (vehicle, simulator)]
     p = float(fisher_exact(table)[1])
     shares = [_share(*counts) for counts in (vehicle, simulator)]
-    # one or two are no habit
+    # one or two events are not systematic
     return Candidate(name, "share", shares[0], shares[1], p, (vehicle[0] > 2, simulator[0] > 2))
 
 

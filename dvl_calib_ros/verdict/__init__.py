@@ -1,1 +1,1 @@
-"""What is said of data, configurations and results: reasons by code, their sentences and remedies in tables."""
+"""Messages about data, configurations and results: tables of codes with sentence, meaning and remedy."""

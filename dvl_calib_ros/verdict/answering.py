@@ -10,15 +10,15 @@ if TYPE_CHECKING:
 
 
 class Answering:
-    """A result: printed it is its answer, in a notebook as well.
+    """Base of results that print as their answer, also in a notebook.
 
-    How a result is laid out is known further up, by whoever hands results to people (`api`), and told here.
+    `api` sets the functions that lay a result out, because this room must not import them.
     """
 
     laid_out: Callable[[Answering, bool], str] | None = None
-    """Result and whether HTML is wanted -> text."""
+    """Formatter: result and whether HTML is wanted -> text."""
     framed: Callable[[Answering], dict[str, pandas.DataFrame]] | None = None
-    """Result -> its tables by heading."""
+    """Function from a result to its tables by heading."""
 
     def __repr__(self) -> str:
         show = Answering.laid_out
@@ -29,13 +29,13 @@ class Answering:
         return None if show is None else show(self, True)
 
     def tables(self) -> dict[str, pandas.DataFrame]:
-        """Give the tables of its page and of the terminal as data frames.
+        """Return the tables of the report and the terminal as data frames.
 
         Returns
         -------
         dict of str to pandas.DataFrame
-            By the heading that each stands below. Columns of numbers hold these, in the unit of their heading, with
-            their σ as ``... ±1σ`` and whether they are shown as ``... shown`` beside them; others hold texts.
+            By heading. Numeric columns are in the unit of their heading, with their σ as ``... ±1σ`` and whether they
+            are observable as ``... shown`` next to them; other columns are texts.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Reasons: what the data fit where it is not what was configured, and what discovery had to guess."""
+"""Reasons: conventions that fit the data better than the configured ones, and guesses of discovery."""
 
 from __future__ import annotations
 
@@ -12,94 +12,94 @@ CONFIGURATIONS = (
     _Said(
         "DVL_TWO_ON_TOPIC",
         "two DVLs publish on one topic: the velocity alternates between two values",
-        "The difference from one message to the next changes its sign almost every time.",
+        "Velocity differences change sign with almost every message.",
         "record one DVL per topic",
     ),
     _Said(
         "DVL_ROUNDED",
         "the DVL's velocity is rounded to {step:.2g} m/s, too coarse to find a mounting",
-        "Most values repeat exactly, and the step between two values is larger than the noise.",
+        "The step between two values exceeds the noise.",
         "let the driver send all digits",
     ),
     _Said(
         "DVL_AXIS_DEAD",
         "the DVL measures nothing along {axes} (exactly 0 in every message)",
-        "The other axes are noisy, so this one is no simulation without noise.",
+        "One axis is exactly 0, and the others are noisy.",
         "check the driver's fields",
     ),
     _Said(
         "DVL_TURNS_WITH_HEADING",
         "the DVL's velocity turns with the heading, as a velocity in the earth's frame does",
-        "The driver has turned the velocity into ENU or NED.",
+        "The driver has rotated the velocity into ENU or NED.",
         "let the driver send the velocity in the DVL's own axes",
     ),
     _Said(
         "DVL_AXES_TURNED",
         "the DVL's axes look turned over: y and z point the other way",
-        "The data fit much better with y and z negated: forward-right-down for forward-left-up, or the other way.",
+        "Data fit with y and z negated: forward-right-down for forward-left-up, or the reverse.",
         "set dvl_axes to {axes}",
     ),
     _Said(
         "DVL_LEFT_HANDED",
         "the DVL's axes look left-handed: {axis} points the other way",
-        "The data fit much better with this one axis negated, which no rotation does.",
+        "Data fit with one axis negated.",
         "negate this axis in the DVL's driver; of z, check the sign of the reference's vertical velocity as well",
     ),
     _Said(
         "DVL_AXIS_SCALED",
-        "the DVL's {axis} is {factor:.2g} of what it should be, and its x is not",
-        "An axis that is wrong alone comes from beam angles or a beam matrix that are not those of the instrument.",
+        "the DVL's {axis} is {factor:.2g} times its true value, and its x is not",
+        "Wrong beam angles or beam matrix.",
         "check the beam angle and the beam order in the DVL's driver",
     ),
     _Said(
         "MOUNTING_FITS",
         "the data fit mounting_rpy {roll:.3g} {pitch:.3g} {yaw:.3g}",
-        "The DVL is turned by far more than a misalignment.",
+        "The DVL is rotated by far more than a misalignment.",
         "set mounting_rpy to [{roll:.4g}, {pitch:.4g}, {yaw:.4g}]",
     ),
     # the reference
     _Said(
         "REFERENCE_LOOKS",
         "the reference looks like {name}",
-        "The data fit much better with the reference taken in that frame.",
+        "Data fit with the reference in that frame.",
         "set gnss_frame to {frame}",
     ),
     _Said(
         "REFERENCE_OR_IMU_NED",
         "the reference looks like {name} (gnss_frame: {frame}), or the IMU's orientation looks like NED (imu_frame: "
-        "ned); only sway tells which",
-        "Both explain the motion ahead alike.",
+        "ned); only sway distinguishes them",
+        "Both explain motion ahead; sway decides.",
         "check both drivers",
     ),
     _Said(
         "REFERENCE_HOLDS_DVL",
         "a filter made the reference from this DVL: the reference holds {percent:.0f} % of the DVL's own noise",
-        "Such a reference repeats the DVL's error and cannot judge it.",
+        "A filter made the reference from this DVL.",
         "use the velocity of GNSS alone",
     ),
     # the IMU
     _Said(
         "IMU_LOOKS_NED",
         "the IMU's orientation looks like NED, forward-right-down",
-        "The data fit much better with the orientation taken so.",
+        "Data fit with the orientation as NED.",
         "set imu_frame to ned and imu_rpy to [3.1416, 0, 0]",
     ),
     _Said(
         "IMU_NO_RATES",
         "the IMU sends no angular velocity (exactly 0 in every message) while its orientation turns",
-        "A lever arm shows in turns only, and needs the angular velocity.",
+        "A lever arm needs the angular velocity.",
         "let the IMU's driver fill angular_velocity",
     ),
     _Said(
         "IMU_CONTRADICTS",
         "the IMU's orientation and its angular velocity contradict each other; the data fit {found}",
-        "The orientation is differentiated and compared with the angular velocity; no other sensor is needed.",
+        "The differentiated orientation differs from the angular velocity.",
         "correct the IMU's driver",
     ),
     _Said(
         "IMU_CONTRADICTS_EITHER",
         "the IMU's orientation and its angular velocity contradict each other; the data fit {found}, or {other}",
-        "As IMU_CONTRADICTS, where two conventions explain the data about as well.",
+        "As `IMU_CONTRADICTS`, with two conventions that fit.",
         "correct the IMU's driver",
     ),
     # which conventions
@@ -112,8 +112,8 @@ CONFIGURATIONS = (
     _Said("RATES_NEGATED", "an angular velocity of the other sign", "All three axes are negated.", ""),
     _Said(
         "IMU_AXES_MIXED",
-        "an attitude and an angular velocity of which one is forward-left-up, the other forward-right-down",
-        "y and z are negated in one of them.",
+        "an attitude and an angular velocity in different axes: one forward-left-up, the other forward-right-down",
+        "Attitude and angular velocity differ in y and z.",
         "",
     ),
     _Said(
@@ -122,159 +122,158 @@ CONFIGURATIONS = (
         "Axes are exchanged or negated.",
         "",
     ),
-    _Said("RATES_DEGREES", "an angular velocity in degrees per second", "It has to be in rad/s.", ""),
+    _Said("RATES_DEGREES", "an angular velocity in degrees per second", "The angular velocity has to be in rad/s.", ""),
     _Said(
         "RATES_SCALED",
         "an angular velocity that is {times:.2g} times as large",
-        "It is not in rad/s, or of a wrong scale.",
+        "Not in rad/s, or of a wrong scale.",
         "",
     ),
     _Said(
         "RATES_IN_EARTH",
         "an angular velocity about the axes of the earth ({frame}), not of the body",
-        "sensor_msgs/Imu has it about the IMU's own axes.",
+        "The angular velocity has to be about the IMU's own axes.",
         "",
     ),
     _Said(
         "ATTITUDE_INVERTED",
-        "an inverted attitude (a quaternion that turns the earth into the body)",
-        "sensor_msgs/Imu has the quaternion that turns the body into the earth.",
+        "an inverted attitude (a quaternion from earth to body axes)",
+        "The quaternion has to rotate the body into the earth.",
         "",
     ),
     _Said(
         "RATES_TURNED",
-        "an angular velocity whose axes are turned by {degrees:.0f}° against the attitude's",
-        "Two instruments in one message, or one that is corrected for its mounting and one that is not.",
+        "an angular velocity whose axes are rotated by {degrees:.0f}° from the attitude's",
+        "Two instruments in one message, or one is corrected for its mounting alone.",
         "",
     ),
     # gravity
     _Said(
         "GRAVITY_SIGN",
         "{topic}: the IMU's acceleration at rest points down, as gravity with the other sign",
-        "sensor_msgs/Imu has the specific force, which points up at rest.",
+        "The specific force points up at rest.",
         "correct the IMU's driver",
     ),
     _Said(
         "GRAVITY_UPSIDE_DOWN",
         "{topic}: gravity is upside down in the {where}",
-        "The IMU is turned over, or its axes and its orientation are of two conventions.",
+        "The IMU is upside down, or axes and orientation follow two conventions.",
         "set imu_rpy or imu_frame",
     ),
     _Said(
         "GRAVITY_FITS_INVERTED",
         "{topic}: the IMU's orientation looks inverted: gravity is {given:.1f}° from up, and {inverted:.1f}° with the "
         "quaternion inverted",
-        "The quaternion turns the earth into the body, and not the body into the earth.",
+        "The quaternion has to rotate the body into the earth.",
         "correct the IMU's driver",
     ),
     _Said(
         "GRAVITY_LEANS",
         "{topic}: gravity is {degrees:.0f}° from up by the IMU's own orientation",
-        "Roll and pitch are wrong by that, or the acceleration is.",
+        "Roll and pitch, or the acceleration, are wrong by that angle.",
         "check the IMU's mounting in its driver",
     ),
     _Said(
         "GRAVITY_IN_G",
         "{topic}: the IMU's acceleration at rest is 1 g and not 9.81 m/s²",
-        "Its driver does not send SI units; the angular velocity may be in degrees as well.",
+        "The driver does not send SI units; check the angular velocity too.",
         "let the driver send SI units",
     ),
     _Said(
         "GRAVITY_SIZE",
         "{topic}: the IMU's acceleration at rest is {size:.3g} m/s², which is not gravity",
-        "Gravity has been taken out, or the units are others.",
+        "Gravity is subtracted, or the units are wrong.",
         "let the driver send the acceleration with gravity, in m/s²",
     ),
     # clocks
     _Said(
         "CLOCK_OFF",
         "{whose} stamps are {seconds:.2f} ± {std:.2f} s {way}",
-        "By what velocities and turns show, beside the IMU's clock.",
+        "Estimated from velocities and turns, against the IMU's clock.",
         "",
     ),
     _Said(
         "CLOCK_LATE",
         "{whose} stamps are {seconds:.2f} s {way}",
-        "By what velocities and turns show; the other clocks are in time.",
+        "Estimated from velocities and turns; the other clocks agree.",
         "set {parameter} to {offset:g}",
     ),
     _Said(
         "CLOCKS_LATE",
         "the reference's stamps are {seconds:.2f} s {way}, and the DVL's {dvl_seconds:.2f} s {dvl_way}",
-        "Both are off beside the IMU's clock. A calibration finds the DVL's delay by itself.",
+        "Both differ from the IMU's clock. A calibration estimates the DVL's delay.",
         "set {parameter} to {offset:g}",
     ),
     _Said(
         "CLOCKS_NOT_TOLD_APART",
-        "the stamps of DVL and reference are {seconds:.2f} ± {std:.2f} s apart; whose clock is off does not show",
-        "Legs that repeat at one speed fit more than one clock, and more than one delay.",
+        "the stamps of DVL and reference differ by {seconds:.2f} ± {std:.2f} s; it is unknown whose clock is wrong",
+        "Legs at one speed fit more than one clock.",
         "set the clocks by one source, or drive turns at two speeds",
     ),
     _Said(
         "CLOCK_DRIFTS",
-        "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
-        "It gains or loses time at a steady rate.",
+        "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
+        "The clock gains or loses time at a steady rate.",
         "set the clocks by one source",
     ),
     _Said(
         "CLOCK_DRIFTS_DVL",
-        "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm beside the others",
-        "It gains or loses time at a steady rate.",
+        "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
+        "The clock gains or loses time at a steady rate.",
         "set the clocks by one source, or dvl_clock_drift to {drift:.2g}",
     ),
     _Said(
         "CLOCK_LEAPS",
-        "{whose} clock leaps {way} by {seconds:.2f} ± {std:.2f} s after {at:.0f} s",
+        "{whose} clock steps {way} by {seconds:.2f} ± {std:.2f} s after {at:.0f} s",
         "A clock was set during the recording.",
         "cut the recording there, and calibrate with either part",
     ),
     _Said(
         "CLOCK_FAR",
-        "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be found and taken off",
-        "Speeds agree only with that much between the stamps.",
+        "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be estimated and "
+        "subtracted",
+        "Speeds agree only with that clock offset.",
         "set that clock right; this recording: --restamp log takes the times at which messages were recorded",
     ),
-    # what a recording declares
+    # declarations of a recording
     _Said(
         "DVL_FRAME_NOT_OWN",
-        "{topic}: the DVL's messages carry frame {frame!r} and not one of the DVL's own; the data are taken as they "
-        "are",
-        "The driver may have turned the velocity into that frame.",
+        "{topic}: the DVL's messages carry frame {frame!r} and not one of the DVL's own; the data are used unchanged",
+        "The driver may have rotated the velocity into that frame.",
         "check the driver's settings",
     ),
     _Said(
         "BODY_OR_EARTH",
         "DVL and reference agree in the body frame, but would agree as well if both were in the earth's frame",
-        "Without an attitude that turns, nothing tells the two apart.",
+        "Without an attitude that changes, both fit.",
         "set gnss_frame",
     ),
     _Said(
         "REFERENCE_FRAME_OTHER",
         "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}, which is used",
-        "The name of the frame and the data contradict each other.",
+        "The frame's name and the data contradict each other.",
         "-p gnss_frame:={declared} overrides this",
     ),
     _Said(
         "MOUNTING_CONTRADICTED",
         "DVL and reference do not agree with the mounting {given}; they do with {found}",
-        "A transform or parameter says another mounting than the data.",
+        "A transform or parameter contradicts the data.",
         "try -p mounting_rpy:={option}",
     ),
     _Said(
         "TRAVELS_SIDEWAYS",
         "with the mounting {given} the vehicle travels sideways; it goes ahead with {found}",
-        "A transform whose yaw has the wrong sign does that, or a vehicle that drifts.",
+        "A yaw of the wrong sign in the transform, or a vehicle that drifts.",
         "try -p mounting_rpy:={option}",
     ),
     _Said(
         "FRAMES_AMBIGUOUS",
         "the data fit {taken} and, as well, {other}; the first is taken",
-        "Both explain the data, and give another mounting. Which side is port on the DVL, and in which axes is the "
-        "reference?",
+        "Both fit and give different mountings. Which side is port, and which axes has the reference?",
         "set the one that is right",
         severity=Severity.MARGINAL,
     ),
-    _Said("TWO_CONTRADICTIONS", "{one}; {other}", "Two of this list at once.", ""),
+    _Said("TWO_CONTRADICTIONS", "{one}; {other}", "Two reasons of this list.", ""),
 )
 
 
@@ -284,26 +283,26 @@ DISCOVERIES = (
         "SECOND_DVL",
         "two DVLs: {topic} ({frame}) is calibrated here, not {other} ({other_frame}); calibrate that with --dvl-topic "
         "{other}",
-        "Each DVL has a mounting of its own.",
+        "Each DVL has its own mounting.",
         "",
     ),
     _Discovered(
         "TOPIC_DOES_NOT_MOVE",
         "{topic} does not move; not taken as a reference",
-        "A velocity that is 0 throughout, as of a station.",
+        "The velocity is 0 throughout.",
         "",
     ),
     _Discovered(
         "TOPIC_FROM_DVL",
         "{topic} looks as if it was computed from the DVL; not taken as a reference",
-        "It agrees with the DVL to the last digits, or is named after it.",
+        "The topic equals the DVL's velocity, or is named after the DVL.",
         "",
     ),
     _Discovered(
         "TOPIC_DERIVED",
         "{topic} may be a filter's output that uses the DVL; not taken as a reference. If it does not use the DVL: "
         "--gnss-topic {topic}",
-        "Its name says that it is computed.",
+        "The name says that a filter made it.",
         "",
     ),
     _Discovered(
@@ -315,26 +314,26 @@ DISCOVERIES = (
     _Discovered(
         "FRAME_NOT_IN_TREE",
         "no transform for the DVL's frame {frame!r}; using frame {other!r} instead",
-        "Its name is that of a DVL.",
+        "The frame used instead has a DVL's name.",
         "",
     ),
     _Discovered(
         "REFERENCE_FRAME_NOT_TOLD",
-        "{topic}: nothing tells its frame, not even the data without an IMU",
-        "A frame fits where the velocities agree under it, which takes an attitude.",
+        "{topic}: its frame is unknown, and without an IMU the data do not show it",
+        "Finding the frame needs an attitude.",
         "",
     ),
     _Discovered(
         "MOUNTING_GUESSED",
         "mounting {mounting}, {why}: nothing in the bag says how the DVL is mounted (-p mounting_rpy:={option}){also}",
-        "Taken from the data, to the next quarter of a turn where that fits.",
+        "Estimated from the data, rounded to a quarter turn where that fits.",
         "",
     ),
     _Discovered(
         "TRANSFORM_NOT_ROTATION",
         "/tf_static: the transform of {frame!r} is not a rotation; not used",
-        "Its quaternion has no length of 1.",
+        "The quaternion does not have length 1.",
         "",
     ),
-    _Discovered("URDF_NOT_READ", "{reason}; not used", "The recording's /robot_description is no URDF.", ""),
+    _Discovered("URDF_NOT_READ", "{reason}; not used", "`/robot_description` is no URDF.", ""),
 )

@@ -1,4 +1,4 @@
-"""What an entry of a table of reasons is, and how bad a reason can be."""
+"""Entries of the tables of reasons, and their severities."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from enum import Enum
 
 
 class Severity(Enum):
-    """How bad a reason is.
+    """Severity of a reason.
 
-    Of a finding: with a warning the calibration goes on, with an error it learns nothing. Of a verdict: what to do with
-    the calibration; its word is that of its worst reason.
+    Of a finding: after a warning the calibration continues, after an error it learns nothing. Of a verdict: advice on
+    the calibration; the worst reason decides the word.
     """
 
     ERROR = "error"
@@ -22,7 +22,7 @@ class Severity(Enum):
     ACCEPT = "accept"
 
 
-# Of a verdict, by its word.
+# severities of a verdict by its word
 VERDICT_WORDS: Mapping[str, Severity] = {
     each.value: each for each in (Severity.ACCEPT, Severity.MARGINAL, Severity.REJECT)
 }
@@ -30,28 +30,27 @@ VERDICT_WORDS: Mapping[str, Severity] = {
 
 @dataclass(frozen=True)
 class Kind:
-    """An entry of a table of reasons.
+    """Entry of a table of reasons.
 
     Parameters
     ----------
     code
-        What users search for. Never changes its meaning.
+        Text to search for; its meaning never changes.
     says
-        What is the matter, in a sentence with fields in braces for what is found.
+        The fact, as a sentence with fields in braces for the values found.
     means
-        What is behind it, for the documentation.
+        Explanation for the documentation.
     remedy
-        What to do, may have fields as well; '' where there is nothing to do.
+        What to do, also with fields; '' if there is nothing to do.
     severity
-        How bad it is, where the call does not say otherwise.
+        Default severity.
     page
-        Where the documentation says more: a page of docs/ with the heading.
+        Page of docs/ with the heading that explains more.
 
     Raises
     ------
     ValueError
-        For a code that is not one word in capitals, or an entry that says nothing.
-
+        For a code that is not one word in capitals, or a finding without an explanation or remedy.
     """
 
     code: str
@@ -69,5 +68,5 @@ class Kind:
 
     @property
     def is_finding(self) -> bool:
-        """Whether it is a warning or error, which is listed with its remedy, and not the word of a verdict."""
+        """Whether it is a warning or error, listed with its remedy, rather than a reason of a verdict."""
         return self.severity in (Severity.ERROR, Severity.WARNING)

@@ -1,7 +1,7 @@
-"""What is said of data, configuration, network and result: a code, how bad it is, and the numbers.
+"""Reasons about data, configuration, network and result: a code, its severity and its numbers.
 
-Its sentence, remedy and page come from the tables beside this module. Terminal, report, JSON, /diagnostics and docs
-speak from them, so a sentence is mended in one place. Codes are stable: users search for them.
+Sentence, remedy and page come from the tables in this room; terminal, report, JSON, /diagnostics and docs all use them.
+Codes are stable, because users search for them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .kinds import Kind, Severity
 from .verdicts import MANOEUVRES, SELECTIONS, VERDICTS
 
 _FIELD = re.compile(r"\{[^{}]*\}")
-# What each table is of.
+# tables by name
 TABLES: Mapping[str, Sequence[Kind]] = {
     "findings": FINDINGS,
     "doctor": DOCTOR,
@@ -34,15 +34,14 @@ TABLES: Mapping[str, Sequence[Kind]] = {
     "manoeuvres": MANOEUVRES,
 }
 KINDS: Mapping[str, Kind] = {kind.code: kind for kinds in TABLES.values() for kind in kinds}
-# The worst first.
 _WORST_FIRST = (Severity.ERROR, Severity.REJECT, Severity.MARGINAL, Severity.WARNING, Severity.ACCEPT)
 
 
 @dataclass(frozen=True)
 class Reason:
-    """Something that was found: an entry of the tables with what was put in. ``str()`` of it is what people read.
+    """Instance of a table entry with its values. ``str()`` gives the text for users.
 
-    What is put in may be a reason as well, or several: then their sentences are read in its place.
+    A value may be a reason, or several; its text is the reasons' sentences.
     """
 
     code: str
@@ -51,22 +50,22 @@ class Reason:
 
     @property
     def says(self) -> str:
-        """What is the matter."""
+        """The fact, as a sentence."""
         return KINDS[self.code].says.format(**self._words)
 
     @property
     def remedy(self) -> str:
-        """What to do; '' where there is nothing to do."""
+        """What to do; '' if there is nothing to do."""
         return KINDS[self.code].remedy.format(**self._words)
 
     @property
     def page(self) -> str:
-        """Where the documentation says more."""
+        """Page of the documentation."""
         return KINDS[self.code].page
 
     @property
     def sentence(self) -> str:
-        """As a reason of a verdict; a finding goes without its remedy, which is listed with the warnings."""
+        """Text as a reason of a verdict. A finding has no remedy here, because it is listed with the warnings."""
         return self.says if KINDS[self.code].is_finding or not self.remedy else f"{self.says}: {self.remedy}"
 
     @property
@@ -83,7 +82,7 @@ class Reason:
 
     @property
     def causes(self) -> tuple[Reason, ...]:
-        """The reasons that are put into it."""
+        """Reasons among the values."""
         return tuple(cause for each in self.numbers.values() for cause in _causes(each))
 
     def __str__(self) -> str:
@@ -91,11 +90,11 @@ class Reason:
         return f"{self.says}; {remedy} [{self.code}]" if remedy else f"{self.says} [{self.code}]"
 
     def weighed(self, severity: Severity) -> Reason:
-        """The same, as bad as this."""
+        """Return the same reason with another severity."""
         return replace(self, severity=severity)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain data, for JSON."""
+        """Return plain data for JSON."""
         return {
             "code": self.code,
             "severity": self.severity.value,
@@ -108,9 +107,9 @@ class Reason:
 
 
 def finding(code: str, **numbers: object) -> Reason:
-    """The entry of this code with its numbers. Raises KeyError for an unknown code or a missing number."""
+    """Return the reason of this code with its values. Raises KeyError for an unknown code or a missing value."""
     found = Reason(code, KINDS[code].severity, numbers)
-    str(found)  # a number that is missing is an error here, not where it is read
+    str(found)  # a missing value raises here rather than when the text is read
     return found
 
 
@@ -121,8 +120,8 @@ def _clock_cost(numbers: Mapping[str, Any]) -> float:
     return 1000.0 * math.radians(numbers["degrees"])
 
 
-# Drift on a straight leg, m per km, by ambiguities that σ includes; of deviations within twice their own σ none.
-# A bias of the DVL costs nothing at the speeds driven.
+# Drift on a straight leg, m per km, of ambiguities that σ includes; 0 for a deviation within 2 σ. A bias of the DVL
+# costs nothing at the speeds driven.
 _COST_OF_AMBIGUITY: Mapping[str, Callable[[Mapping[str, Any]], float]] = {
     "CLOCK_ON_TURN": _clock_cost,
     "CLOCK_OR_ARM": _clock_cost,
@@ -132,7 +131,7 @@ _COST_OF_AMBIGUITY: Mapping[str, Callable[[Mapping[str, Any]], float]] = {
 
 
 def of_consequence(reasons: Iterable[Reason], target_m_per_km: float) -> list[Reason]:
-    """Leave out what an accepted calibration need not be warned of, as it costs less drift than the target."""
+    """Omit warnings that matter little for an accepted calibration: their drift is below the target."""
     return [
         each
         for each in reasons
@@ -143,23 +142,23 @@ def of_consequence(reasons: Iterable[Reason], target_m_per_km: float) -> list[Re
 
 
 def is_cause(reason: Reason) -> bool:
-    """Return whether a reason is of frames or clocks, which make most of the others."""
+    """Return whether a reason concerns frames or clocks, which cause most other reasons."""
     return reason.code.startswith(_CAUSES)
 
 
 def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
-    """The worst first; of one severity frames and clocks first, as causes of the others, else as they came in."""
+    """Sort by severity, the worst first; within one severity frames and clocks first, as likely causes."""
     return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), not is_cause(each)))
 
 
-def table(kinds: Iterable[Kind]) -> str:
-    """A table of the documentation, in Markdown; … stands for what is put in."""
-    lines = ["| code | it says | which means | what to do |", "|---|---|---|---|"]
-    for kind in kinds:
-        code = f"`{kind.code}`" + ("" if kind.severity is Severity.WARNING else f" ({kind.severity.value})")
-        cells = (_FIELD.sub("…", text).replace("|", "\\|") for text in (kind.says, kind.means, kind.remedy))
-        lines.append(f"| {code} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+def lookup(kinds: Iterable[Kind]) -> str:
+    """Return a part of docs/troubleshooting.md: cause and remedy under each code, with … for fields."""
+    return "\n".join(f"### {kind.code}\n\n{_cause_and_remedy(kind)}\n" for kind in kinds)
+
+
+def _cause_and_remedy(kind: Kind) -> str:
+    remedy = _FIELD.sub("…", re.sub(r"^{\w+}", "", kind.remedy))
+    return f"{kind.means} {full(remedy)}".replace("….", "…") if remedy else kind.means
 
 
 def _causes(value: object) -> tuple[Reason, ...]:
@@ -168,11 +167,11 @@ def _causes(value: object) -> tuple[Reason, ...]:
 
 
 def _plain(value: object) -> object:
-    """For JSON: a number as one, a truth value as one, all else as its words."""
+    """Convert for JSON: numbers and truth values unchanged, all else as text."""
     value = value.item() if hasattr(value, "item") else value
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 
 def full(sentence: str) -> str:
-    """A sentence with a capital and a full stop."""
+    """Return a sentence with a capital and a full stop."""
     return f"{sentence[:1].upper()}{sentence[1:]}" + ("" if sentence.endswith((".", "?")) else ".")

@@ -157,7 +157,7 @@ def test_what_a_full_disk_does_not_take_is_printed_and_the_other_files_are_writt
         capsys.readouterr()
         assert main(["replay", str(bag), "--json", str(small), "--save", str(large)]) == 2
     shown, error = capsys.readouterr()
-    assert shown.split("next")[0] == answer.split("next")[0] and "The DVL is turned by" in shown
+    assert shown.split("next")[0] == answer.split("next")[0] and "The DVL is rotated by" in shown
     assert error.splitlines()[-1].count("free some space") == 2 and "verdict" in json.loads(small.read_text())
     assert large.read_text() == "the one before" and len(os.listdir(tmp_path)) == 3
 

@@ -111,7 +111,7 @@ def test_an_autopilot_takes_place_quarter_turns_and_delay(saved):
         (["--instrument", "waterlinked", "--now", "speed_of_sound=fast"], "NAME=VALUE"),
         (["--instrument", "waterlinked", "--now", "speed_of_sound=nan"], "1000 to 2000"),
         (["--instrument", "waterlinked", "--now", "speed_of_sound=150"], "1000 to 2000"),
-        (["--instrument", "waterlinked", "--now", "speed_of_sound=1001"], "is what it is set to now right?"),
+        (["--instrument", "waterlinked", "--now", "speed_of_sound=1001"], "is the current setting right?"),
         (["--instrument", "waterlinked", "--now", "mounting_rotation_offset=-5"], "0 to 360"),
         (["--instrument", "cerulean", "--now", "velocity_adjustment=0"], "0.8 to 1.25"),
         (["--instrument", "cerulean", "--now", "roll=1000"], "-360 to 360"),
@@ -281,7 +281,7 @@ def test_a_connection_that_ends_after_the_dvl_may_have_been_set_is_said(saved, c
     dvl = WaterLinked(NOW, closes=closes)
     assert send(saved, dvl) == 2
     error, kept = capsys.readouterr().err, dvl.ended()
-    assert "the DVL may be set or not; give the same line again" in error and kept != NOW
+    assert "the DVL may be set or not; repeat the command" in error and kept != NOW
     again = WaterLinked(kept)  # which the same line then tells
     assert send(saved, again) == 0 and again.ended() == kept
     assert "is so already" in capsys.readouterr().out

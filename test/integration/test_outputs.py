@@ -306,7 +306,7 @@ def test_what_export_writes_beside_is_no_input_and_is_called_by_its_option(scrat
     (folder / "result.yaml").rename(folder / "dvl.sdf.missing.json")
     before = snapshot(folder)
     error = refused(capsys, ["export", "gazebo", "dvl.sdf.missing.json", "-o", "dvl.sdf"])
-    assert "--output, for what is missing," in error
+    assert "--output, for missing effects," in error
     assert snapshot(folder) == before
 
 

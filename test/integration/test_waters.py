@@ -95,7 +95,7 @@ def test_of_a_dvl_whose_setting_nobody_knows_apply_sets_the_speed_of_sound_of_th
     chosen = instrument_settings(dataclasses.replace(calibrated, water=water), "waterlinked", force=True)
     (sound,) = (each for each in chosen.settings if each.name == "speed_of_sound")
     assert sound.now is None and sound.new == pytest.approx(speed_of_sound(TEMPERATURE, SALINITY), abs=0.1)
-    assert any("that of the water, ±" in each and "--now speed_of_sound=1500" in each for each in chosen.notes)
+    assert any("the water's, ±" in each and "--now speed_of_sound=1500" in each for each in chosen.notes)
     fresh_or_salt = dataclasses.replace(water, salinity=math.nan)
     chosen = instrument_settings(dataclasses.replace(calibrated, water=fresh_or_salt), "waterlinked", force=True)
     assert [each.name for each in chosen.settings] == ["mounting_rotation_offset"]

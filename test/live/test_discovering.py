@@ -58,7 +58,7 @@ def test_topics_that_nobody_named_are_found_and_calibrated_with(world, playing):
 
         until(lambda: hearers() == [NODE], "what was recorded with to be gone")
         assert any("[TOPICS_FOUND]" in value for key, value in latest(said).items() if key.startswith("finding"))
-    assert "nobody publishes the DVL's topic" in node.output
+    assert "the DVL's topic has no publisher" in node.output
     assert "DVL /a50/velocity (TwistWithCovarianceStamped" in node.output and "reference /gps" in node.output
 
 

@@ -187,8 +187,8 @@ def test_what_is_usable_follows_the_verdict(turned):
 @pytest.mark.parametrize(
     ("model", "goes_on"),
     [
-        ("auto", "F1 goes on without it, what needs GNSS, as the scale, learns nothing"),
-        ("M3", "correcting goes on with what M3 has learnt, learning does not"),
+        ("auto", "F1 continues, but learns nothing that needs GNSS, such as the scale"),
+        ("M3", "M3 still corrects with its last estimate, but learns nothing more"),
     ],
 )
 def test_an_outage_of_gnss_is_said_in_these_words_first_with_what_goes_on(model, goes_on):

@@ -1,18 +1,13 @@
-"""What pages show of commands on bags that anybody can make: examples of the diagnosis, shipped bags, damaged bags."""
+"""The examples of the diagnosis on its page: commands on bags that anybody can make."""
 
 from __future__ import annotations
 
 import json
-import math
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
-from .registry import CHEAP, ROOT, Found, dvl_calib, measurement
+from .registry import CHEAP, Found, dvl_calib, measurement
 
-# The shipped bags and what was simulated in them (bags/README.md): pitch, yaw in degrees; scale ahead in per cent
-SHIPPED = {"harbour_box": (1.47, -3.02, 0.33), "straight_leg": (-2.02, 4.00, -0.01)}
 _MISALIGNED = ("--misalignment", 1, -1, 2, "--scale", 0.5)
 
 
@@ -48,40 +43,3 @@ def diagnosis_examples(folder: Path) -> Found:
             low, high = each["ci95"]
             found[f"two.{name}"], found[f"two.{name}_low"], found[f"two.{name}_high"] = each["value"], low, high
     return found
-
-
-@measurement(
-    cost=CHEAP,
-    command="dvl-calib replay of the two shipped bags",
-    tolerances={"*.scale": 0.02, "*": 0.02},
-)
-def shipped(folder: Path) -> Found:
-    """Pitch and yaw of φ in degrees, scale ahead in per cent: error of what is found, and its σ."""
-    found: dict[str, Any] = {}
-    for name, (pitch, yaw, scale) in SHIPPED.items():
-        options = ("--params", "bags/straight_leg.yaml") if name == "straight_leg" else ()
-        dvl_calib("replay", f"bags/{name}", *options, "--json", folder / f"{name}.json")
-        replayed = json.loads((folder / f"{name}.json").read_text())
-        selected = replayed["selected"][-1]["model"]
-        model = replayed["models"][selected]
-        values = dict(zip(model["state_names"], model["state"], strict=True))
-        stds = {
-            each: math.sqrt(row[at]) for at, (each, row) in enumerate(zip(values, model["covariance"], strict=True))
-        }
-        found[f"{name}.model"], found[f"{name}.verdict"] = selected, replayed["verification"][selected]["verdict"]
-        for label, state, truth, to_shown in (
-            ("pitch", "phi_y", pitch, math.degrees(1)), ("yaw", "phi_z", yaw, math.degrees(1)),
-            ("scale", "delta_k_x", scale, 100.0),
-        ):  # fmt: skip
-            found[f"{name}.{label}"] = to_shown * values[state] - truth
-            found[f"{name}.{label}_std"] = to_shown * stds[state]
-    return found
-
-
-@measurement(cost=CHEAP, command="python test/damage.py", tolerances={})
-def damage(_: Path) -> Found:
-    """The table of damaged bags: messages recovered by each reader."""
-    command = [sys.executable, str(ROOT / "test" / "damage.py")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    rows = [line for line in done.stdout.splitlines() if line.startswith("|")]
-    return {"table": "\n".join(rows)}

@@ -1,1 +1,1 @@
-"""Reading on where a recording is damaged."""
+"""Readers that continue after damage in a recording."""

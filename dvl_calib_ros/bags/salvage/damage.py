@@ -1,16 +1,15 @@
-"""What reading a damaged recording gives: its whole messages, then what is lost, in words."""
+"""Results of reading a damaged recording: whole messages, then a description of the loss."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-# Nothing in a recording may take more memory than this, whatever it claims: the chunks and messages that recorders
-# write are of a few MB.
+# largest size of any record, whatever it claims; chunks and messages of recorders have a few MB
 LARGEST_RECORD = 1 << 28
 
 
 class Salvaged(NamedTuple):
-    """One whole message. definition is the embedded one, '' if there is none; encoding ros2msg or ros2idl."""
+    """One whole message. definition: embedded one, '' if missing. encoding: ros2msg or ros2idl."""
 
     topic: str
     msgtype: str
@@ -21,7 +20,7 @@ class Salvaged(NamedTuple):
 
 
 class DamagedError(Exception):
-    """What is damaged, in words, and how many messages are lost. Raised after the last message that is whole."""
+    """Description of the damage and number of lost messages. Raised after the last whole message."""
 
     def __init__(self, what: str, lost: int = 0) -> None:
         super().__init__(what + (f", {lost} message{'s' if lost > 1 else ''} lost" if lost else ""))
@@ -29,10 +28,10 @@ class DamagedError(Exception):
 
 
 class Damage:
-    """Takes note of damaged places on the way, so that reading goes on after each.
+    """Collector of damaged places, so that reading continues after each.
 
-    skipped: bytes that are not used because of them; of what is compressed within a chunk, unpacked bytes. lost: how
-    many messages fewer were found than the recording counts.
+    skipped: bytes not used because of damage; within a compressed chunk, unpacked bytes. lost: number of messages
+    missing compared with the recording's count.
     """
 
     def __init__(self) -> None:
@@ -42,7 +41,7 @@ class Damage:
         self.lost = 0
 
     def note(self, what: str, skipped: int) -> None:
-        """One more damaged place, and how many bytes are not used because of it."""
+        """Note one more damaged place and the number of bytes not used because of it."""
         self._first = self._first or what
         self._places += 1
         self.skipped += skipped
@@ -51,7 +50,7 @@ class Damage:
         return self._places > 0 or self.lost > 0
 
     def raise_if_any(self) -> None:
-        """Raise DamagedError with all of it in one sentence."""
+        """Raise DamagedError with one sentence on all damage, if any."""
         if self:
             more = f" (the first of {self._places} damaged places)" if self._places > 1 else ""
             what = f"{self._first}{more}, {self.skipped} bytes skipped" if self._places else "less than it counts"

@@ -1,9 +1,8 @@
-"""MCAP read so that damage costs no more than what it hits: by its index while that is sound, else record by record.
+"""MCAP reading with minimal loss by damage: by the index while it is sound, else record by record.
 
-https://mcap.dev/spec. A reader that trusts lengths and indexes gives up at the first damage, takes gigabytes for a
-length that claims them, or returns half a message. Here every length is checked against what is there, what is
-unpacked is bounded, and after damage the next place is searched where records begin. What the disk cannot read costs
-the records that it is in.
+https://mcap.dev/spec. A reader that trusts lengths and indexes gives up at the first damage, allocates gigabytes for a
+damaged length, or returns half a message. Here every length is checked against the file, unpacking is bounded, and
+after damage the next record is searched. Unreadable disk sectors cost only the records that they are in.
 """
 
 from __future__ import annotations
@@ -57,24 +56,24 @@ from .mcap_records import (
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 FIRST_PRIVATE = 0x80
-# What ends the data, and its length: its end, or, where that is damaged, the footer behind all that follows
+# records that end the data, and their lengths: the data end or, if that is damaged, the footer at the end of the file
 _ENDS = {int(Opcode.DATA_END): 4, int(Opcode.FOOTER): 20}
-# Of a message's head length, channel and log time
+# of a message's head: length, channel and log time
 ALL_BUT_OPCODE = 3
 _CHUNK_BEGIN_SIZE = 64
-# Before a summary the data end: opcode and length
+# the data end before a summary: opcode and length
 _DATA_END = RECORD_HEAD.pack(Opcode.DATA_END, 4)
 _LARGEST_SUMMARY = 16 << 20
-# Of an index of messages: opcode, length, channel, bytes of its pairs of log time and place
+# an index of messages: opcode, length, channel, bytes of its pairs of log time and position
 _INDEX_HEAD = struct.Struct("<BQHI")
 _INDEX_OWN = _INDEX_HEAD.size - RECORD_HEAD.size
-# At the very end: where the summary begins, where its offsets do, CRC, magic
+# at the end of the file: start of the summary and of its offsets, CRC, magic
 _FOOTER = struct.Struct("<QQI8s")
 _CHECKSUM_TO_END = 12
 
 
 def read_summary(path: Path) -> Summary | None:
-    """The index at the end of the file if there is one that leads to messages; DamagedError if it is damaged."""
+    """Read the index at the end of the file, if there is one. Raises DamagedError if it is damaged."""
     with open_raw(path) as file:
         if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise DamagedError("its beginning is damaged")
@@ -93,7 +92,7 @@ def _summary(file: BinaryIO) -> Summary | None:
         raise DamagedError("it does not end as a finished recording does")
     _check_no_chunk(file, start, size)
     _check_sum(file, start, size)
-    # The library looks for the magic bytes wherever the file stands; those at the beginning may be unreadable.
+    # the library expects the magic bytes at the current position; those at the beginning may be unreadable
     file.seek(size - len(MCAP_MAGIC))
     try:
         summary = SeekingReader(file, record_size_limit=LARGEST_RECORD).get_summary()
@@ -106,7 +105,7 @@ def _summary(file: BinaryIO) -> Summary | None:
 
 
 def _check_no_chunk(file: BinaryIO, start: int, size: int) -> None:
-    """Raise DamagedError if an index that begins at `start` holds a chunk, which the library would unpack unbounded."""
+    """Raise DamagedError if an index at `start` contains a chunk, which the library would unpack without limit."""
     at = start
     while 0 < at < size - _FOOTER.size:
         opcode, length = record_head(file, at)
@@ -120,7 +119,7 @@ def _check_no_chunk(file: BinaryIO, start: int, size: int) -> None:
 
 
 def _check_sum(file: BinaryIO, start: int, size: int) -> None:
-    """Raise DamagedError if the index that begins at `start` has a checksum that does not match."""
+    """Raise DamagedError if the index at `start` has a checksum that does not match."""
     end = size - _CHECKSUM_TO_END
     if not 0 < start < end or end - start > LARGEST_RECORD:
         return
@@ -132,7 +131,7 @@ def _check_sum(file: BinaryIO, start: int, size: int) -> None:
 
 
 def bytes_at_once(summary: Summary, channels: Collection[int]) -> int:
-    """What the chunks that hold messages of these channels at one time take, unpacked, at most."""
+    """Return the largest unpacked size of the chunks with messages of these channels at one time."""
     wanted = frozenset(channels)
     changes = [
         change
@@ -148,7 +147,7 @@ def bytes_at_once(summary: Summary, channels: Collection[int]) -> int:
 def indexed_messages(
     path: Path, summary: Summary, channels: Mapping[int, Channel], in_order: bool = True
 ) -> Iterator[Batch]:
-    """Messages of these channels in order of log time, or chunk by chunk. Raises DamagedError at damage.
+    """Yield messages of these channels in order of log time, or chunk by chunk. Raises DamagedError at damage.
 
     Merging takes as much memory as `bytes_at_once`.
     """
@@ -162,7 +161,7 @@ def indexed_messages(
 
 
 def _merged(group: Sequence[ChunkIndex], chunks: Iterator[Batch]) -> Iterator[Batch]:
-    """Chunks that overlap, in order of log time; each is read when its time has come."""
+    """Merge overlapping chunks by log time; each chunk is read when its time comes."""
     held = next(chunks)
     for index in group[1:]:
         before = int(np.searchsorted(held.log_ns, index.message_start_time, side="right"))
@@ -172,7 +171,7 @@ def _merged(group: Sequence[ChunkIndex], chunks: Iterator[Batch]) -> Iterator[Ba
 
 
 def _overlapping(indexes: Collection[ChunkIndex], wanted: Collection[int]) -> Iterator[list[ChunkIndex]]:
-    """Chunks that hold wanted channels, as far as the index says, in groups that overlap in time."""
+    """Yield groups of chunks that overlap in time, without chunks that lack the wanted channels by their index."""
     group: list[ChunkIndex] = []
     newest_ns = -1
     for index in sorted(indexes, key=attrgetter("message_start_time")):
@@ -214,7 +213,7 @@ def _whole_chunk(
 
 
 def _indexed_starts(file: BinaryIO, index: ChunkIndex) -> NDArray[np.uint64] | None:
-    """Where in a chunk its messages begin, by the indexes that follow it; None if they are not as they should be."""
+    """Return the starts of messages in a chunk by the indexes after it; None if those are not sound."""
     if not index.message_index_offsets or not 0 < index.message_index_length <= LARGEST_RECORD:
         return None
     file.seek(index.chunk_start_offset + index.chunk_length)
@@ -232,24 +231,24 @@ def _indexed_starts(file: BinaryIO, index: ChunkIndex) -> NDArray[np.uint64] | N
 
 
 def salvage_mcap(path: Path) -> Iterator[Salvaged]:
-    """All whole messages, in file order; then DamagedError, unless the recording is whole."""
+    """Yield all whole messages, in file order; then raise DamagedError, unless the recording is whole."""
     with open_raw(path) as file:
         yield from salvage_mcap_stream(file, path.stat().st_size)
 
 
 def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
-    """As `salvage_mcap`, of an open file of so many bytes."""
+    """Read an open file of `size` bytes like `salvage_mcap`."""
     damage, summary = Damage(), None
-    with suppress(DamagedError):  # schemas and channels once more: the chunk that introduces them may be damaged
+    with suppress(DamagedError):  # the summary repeats schemas and channels, whose own chunk may be damaged
         summary = _summary(file)
-    repeated = Tables(summary) if summary else _repeated(file, size).unmet()
+    repeated = Tables(summary) if summary else _unreferenced_tables(file, size).unmet()
     announced = Counter(summary.statistics.channel_message_counts if summary and summary.statistics else {})
     file.seek(0)
     is_cut = file.read(len(MCAP_MAGIC)) != MCAP_MAGIC and not holes_in(file, 0, len(MCAP_MAGIC))
     if is_cut:
         damage.note("its first bytes are lost or damaged", 0)
     begins: int | None = 0 if is_cut else len(MCAP_MAGIC)
-    while begins is not None:  # more than once where recordings were joined by `cat`
+    while begins is not None:  # more than one pass if recordings were joined by `cat`
         tables = repeated.copy()
         walk = _FileWalk(file, size, tables, damage, summary.chunk_indexes if summary else ())
         at = begins
@@ -261,13 +260,13 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
         yield from map(tables.salvaged, walk.held)
         if not walk.has_ended and not damage:
             damage.note(f"it stops at byte {size} without the end of the data", 0)
-        begins = _joined(file, at, size)
+        begins = _next_recording(file, at, size)
     damage.lost = (+announced).total()
     damage.raise_if_any()
 
 
-def _repeated(file: BinaryIO, size: int) -> Tables:
-    """The schemas and channels of a summary that the end of the file does not lead to: bytes before it are lost."""
+def _unreferenced_tables(file: BinaryIO, size: int) -> Tables:
+    """Return the schemas and channels of a summary that the damaged end of the file does not lead to."""
     tables = Tables(None)
     first = max(size - _LARGEST_SUMMARY, 0)
     file.seek(first)
@@ -282,8 +281,8 @@ def _repeated(file: BinaryIO, size: int) -> Tables:
     return tables
 
 
-def _joined(file: BinaryIO, at: int, size: int) -> int | None:
-    """Where the records of another recording begin, behind one whose summary is at `at`; None if there is none."""
+def _next_recording(file: BinaryIO, at: int, size: int) -> int | None:
+    """Return the start of another recording's records after the summary at `at`; None if there is none."""
     with suppress(DamagedError):
         while at < size:
             opcode, length = record_head(file, at)
@@ -296,7 +295,7 @@ def _joined(file: BinaryIO, at: int, size: int) -> int | None:
 
 
 class _FileWalk:
-    """Goes through a file record by record."""
+    """Walk through a file record by record."""
 
     def __init__(
         self, file: BinaryIO, size: int, tables: Tables, damage: Damage, indexes: Collection[ChunkIndex]
@@ -310,9 +309,10 @@ class _FileWalk:
         self.has_ended = False
 
     def step(self, at: int) -> tuple[list[Found], int]:
-        """Messages of the record before that at `at`, and where to go on; `has_ended` behind the last of the data.
+        """Return the messages of the record before `at`, and the next position.
 
-        held: what the record at `at` itself holds, of which nothing is said before it is known that it led on.
+        has_ended: set at the end of the data. held: messages of the record at `at` itself, which count only if the
+        record leads on to another.
         """
         found, self.held, here = self.held, [], None
         try:
@@ -327,7 +327,7 @@ class _FileWalk:
         return found, end
 
     def _record(self, at: int) -> tuple[list[Found], int, int | None]:
-        """Messages of the record at `at`, its end, and where it begins if the end is only what itself says."""
+        """Return the messages of the record at `at`, its end, and its start if the end is uncertain."""
         if index := self._index_instead_of_head(at):
             return *self._chunk(at, 0, index), None
         opcode, length = record_head(self._file, at)
@@ -344,14 +344,14 @@ class _FileWalk:
             raise DamagedError(f"the record at byte {at} is cut off or damaged")
         head = head_at(self._file, at)
         is_message = likeness(head, self._size - at, self._tables) >= ALL_BUT_OPCODE and bool(self._tables.eras)
-        # an index behind a chunk begins as a message does, but for its opcode
+        # an index after a chunk resembles a message except for the opcode
         is_index = self._holds_chunks and is_message and _INDEX_HEAD.unpack_from(head)[-1] == length - _INDEX_OWN
         if is_message and (opcode == MESSAGE) == is_index:
             raise DamagedError(f"the record at byte {at} is damaged")
         self.has_ended = is_end
-        if is_end and opcode == Opcode.FOOTER:  # the end of the data itself is damaged
+        if is_end and opcode == Opcode.FOOTER:  # the end of the data is damaged
             return [], at, None
-        if not is_read:  # a wrong length may have led into several such in a row
+        if not is_read:  # a wrong length may have led into several such records in a row
             return [], end, at if self._before is None else self._before
         self._file.seek(at)
         content = self._file.read(end - at)
@@ -365,7 +365,7 @@ class _FileWalk:
         return [], end, at
 
     def _index_instead_of_head(self, at: int) -> ChunkIndex | None:
-        """What the index says of the chunk at `at`, if the disk cannot read how the chunk begins."""
+        """Return the index entry of the chunk at `at` if the disk cannot read the chunk's start."""
         index = self._indexes.get(at)
         if index is None:
             return None
@@ -375,7 +375,7 @@ class _FileWalk:
     def _chunk(self, at: int, length: int, index: ChunkIndex | None = None) -> tuple[list[Found], int]:
         self._holds_chunks, self._before = True, None
         chunk = open_chunk(self._file, at, length, self._size, index)
-        # of what is not believed only the channels, which later chunks need
+        # of a chunk that is not trusted, use only the channels, which later chunks need
         within = Damage() if chunk.damage else self._damage
         found = messages_of(at, chunk.records, self._tables, within, holes=chunk.holes)
         if not chunk.damage:
@@ -386,12 +386,12 @@ class _FileWalk:
         return found, chunk.end if index else self._next_place(at)
 
     def _next_place(self, at: int) -> int:
-        """Where to go on after the damaged chunk at `at`: at its end, if records follow there; else search."""
+        """Return where to continue after the damaged chunk at `at`: at its end if records follow there, else search."""
         end = sound_end(self._file, at, self._size, self._tables)
         return self._resumed(at).place if end is None else end
 
     def _resumed(self, at: int) -> Resumed:
-        """Where to go on after the damaged record at `at`."""
+        """Return where to continue after the damaged record at `at`."""
         if self._before is None and not head_at(self._file, at).startswith(bytes([MESSAGE])):
             end = sound_end(self._file, at, self._size, self._tables)
             if end is not None:
@@ -407,7 +407,7 @@ class _FileWalk:
             if place is not None:
                 return Resumed(place, place < at)
             self._may_hold_chunks = False
-        if self._holds_chunks:  # outside of chunks, with their checksums, what looks like messages is not believed
+        if self._holds_chunks:  # outside of chunks, with their checksums, data that resemble messages are not trusted
             return Resumed(self._size, False)
         return resumed(self._file, self._before, at, self._size, self._tables)
 

@@ -1,6 +1,6 @@
-"""Records and chunks of MCAP files, and where records go on after damage.
+"""Records and chunks of MCAP files, and the search for the next record after damage.
 
-A chunk whose checksum does not match gives nothing: some of it is wrong, and nothing says which.
+A chunk with a wrong checksum gives nothing: some of it is wrong, and it is unknown which part.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from numpy.typing import NDArray
 from ..raw_file import Hole, holes_in
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 
-# plain numbers: they are compared for every message
+# plain integers, because they are compared for every message
 SCHEMA, CHANNEL, MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-MESSAGE_START = 31  # of a message's content, from where its record begins
-# Of the four parts of a head so many are sound where two bits are flipped; elsewhere no two are by chance
+MESSAGE_START = 31  # offset of a message's content from the start of its record
+# number of parts of a head; how many are sound after two flipped bits, and never by chance elsewhere
 ALIKE, ENOUGH_ALIKE = 4, 2
 _WINDOW = 1 << 20
-# Damaged offsets lead beyond what can be sought in a file
+# damaged offsets exceed the largest seekable position
 _LARGEST_FILE = 1 << 62
-# Log times with the same upper bits are within 2^48 ns, three days: a flipped bit above is told from a log time
+# log times with the same upper bits are within 2^48 ns, three days; this detects a flipped bit above
 ERA_BITS = 48
-# Of schemas and channels the table that has them, and what must be the same each time that one is written
+# per record type: the table's name, and the fields that must be the same in each repetition
 _DEFINITIONS: Mapping[int, tuple[Any, str, attrgetter[Any]]] = {
     SCHEMA: (Schema, "schemas", attrgetter("name", "encoding", "data")),
     CHANNEL: (Channel, "channels", attrgetter("topic", "schema_id")),
 }
-# What damaged bytes make the mcap library raise when it parses records
+# exceptions of the mcap library for damaged records
 PARSING = (McapError, struct.error, ValueError, LookupError, OverflowError, EOFError, MemoryError)
 
-# The same from where the record begins, for thousands of them; of its content begins what comes after
+# head of a message record for arrays of them; the remaining fields come after
 _HEAD_AT = np.dtype(
     {
         "names": ["opcode", "length", "channel", "log_ns"],
@@ -59,7 +59,7 @@ Found = tuple[int, int, bytes]
 
 
 class Places(NamedTuple):
-    """Of N messages: log time (ns), number of the channel, and where its content begins and ends."""
+    """Positions of N messages: log time (ns), channel number, start and end of the content."""
 
     log_ns: NDArray[np.uint64]
     number: NDArray[np.intp]
@@ -68,9 +68,9 @@ class Places(NamedTuple):
 
 
 class Tables:
-    """The schemas and channels that are known, and what is known of messages; at the beginning, by the summary.
+    """Known schemas and channels, initially from the summary, and statistics of messages.
 
-    eras: stretches of three days (`ERA_BITS`) that log times were met in. lengths: channel -> of its last message.
+    eras: periods of three days (`ERA_BITS`) with log times. lengths: channel -> length of its last message.
     """
 
     def __init__(self, summary: Summary | None) -> None:
@@ -85,25 +85,25 @@ class Tables:
             self.meet(summary.statistics.message_end_time)
 
     def copy(self) -> Tables:
-        """The same, to go on from."""
+        """Return a copy."""
         copied = Tables(None)
         copied.schemas, copied.channels = dict(self.schemas), dict(self.channels)
         copied.eras, copied._met = set(self.eras), set(self._met)
         return copied
 
     def unmet(self) -> Tables:
-        """The same of a summary that may be another recording's: what the messages' own records say replaces it."""
+        """Mark a summary's tables as replaceable, because it may belong to another recording. Return self."""
         self._met.clear()
         return self
 
     def meet(self, log_ns: int) -> None:
-        """Take note of when messages are."""
+        """Note the era of a log time."""
         era = log_ns >> ERA_BITS
         if era not in self.eras:
             self.eras.update((era - 1, era, era + 1))
 
     def note(self, at: int, opcode: int, content: bytes) -> None:
-        """Take note of a schema or channel; DamagedError if it is none, or not as it was known."""
+        """Note a schema or channel. Raises DamagedError if it is invalid or contradicts the known one."""
         kind, known, says = _DEFINITIONS[opcode]
         table = getattr(self, known)
         try:
@@ -117,7 +117,7 @@ class Tables:
         self._made.clear()
 
     def salvaged(self, message: Found) -> Salvaged:
-        """A message with what is known of its channel."""
+        """Return a message with its channel's topic, type and definition."""
         log_ns, channel_id, data = message
         if channel_id not in self._made:
             self._made[channel_id] = self._of(self.channels[channel_id])
@@ -131,7 +131,7 @@ class Tables:
 
 
 def record_head(file: BinaryIO, at: int) -> tuple[int, int]:
-    """Opcode and length of a record."""
+    """Return opcode and length of a record."""
     if at > _LARGEST_FILE:
         raise DamagedError(f"cut off before byte {at}")
     file.seek(at)
@@ -145,9 +145,9 @@ def record_head(file: BinaryIO, at: int) -> tuple[int, int]:
 def search(
     file: BinaryIO, start: int, size: int, opcodes: tuple[int, int], accept: Callable[[int], bool]
 ) -> int | None:
-    """The first place from `start` on that accept(place) agrees to, and where a record may begin.
+    """Return the first position from `start` on that `accept` confirms and that may begin a record.
 
-    That is an opcode between the two given, and a length below 4 GB.
+    Such a record has an opcode between the two given and a length below 4 GB.
     """
     for window in range(start, size, _WINDOW):
         file.seek(window)
@@ -163,7 +163,7 @@ def search(
 
 
 def sound_end(file: BinaryIO, at: int, size: int, tables: Tables) -> int | None:
-    """Where the record at `at` says that it ends, if a record follows there."""
+    """Return the end of the record at `at` by its own length, if a record follows there."""
     with suppress(DamagedError):
         end = at + RECORD_HEAD.size + record_head(file, at)[1]
         if end <= size and _record_follows(file, end, size, tables):
@@ -172,16 +172,16 @@ def sound_end(file: BinaryIO, at: int, size: int, tables: Tables) -> int | None:
 
 
 class Resumed(NamedTuple):
-    """Where reading goes on; is_before_damaged: the record before is the one that is damaged, or is as well."""
+    """Position at which reading continues. is_before_damaged: whether the record before it is damaged, too."""
 
     place: int
     is_before_damaged: bool
 
 
 def resumed(file: BinaryIO, before: int | None, at: int, size: int, tables: Tables) -> Resumed:
-    """Where schemas, channels or messages go on after damage at `at`; `size` if nowhere.
+    """Return the next sound schema, channel or message after damage at `at`; `size` if there is none.
 
-    before: where the record begins whose length led to `at`. That may be what is damaged, and have led past others.
+    before: start of the record whose length led to `at`. That length may be damaged, and have skipped records.
     """
     start = at if before is None else before
     place = search(
@@ -194,7 +194,7 @@ def resumed(file: BinaryIO, before: int | None, at: int, size: int, tables: Tabl
 def likeness(head: bytes, room: int, tables: Tables) -> int:
     """Return how many of the four parts of a message's head are sound: opcode, length, channel and log time.
 
-    head: from its opcode on. room: bytes there are from there on.
+    head: bytes from the opcode on. room: number of bytes from there to the end.
     """
     if len(head) < MESSAGE_START:
         return 0
@@ -206,13 +206,13 @@ def likeness(head: bytes, room: int, tables: Tables) -> int:
 
 
 def head_at(file: BinaryIO, at: int) -> bytes:
-    """Return the bytes at a place, as many as stand before the content of a message; fewer at the end."""
+    """Return the bytes of a message record before its content; fewer at the end of the file."""
     file.seek(at)
     return file.read(MESSAGE_START)
 
 
 def _may_be_head(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
-    """Whether a record may begin here, some of whose head is damaged."""
+    """Return whether a record with a partly damaged head may begin here."""
     head = head_at(file, at)
     if len(head) < MESSAGE_START:
         return True
@@ -221,7 +221,7 @@ def _may_be_head(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
 
 
 def _begins(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
-    """Whether a sound message, schema, channel or end of the data begins here, and a record follows."""
+    """Return whether a sound message, schema, channel or end of data begins here, followed by a record."""
     head = head_at(file, at)
     opcode, length = RECORD_HEAD.unpack_from(head)
     end = at + RECORD_HEAD.size + length
@@ -246,7 +246,7 @@ def _is_definition(file: BinaryIO, at: int, opcode: int, length: int) -> bool:
 
 
 def _record_follows(file: BinaryIO, at: int, size: int, tables: Tables, deep: int = 3) -> bool:
-    """Whether a record begins at `at`: a message, of whose head parts may be damaged, or `deep` others in a row."""
+    """Return whether a record begins at `at`: a message, perhaps with a damaged head, or `deep` other records."""
     if at == size or not deep:
         return True
     head = head_at(file, at)
@@ -266,16 +266,16 @@ def _record_follows(file: BinaryIO, at: int, size: int, tables: Tables, deep: in
 def message_head(
     head: bytes, at: int, here: int, n: int, tables: Tables, holds: Callable[[int], bytes]
 ) -> tuple[int, int]:
-    """Channel and log time of a message whose record begins at `here` of `n`; DamagedError if it is none.
+    """Return channel and log time of a message record at `here` of `n`. Raises DamagedError if invalid.
 
-    at: place of all that in the file. holds: what is at a place.
+    at: position of all records in the file. holds: function that returns the bytes at a position.
     """
     _, length = RECORD_HEAD.unpack_from(head)
     channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(head, RECORD_HEAD.size)
     if length < _MESSAGE_HEAD.size or channel not in tables.channels:
         raise DamagedError(f"at byte {at}: a message is of no known channel")
     usual = tables.lengths.get(channel, length)
-    if usual != length and tables.eras:  # a length may be damaged, and lead into the message or past others
+    if usual != length and tables.eras:  # a damaged length may lead into the message or past others
         ends = [here + RECORD_HEAD.size + each for each in (usual, length)]
         by_usual, by_own = (likeness(holds(end), n - end, tables) for end in ends)
         if by_usual == ALIKE and (usual < length or by_own < ENOUGH_ALIKE):
@@ -286,7 +286,7 @@ def message_head(
 
 
 def places_of(records: bytes, tables: Tables) -> Places | None:
-    """The messages of sound records in their order; None where something is wrong, which `messages_of` looks into."""
+    """Return the messages of sound records in order; None if something is wrong, to be handled by `messages_of`."""
     places, here, n = [], 0, len(records)
     head = RECORD_HEAD.unpack_from
     try:
@@ -320,7 +320,7 @@ def places_of(records: bytes, tables: Tables) -> Places | None:
 
 
 def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) -> Places | None:
-    """`places_of`, by an index of where messages begin; None where that is not exactly what the records hold."""
+    """Return `places_of` by an index of message starts; None if that does not match the records exactly."""
     n = len(records)
     if not len(starts) or int(starts.max()) > n - _HEAD_AT.itemsize:
         return None
@@ -330,12 +330,12 @@ def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) 
     if not ((heads["opcode"] == MESSAGE) & (length >= _MESSAGE_HEAD.size) & (length <= n)).all():
         return None
     end = start + (RECORD_HEAD.size + length.astype(np.intp))
-    # what is between messages are other records, else the index lacks some
+    # between messages there must be only other records, else the index is incomplete
     before, after = np.concatenate([[0], end]), np.append(start, n)
     if (after < before).any():
         return None
     gaps = np.flatnonzero(after > before).tolist()
-    between = [_others(records, int(before[gap]), int(after[gap])) for gap in gaps]
+    between = [_definitions_between(records, int(before[gap]), int(after[gap])) for gap in gaps]
     number = heads["channel"].astype(np.intp)
     if None in between or not tables.channels.keys() >= set(np.flatnonzero(np.bincount(number)).tolist()):
         return None
@@ -347,8 +347,8 @@ def places_by_index(records: bytes, starts: NDArray[np.uint64], tables: Tables) 
     return Places(heads["log_ns"], number, start + _HEAD_AT.itemsize, end)
 
 
-def _others(records: bytes, here: int, end: int) -> list[tuple[int, bytes]] | None:
-    """Opcode and content of the schemas and channels that are all there is between two places; else None."""
+def _definitions_between(records: bytes, here: int, end: int) -> list[tuple[int, bytes]] | None:
+    """Return opcode and content of the schemas and channels between two positions; None if there is anything else."""
     found = []
     while here + RECORD_HEAD.size <= end:
         opcode, length = RECORD_HEAD.unpack_from(records, here)
@@ -367,10 +367,9 @@ def messages_of(
     wanted: Collection[int] | None = None,
     holes: Sequence[Hole] = (),
 ) -> list[Found]:
-    """Messages of a chunk's records, in order of log time; what is damaged among them is skipped and noted.
+    """Return messages of a chunk's records, by log time; damaged ones are skipped and noted.
 
-    wanted: the channels whose messages are given, None for all; the others' are checked, but not copied. holes: what
-    of the records could not be read.
+    wanted: channels to return, None for all; messages of others are checked but not copied. holes: unreadable parts.
     """
     found: list[Found] = []
     n = len(records)
@@ -419,7 +418,7 @@ SMALL_PIECE = 16
 
 
 class ChunkHead(NamedTuple):
-    """What stands before a chunk's records; size: of that itself, after the record's opcode and length."""
+    """Head of a chunk before its records. size: of the head, after the record's opcode and length."""
 
     unpacked_size: int
     checksum: int
@@ -429,15 +428,15 @@ class ChunkHead(NamedTuple):
 
     @classmethod
     def of_index(cls, index: ChunkIndex) -> ChunkHead:
-        """As the index at the end of the file has it, which knows no checksum."""
+        """Build from the index at the end of the file, which has no checksum."""
         size = _CHUNK_HEAD.size + len(index.compression.encode()) + 8
         return cls(index.uncompressed_size, 0, index.compression, size, index.compressed_size)
 
 
 class Chunk(NamedTuple):
-    """records: what could be unpacked. damage: '' if that is all. is_believed: nothing says that they are wrong.
+    """Unpacked chunk. damage: '' if complete. is_believed: no sign of wrong records.
 
-    holes: what in the records is not their content, because the disk cannot read it.
+    holes: unreadable parts of the records.
     """
 
     records: bytes
@@ -448,7 +447,7 @@ class Chunk(NamedTuple):
 
 
 def chunk_head(file: BinaryIO, at: int) -> ChunkHead:
-    """The head of the chunk whose record is at `at`; DamagedError if there is none."""
+    """Return the head of the chunk record at `at`. Raises DamagedError if there is none."""
     start = at + RECORD_HEAD.size
     file.seek(start)
     head = file.read(_LONGEST_CHUNK_HEAD)
@@ -467,7 +466,7 @@ def chunk_head(file: BinaryIO, at: int) -> ChunkHead:
 
 
 def is_chunk(file: BinaryIO, at: int, length: int) -> bool:
-    """Whether a record is a chunk in all but its opcode."""
+    """Return whether a record looks like a chunk, apart from its opcode."""
     with suppress(DamagedError):
         head = chunk_head(file, at)
         return head.size + head.packed_size == length and 0 < head.unpacked_size <= LARGEST_RECORD
@@ -475,9 +474,9 @@ def is_chunk(file: BinaryIO, at: int, length: int) -> bool:
 
 
 def open_chunk(file: BinaryIO, at: int, length: int, size: int, index: ChunkIndex | None = None) -> Chunk:
-    """Unpack a chunk. Its length is there twice: of the two, either may be what is damaged.
+    """Unpack a chunk. Its length is stored twice, and either copy may be damaged.
 
-    index: what the end of the file says of it, to be used instead of a head that the disk cannot read.
+    index: entry at the end of the file, used instead of a head that the disk cannot read.
     """
     if index is not None and index.compression in _DECOMPRESS:
         head = ChunkHead.of_index(index)
@@ -502,12 +501,12 @@ def _unpack_chunk(file: BinaryIO, at: int, start: int, head: ChunkHead, packed_s
     packed = file.read(packed_size)
     is_cut = len(packed) < packed_size
     end = min(start + packed_size, size)
-    if is_cut and not head.compression:  # both of its lengths may be damaged, and reach over other chunks
+    if is_cut and not head.compression:  # both lengths may be damaged and extend over other chunks
         packed = packed[: head.unpacked_size]
     if holes := [(first - start, last - start) for first, last in holes_in(file, start, start + len(packed))]:
         lost = sum(last - first for first, last in holes)
         damage = f"{lost} bytes of the chunk at byte {at} cannot be read from the disk"
-        if head.compression:  # nothing can be unpacked behind what is missing
+        if head.compression:  # compressed data after a gap cannot be unpacked
             return Chunk(_DECOMPRESS[head.compression](packed[: holes[0][0]], head.unpacked_size), damage, True, end)
         return Chunk(packed, damage, True, end, holes)
     records = _DECOMPRESS[head.compression](packed, head.unpacked_size)
@@ -539,12 +538,12 @@ _DECOMPRESS: Mapping[str, Callable[[bytes, int], bytes]] = {
 
 
 def _unpack_start(new: Callable[[], Any], packed: bytes, size: int) -> bytes:
-    """What a decompressor makes of `packed`, up to the damage, and no more than `size` bytes and one.
+    """Decompress up to the damage, and at most `size` + 1 bytes.
 
-    A decompressor that meets damage withholds all that the call would have returned. So what is damaged is fed again
-    in small pieces, for the damage to cost what comes after it and not what comes before.
+    A decompressor that meets damage returns nothing of that call. So damaged data are fed again in small pieces, to
+    lose only the data after the damage.
     """
-    with suppress(zstd.ZstdError, RuntimeError, EOFError):  # sound, as nearly all are: nothing is copied
+    with suppress(zstd.ZstdError, RuntimeError, EOFError):  # nearly all data are sound: avoid a copy
         decompressor = new()
         whole: bytes = decompressor.decompress(packed, max_length=size + 1)
         if decompressor.eof and not decompressor.unused_data:

@@ -1,7 +1,8 @@
-"""rosbag2 databases read without SQLite, which gives up at the first damaged page: every leaf page stands for itself.
+"""Reading of damaged rosbag2 databases without SQLite, page by page.
 
-https://www.sqlite.org/fileformat2.html. Tables are known by the shape of their rows, because the pages that say which
-table is where may be gone. Pages have no checksum: what is zeroed or cut is noticed, a changed byte of data is not.
+https://www.sqlite.org/fileformat2.html. SQLite gives up at the first damaged page. Tables are recognised by the shape
+of their rows, because the pages that locate tables may be lost. Pages have no checksum: zeroed or cut pages are
+detected, a changed byte of data is not.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ _FORMATS = ("ros2msg", "ros2idl", "unknown")
 
 
 class _TableRow(NamedTuple):
-    """A row of a table: its number and its columns, where a column that is the number is None."""
+    """A row of a table: its number and its columns; a column that repeats the number is None."""
 
     number: int
     columns: list[Any]
 
 
 def salvage_sqlite(path: Path) -> Iterator[Salvaged]:
-    """All whole messages in the order they were written; then DamagedError, unless none is missing."""
+    """Yield all whole messages in the order of writing; then raise DamagedError, unless none is missing."""
     with open_raw(path) as file:
         yield from salvage_sqlite_stream(file, path.stat().st_size)
 
 
 def salvage_sqlite_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
-    """As `salvage_sqlite`, of an open file of so many bytes."""
+    """Read an open file of `size` bytes like `salvage_sqlite`."""
     pages = _Pages(file, size)
     topics: dict[int, _Topic] = {}
     definitions: dict[tuple[str, str], tuple[str, str]] = {}
@@ -46,7 +47,7 @@ def salvage_sqlite_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
             if _is_message(row.columns):
                 leaves.setdefault(row.number, page)
                 break
-            _take_note(row, topics, definitions)
+            _note(row, topics, definitions)
     count, astray, last = 0, 0, 0
     for page in (leaves[number] for number in sorted(leaves)):
         for row in pages.rows(page):
@@ -75,7 +76,7 @@ def salvage_sqlite_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
 
 
 class _Topic(NamedTuple):
-    """digest: hash of the type's description, '' before ROS 2 Iron."""
+    """A topic. digest: hash of the type's description, '' before ROS 2 Iron."""
 
     name: str
     msgtype: str
@@ -83,7 +84,7 @@ class _Topic(NamedTuple):
 
 
 def _is_message(columns: list[Any]) -> bool:
-    """id, topic, log time, data."""
+    """Return whether a row is a message: id, topic, log time, data."""
     return (
         len(columns) == 4
         and columns[0] is None
@@ -94,23 +95,23 @@ def _is_message(columns: list[Any]) -> bool:
     )
 
 
-def _take_note(row: _TableRow, topics: dict[int, _Topic], definitions: dict[tuple[str, str], tuple[str, str]]) -> None:
-    """Take note of a topic (id, name, type, cdr, QoS, hash) or a definition (id, type, format, text, hash)."""
+def _note(row: _TableRow, topics: dict[int, _Topic], definitions: dict[tuple[str, str], tuple[str, str]]) -> None:
+    """Note a topic (id, name, type, cdr, QoS, hash) or a definition (id, type, format, text, hash)."""
     number, columns = row
     if len(columns) < 4 or columns[0] is not None or not all(isinstance(text, str) for text in columns[1:]):
         return
     if columns[2] in _FORMATS:
         definition = (columns[2], columns[3])
         definitions.setdefault((columns[1], columns[4] if len(columns) > 4 else ""), definition)
-        definitions.setdefault((columns[1], ""), definition)  # for topics that do not say which of several
+        definitions.setdefault((columns[1], ""), definition)  # for topics without the hash of their definition
     elif "/" in columns[2]:
         topics[number] = _Topic(columns[1], columns[2], columns[5] if len(columns) > 5 else "")
 
 
 class _Pages:
-    """The pages of a database file, numbered from 1.
+    """Pages of a database file, numbered from 1.
 
-    size: of each, bytes. missing: bytes that the file is shorter than it says. unread: pages that the disk cannot read.
+    size: bytes per page. missing: bytes by which the file is shorter than its header states. unread: unreadable pages.
     """
 
     def __init__(self, file: BinaryIO, size: int) -> None:
@@ -127,7 +128,7 @@ class _Pages:
         self.missing = max(0, said * self.size - size) if is_sound else 0
 
     def rows(self, number: int) -> Iterator[_TableRow]:
-        """The whole rows of a page, if it is a leaf of a table."""
+        """Yield the whole rows of a page, if it is a leaf of a table."""
         page = self._read(number)
         start = _FILE_HEADER if number == 1 else 0
         if len(page) < start + _LEAF_HEADER or page[start] != _LEAF:
@@ -137,7 +138,7 @@ class _Pages:
             try:
                 (cell,) = struct.unpack_from(">H", page, start + _LEAF_HEADER + 2 * i)
                 yield self._row(page, cell)
-            except (IndexError, struct.error, ValueError):  # a row that is no row
+            except (IndexError, struct.error, ValueError):  # an invalid row
                 continue
 
     def _read(self, number: int) -> bytes:
@@ -157,7 +158,7 @@ class _Pages:
         return _TableRow(number, _columns(self._payload(page, at, size)))
 
     def _payload(self, page: bytes, at: int, size: int) -> bytes:
-        """The content of a row; what does not fit in its page is on a chain of overflow pages."""
+        """Return the content of a row; the part beyond its page is on a chain of overflow pages."""
         largest, least = self._usable - 35, (self._usable - 12) * 32 // 255 - 23
         if size <= largest:
             local = size
@@ -173,7 +174,7 @@ class _Pages:
             if not 0 < following <= self.count:
                 raise ValueError("its chain of pages is broken")
             chain = self._read(following)
-            if not any(chain):  # what file systems leave of what was never written
+            if not any(chain):  # file systems zero unwritten blocks
                 raise ValueError("zeroed")
             content += chain[4 : 4 + min(self._usable - 4, size - len(content))]
         return bytes(content)
@@ -190,7 +191,7 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def _columns(payload: bytes) -> list[Any]:
-    """The values of a record; ValueError if they are not exactly what its header says."""
+    """Return the values of a record. Raises ValueError if they do not match its header exactly."""
     header_size, at = _varint(payload, 0)
     values: list[Any] = []
     here = header_size

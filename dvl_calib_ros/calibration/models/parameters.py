@@ -41,28 +41,27 @@ class Parameters:
 
     model: str = _parameter(
         AUTO,
-        "Model whose estimate is published: auto (what we recommend), iac (the published selection: IAC-G, M3 or M4, "
-        "with GNSS, IAC-GF, M5-M7, without), or a model's name.",
+        "Published model: auto (recommended), iac (the paper's: M3 or M4 with GNSS, M5 to M7 without), or a name.",
         choices=(AUTO, IAC, *MODELS),
         read_only=False,
     )
     gnss_model: str = _parameter(
         "full",
-        "Model that auto runs while GNSS is available. Under iac it is M3, unless this says M4.",
+        "Model of auto with GNSS. iac: M3, or M4 if set here.",
         choices=_AIDED,
         read_only=False,
     )
     gnss_free_model: str = _parameter(
         "F1",
-        "Model that auto runs while GNSS is not available. F1 gives way to A1 once there is attitude and several "
-        "headings show the current. Under iac it is M7, unless this says M5 or M6.",
+        "Model of auto without GNSS; F1 gives way to A1 with attitude over several headings. iac: M7, or M5 or M6 if "
+        "set here.",
         choices=_UNAIDED,
         read_only=False,
     )
     gnss_timeout: float = _parameter(
         2.0,
-        "Age of the last paired reference sample at which GNSS counts as lost; also the longest gap between two "
-        "reference samples that is interpolated across.",
+        "GNSS counts as lost at this age of the last paired reference sample; also the longest gap that is "
+        "interpolated.",
         unit="s",
         low=0.05,
         high=60.0,
@@ -77,56 +76,51 @@ class Parameters:
     )
     gnss_frame: str = _parameter(
         FROM_FRAME_ID,
-        "Frame of the reference velocity; body: of the body, in base_axes; frd: of the body, forward-right-down. "
-        "from_frame_id: base_frame is body; "
-        "enu, map, odom, world are ENU; ned is NED; nwu: north-west-up; a name that ends in _enu, _ned, _nwu, _flu "
-        "or _frd says so; anything else is refused.",
+        "Frame of the reference velocity; body: base_axes, frd: forward-right-down body. from_frame_id: base_frame is "
+        "body; enu, map, odom, world: ENU; ned, nwu; or a name ending in _enu, _ned, _nwu, _flu, _frd.",
         choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame), FRD, NWU),
     )
     gnss_axes: str = _parameter(
         AUTO,
-        "Axes of its frame that the reference measures: xyz, xy (no vertical velocity), or auto: xy as long as its "
-        "vertical velocity has been exactly 0. An axis whose variance is -1, or 1000 (m/s)² and more, never counts.",
+        "Axes that the reference measures. auto: xy while its vertical velocity is exactly 0. A variance of -1, or "
+        "1000 (m/s)² and more, marks an axis as not measured.",
         choices=(AUTO, XYZ, XY),
     )
     base_frame: str = _parameter(
         "base_link",
-        "Name of the body frame: of calibrated_twist, and of a body-frame reference.",
+        "Name of the body frame.",
     )
     base_axes: str = _parameter(
         FLU,
-        "Axes of base_frame: flu (forward-left-up, as REP-103 has it) or frd (forward-right-down, z down). Mounting, "
-        "lever arm and every result are in these axes.",
+        "Axes of base_frame, mounting, lever arm and all results: forward-left-up (REP-103) or forward-right-down.",
         choices=(FLU, FRD),
     )
     use_transforms: bool = _parameter(
         True,
-        "Take mounting_rpy, lever_arm and imu_rpy from /tf_static or robot_description, where they are at their "
-        "default and the transforms have the DVL's frame.",
+        "Take mounting_rpy, lever_arm and imu_rpy at their defaults from /tf_static or robot_description.",
     )
     publish_tf: bool = _parameter(
         False,
-        "Broadcast the calibrated mounting, as in ~/mounting, as a static transform from base_frame to the DVL's frame "
-        "(live, where tf2_ros is installed). Not beside another node that publishes that transform.",
+        "Broadcast ~/mounting as a static transform (live, needs tf2_ros). Not next to another publisher of it.",
     )
     dvl_frame: str = _parameter(
         "",
-        "frame_id that DVL messages must carry. Empty: any but a body or earth frame, and the first one seen.",
+        "frame_id that DVL messages must carry. Empty: the first one that is neither body nor earth.",
     )
     dvl_axes: str = _parameter(
         FROM_MESSAGE,
-        "Axes of the DVL's data: flu (forward-left-up) or frd (forward-right-down). Where base_axes are the other, "
-        "they are turned. from_message: a frame_id that ends in _frd or _flu says so, else the message type does.",
+        "Axes of the DVL's data, converted to base_axes. from_message: by a frame_id ending in _frd or _flu, else by "
+        "message type.",
         choices=(FROM_MESSAGE, FLU, FRD),
     )
     dvl_type: str = _parameter(
         "geometry_msgs/msg/TwistWithCovarianceStamped",
-        "Message type of the DVL's topic, live (a bag says its types itself).",
+        "Message type of the DVL's topic, live.",
     )
     dvl_fields: str = _parameter(
         "",
-        "Fields of DVL messages whose type is not listed: velocity=vel.x,vel.y,vel.z,valid=lock; a vector or three "
-        "fields, or beams=list,direction,velocity; also variance, stamp, frame. Axes as dvl_axes says.",
+        "Fields of an unlisted message type: velocity=vel.x,vel.y,vel.z,valid=lock; or beams=list,direction,velocity; "
+        "also variance, stamp, frame.",
     )
     gnss_type: str = _parameter(
         "geometry_msgs/msg/TwistWithCovarianceStamped",
@@ -134,99 +128,93 @@ class Parameters:
     )
     position_window: float = _parameter(
         1.0,
-        "Time over which two satellite positions are differenced where the reference is positions alone "
-        "(sensor_msgs/msg/NavSatFix). Longer: less noise, less true in turns.",
+        "Time between two positions that are differenced to a velocity. Longer: less noise, less true in turns.",
         unit="s",
         low=0.1,
         high=30.0,
     )
     mounting_rpy: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
-        "Nominal orientation of the DVL in the body, as in a URDF origin (fixed axes X, Y, Z).",
+        "Nominal orientation of the DVL in the body, as in a URDF origin.",
         unit="rad",
         low=-2 * math.pi,
         high=2 * math.pi,
     )
     lever_arm: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
-        "Position of the DVL relative to the reference point, body frame; compensated while the "
-        "angular velocity is known.",
+        "Position of the DVL from the reference point, body frame; compensated while the angular velocity is known.",
         unit="m",
         low=-100.0,
         high=100.0,
     )
     reference_position: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
-        "Position in base_frame of the reference point (antenna, INS): added to the lever arm, it is the DVL's.",
+        "Position of the reference point (antenna, INS) in base_frame; plus the lever arm it is the DVL's.",
         unit="m",
         low=-100.0,
         high=100.0,
     )
     dvl_position: str = _parameter(
         UNKNOWN,
-        "How the DVL's position in base_frame is known. from_reference: reference_position plus the lever arm that is "
-        "found; told: the same with the lever_arm that is given; unknown: "
-        "no position is written to URDF, TF or launch files.",
+        "The DVL's position in base_frame. from_reference: reference_position plus the estimated lever arm; told: "
+        "plus the configured one; unknown: no position is written.",
         choices=(UNKNOWN, TOLD, FROM_REFERENCE),
     )
     imu_rpy: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
-        "Orientation in the body of the axes of the IMU's data, as in a URDF origin (fixed axes X, Y, "
-        "Z). Forward-right-down in a level vehicle is pi 0 0.",
+        "Orientation of the IMU's axes in the body, as in a URDF origin. Forward-right-down: pi 0 0.",
         unit="rad",
         low=-2 * math.pi,
         high=2 * math.pi,
     )
     imu_frame: str = _parameter(
         IMU_ENU,
-        "What the IMU's orientation is relative to: enu (yaw 0 is east, REP-103), ned (yaw 0 is north, clockwise) or "
-        "nwu (yaw 0 is north, counter-clockwise).",
+        "Frame of the IMU's orientation: yaw 0 is east (enu, REP-103), or north, clockwise (ned) or counter-clockwise "
+        "(nwu).",
         choices=(IMU_ENU, IMU_NED, NWU),
     )
     restamp: str = _parameter(
         "",
-        "Whose stamps are not believed: log takes the time at which each message was recorded (live: received); names "
-        "of topics, with commas between, do so for these topics of a recording alone.",
+        "Use recording times as stamps: log for all topics, or topic names with commas between.",
     )
     dvl_time_offset: float = _parameter(
         0.0,
-        "Positive: DVL stamps are late. Taken off before pairing.",
+        "Delay of DVL stamps (positive: late). Corrected before pairing.",
         unit="s",
         low=-60.0,
         high=60.0,
     )
     reference_time_offset: float = _parameter(
         0.0,
-        "Positive: reference (GNSS) stamps are late. Taken off before pairing.",
+        "Delay of reference stamps (positive: late). Corrected before pairing.",
         unit="s",
         low=-60.0,
         high=60.0,
     )
     reference_velocity_offset: tuple[float, ...] = _parameter(
         (0.0, 0.0),
-        "Constant error (east, north) of a reference velocity in ENU or NED: of an inertial navigation that drifts, "
-        "or a current where the DVL tracks water. Taken off.",
+        "Constant error (east, north) of a reference in ENU or NED, or a current in water track. Corrected.",
         unit="m/s",
         low=-5.0,
         high=5.0,
     )
     imu_time_offset: float = _parameter(
         0.0,
-        "Positive: IMU stamps (attitude and angular velocity) are late. Taken off before pairing.",
+        "Delay of IMU stamps (positive: late). Corrected before pairing.",
         unit="s",
         low=-60.0,
         high=60.0,
     )
     dvl_clock_drift: float = _parameter(
         0.0,
-        "By how much DVL stamps get later per second since the first (the DVL's clock runs fast). Taken off.",
+        "Growth of the delay of DVL stamps per second since the first. Corrected.",
         unit="s/s",
         low=-0.01,
         high=0.01,
     )
     dvl_time_jump: float = _parameter(
         0.0,
-        "By how much DVL stamps are later from dvl_time_jump_at on, in addition. Taken off.",
+        "Additional delay of DVL stamps from dvl_time_jump_at on. Corrected.",
         unit="s",
         low=-10.0,
         high=10.0,
@@ -247,21 +235,20 @@ class Parameters:
     )
     initial_std_scale: float = _parameter(
         0.006,
-        "Prior standard deviation of the scale-factor error.",
+        "Prior standard deviation of the scale error.",
         low=1e-7,
         high=0.5,
     )
     initial_std_lever_arm: float = _parameter(
         2.0,
-        "Prior standard deviation of each component of the lever arm about lever_arm (full). One that is given counts "
-        "as measured to 0.05 m, or with a probability of 0.1 as wrong by this.",
+        "Prior standard deviation of the lever arm (full). A configured arm has 0.05 m, or with probability 0.1 this.",
         unit="m",
         low=1e-4,
         high=100.0,
     )
     initial_std_time_offset: float = _parameter(
         1.0,
-        "Prior standard deviation of the DVL's time offset about dvl_time_offset (full, which looks within 3.2 s).",
+        "Prior standard deviation of the DVL's delay (full, within 3.2 s).",
         unit="s",
         low=1e-4,
         high=10.0,
@@ -275,110 +262,103 @@ class Parameters:
     )
     process_std_scale: float = _parameter(
         0.0,
-        "Random walk of the scale-factor error.",
+        "Random walk of the scale error.",
         unit="1/√s",
         low=0.0,
         high=0.1,
     )
     use_message_covariance: bool = _parameter(
         True,
-        "R of the GNSS models from the messages' covariances (rotated, added) where given. Without, samples whose "
-        "variances are 1000 (m/s)² and more on all axes are used, which are invalid else.",
+        "R of the GNSS models from message covariances. Without, samples with variances of 1000 (m/s)² and more are "
+        "used too.",
     )
     gnss_aided_std: float = _parameter(
         0.2,
-        "Standard deviation per axis of R of the GNSS models where the reference gives no covariance.",
+        "Standard deviation per axis of R of the GNSS models, if the reference has no covariance.",
         unit="m/s",
         low=1e-4,
         high=10.0,
     )
     gnss_free_std: float = _parameter(
         0.025,
-        "Standard deviation per axis of R of the GNSS-free models; stands in for a DVL covariance that is not given.",
+        "Standard deviation per axis of R of the GNSS-free models, and of a DVL without covariance.",
         unit="m/s",
         low=1e-4,
         high=10.0,
     )
     motion_std: float = _parameter(
         ASSUMPTIONS.motion_std,
-        "Standard deviation of sway and heave about what is modelled, straight ahead: the noise of A1 and F1.",
+        "Standard deviation of sway and heave about the model, straight ahead (A1, F1).",
         unit="m/s",
         low=1e-4,
         high=10.0,
     )
     motion_correlation_time: float = _parameter(
         ASSUMPTIONS.motion_correlation_time,
-        "Correlation time of sway and heave: samples closer together weigh less (A1, F1). 0: all weigh the same.",
+        "Correlation time of sway and heave (A1, F1). 0: none.",
         unit="s",
         low=0.0,
         high=600.0,
     )
     heave_offset_std: float = _parameter(
         ASSUMPTIONS.heave_offset_std,
-        "Prior standard deviation of a constant heave, such as of trim (A1, F1).",
+        "Prior standard deviation of a constant heave, such as trim (A1, F1).",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     reference_offset_std: float = _parameter(
         0.005,
-        "Prior standard deviation, east, north and up, of a constant error of a reference velocity in an earth frame, "
-        "as of an inertial navigation (full). Several headings find the error.",
+        "Prior standard deviation, east, north and up, of a constant error of an earth-frame reference (full).",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     heading_deviation_std: float = _parameter(
         math.radians(0.5),
-        "Prior standard deviation of the heading's error with the course (one and two cycles, as of a compass). On one "
-        "heading the σ of yaw includes it; several headings show its true size. 0: the heading is exact.",
+        "Prior standard deviation of the heading error, one and two cycles (compass). On one heading σ of yaw includes "
+        "it. 0: exact.",
         unit="rad",
         low=0.0,
         high=0.5,
     )
     dvl_bias_std: float = _parameter(
         0.008,
-        "Prior standard deviation of a constant error of the DVL's velocity, along each of its axes (full). At one "
-        "speed σ of roll, pitch, yaw and scale includes it; several speeds show its size. 0.008: as the beam biases "
-        "of the paper's data make it; the worst that is known is under three times that. 0: the DVL has none.",
+        "Prior standard deviation of the DVL's velocity bias per axis (full). At one speed σ includes it. 0: no bias.",
         unit="m/s",
         low=0.0,
         high=1.0,
     )
     day_std_heading: float = _parameter(
         math.radians(0.1),
-        "Constant error of the heading reference on one day: included in the σ of yaw, which is that of the next "
-        "recording (0.1°: a fibre-optic gyrocompass; a magnetic compass: 1° and more).",
+        "Heading error that differs by day, in σ of yaw (0.1°: gyrocompass; magnetic compass: 1° and more).",
         unit="rad",
         low=0.0,
         high=0.5,
     )
     day_std_scale: float = _parameter(
         0.003,
-        "By how much the scale differs from day to day: included in the σ of scale, which is that of the next "
-        "recording (0.3 %: "
-        "4.5 m/s of the speed of sound, as of 1.5 °C).",
+        "Scale difference between days, in σ of scale (0.3 %: 4.5 m/s of the speed of sound, or 1.5 °C).",
         low=0.0,
         high=0.5,
     )
     current_std: float = _parameter(
         ASSUMPTIONS.current_std,
-        "Prior standard deviation of the current per axis (A1, F1). On one heading it decides how much of the sway "
-        "counts as misalignment: half, where it equals speed · initial_std_misalignment.",
+        "Prior standard deviation of the current per axis (A1, F1). On one heading it sets the share of sway that "
+        "counts as misalignment.",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     prior_source: str = _parameter(
         "fixed",
-        "Prior sway and heave of M5 and M6: fixed (prior_sway_heave), initial_window (mean of the DVL's own "
-        "first prior_window; then M5 and M6 gain nothing, the mean already holds the misalignment), reference (mean "
-        "of the reference velocity's first prior_window; replay only).",
+        "Prior sway and heave of M5 and M6: prior_sway_heave, or the mean of prior_window of the DVL itself (gains "
+        "nothing), or of the reference (replay only).",
         choices=("fixed", "initial_window", "reference"),
     )
     prior_window: float = _parameter(
         2.0,
-        "Length of the window that prior_source averages.",
+        "Window that prior_source averages.",
         unit="s",
         low=0.1,
         high=600.0,
@@ -392,7 +372,7 @@ class Parameters:
     )
     gate_probability: float = _parameter(
         0.999,
-        "Innovation gate: share of good samples that pass (chi-square). 0 or 1: off.",
+        "Share of good samples that pass the gate (chi-square). 0 or 1: off.",
         low=0.0,
         high=1.0,
     )
@@ -405,15 +385,14 @@ class Parameters:
     )
     max_turn_rate: float = _parameter(
         0.0,
-        "Samples at a higher angular velocity are not used, nor are samples without one. 0: off.",
+        "Samples above it, or without angular velocity, are not used. 0: off.",
         unit="rad/s",
         low=0.0,
         high=10.0,
     )
     max_repeats: float = _parameter(
         0.0,
-        "How often in a row a DVL velocity may repeat exactly; further repeats mean that the driver hangs, and are "
-        "not used. 0: off (a simulated DVL without noise repeats itself).",
+        "A DVL velocity that repeats exactly more often in a row is not used. 0: off.",
         low=0.0,
         high=1e6,
         read_only=False,
@@ -427,45 +406,43 @@ class Parameters:
     )
     max_fom: float = _parameter(
         0.4,
-        "A DVL message with a figure of merit above this is invalid (dvl_msgs/DVL, which has one).",
+        "A figure of merit above this is invalid (dvl_msgs/DVL).",
         unit="m/s",
         low=0.0,
         high=100.0,
     )
     imu_timeout: float = _parameter(
         1.5,
-        "Longest gap between two IMU samples that is interpolated across.",
+        "Longest gap between two IMU samples that is interpolated.",
         unit="s",
         low=0.01,
         high=60.0,
     )
     max_latency: float = _parameter(
         1.0,
-        "By how much (in stamps) one topic may lag another before a DVL sample goes on without its partner. When "
-        "a bag is played faster than recorded, raise it in proportion.",
+        "Stamp difference by which a topic may lag before a DVL sample continues without it. Raise for bags played "
+        "faster.",
         unit="s",
         low=0.0,
         high=600.0,
     )
     max_time_jump: float = _parameter(
         10.0,
-        "A step between stamps above this needs a second sample to be believed; back in time it is a restart "
-        "(bag loop) and the calibration starts anew.",
+        "A larger step between stamps needs a second sample; backward it restarts the calibration.",
         unit="s",
         low=0.1,
         high=86400.0,
     )
     new_day_after: float = _parameter(
         3600.0,
-        "Pause of the DVL after which it is another day: the delay of its stamps, a constant error of the reference "
-        "and the current, which belong to the day, are found anew. Recordings replayed together are a day each.",
+        "DVL pause that starts a new recording, with its own delay, reference offset and current.",
         unit="s",
         low=15.0,
         high=1e9,
     )
     fine_std_misalignment: float = _parameter(
         0.0017453292519943296,
-        "Convergence is fine once every observable angle's standard deviation is below this (0.1°) ...",
+        "The estimate is fine once each observable angle's standard deviation is below this (0.1°) ...",
         unit="rad",
         low=1e-6,
         high=1.0,
@@ -480,13 +457,11 @@ class Parameters:
     )
     discover: bool = _parameter(
         True,
-        "Look for DVL, reference and IMU among all topics, as replay does, while nobody publishes the DVL's topic and "
-        "that was not remapped.",
+        "Look for DVL, reference and IMU in all topics while the DVL's is silent and not remapped.",
     )
     target_drift: float = _parameter(
         2.0,
-        "Drift of dead reckoning, predicted for a straight leg, from which on the live view says that the calibration "
-        "is good enough.",
+        "Predicted drift that the live view calls good enough.",
         unit="m/km",
         low=0.01,
         high=1000.0,
@@ -494,14 +469,14 @@ class Parameters:
     )
     verification_block: float = _parameter(
         10.0,
-        "Length of the blocks that hold-out verification deals out to its folds.",
+        "Length of the blocks of hold-out verification.",
         unit="s",
         low=0.1,
         high=3600.0,
     )
     accept_misalignment: float = _parameter(
         math.radians(2.0),
-        "A calibration with a misalignment below this (2°) may be accepted; above it is marginal ...",
+        "A misalignment above this (2°) is marginal ...",
         unit="rad",
         low=0.0,
         high=math.pi,
@@ -515,26 +490,25 @@ class Parameters:
     )
     max_scale_error: float = _parameter(
         0.05,
-        "A calibration with a scale-factor error above this is rejected.",
+        "A larger scale error is rejected.",
         low=0.0,
         high=1.0,
     )
     max_error_ratio: float = _parameter(
         1.0,
-        "A held-out velocity error above so many times the predicted one (and beyond chance) makes it marginal.",
+        "A held-out error that exceeds this multiple of the predicted one significantly is marginal.",
         low=0.1,
         high=100.0,
     )
     result_file: str = _parameter(
         "",
-        "Result file (YAML) written by ~/save and at shutdown. Empty: none. At run time only another .yaml file in the "
-        "same folder (the working directory, if none was named at the start).",
+        "Result file (YAML) of ~/save and the end of the node. Empty: none. At run time only another .yaml in the "
+        "same folder.",
         read_only=False,
     )
     result_backups: float = _parameter(
         3.0,
-        "How many earlier results are kept beside result_file: .bak is the last one, .bak.2 and on are the best "
-        "converged of the others.",
+        "Earlier results kept: .bak is the last, .bak.2 and on the best converged.",
         low=1.0,
         high=100.0,
         read_only=False,

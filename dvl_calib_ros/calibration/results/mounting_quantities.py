@@ -13,7 +13,6 @@ from ..models.parameters import Parameters
 from ..numerics.kalman import GaussianState
 from .results import Result, corrected_rpy, rpy_std, scale_and_delay
 
-
 # Axes of `observability` that only a recording with angular velocities can show.
 _NEED_IMU = ("lever arm x", "lever arm y", "lever arm z", "time offset")
 

@@ -140,7 +140,7 @@ def test_without_movement_the_size_that_could_not_be_seen_is_said_and_what_was_n
     (said,) = reasons(compare([extrinsics(0), blank]))
     # (2.69 σ by Holm of seven + 1.28 σ) of √2 0.05°
     assert said.sentence == (
-        "no movement found; smaller than 0.3° could not be seen (pitch 0.3°, yaw 0.3°; 90 of 100 such movements are "
+        "no movement found; smaller than 0.3° is not detectable (pitch 0.3°, yaw 0.3°; 90 of 100 such movements are "
         "found); roll cannot be compared"
     )
 

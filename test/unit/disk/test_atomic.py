@@ -271,7 +271,7 @@ def test_three_writers_on_one_file_leave_a_whole_file_its_backups_and_no_litter(
 def test_what_a_killed_writer_left_goes_with_the_next_save_and_what_a_living_one_writes_stays(tmp_path):
     dead = tmp_path / ".dvl_calib.dead.tmp"
     dead.write_text("torn")
-    with atomic._written_beside(tmp_path / "other.yaml", b"alive") as living:
+    with atomic._temporary_file(tmp_path / "other.yaml", b"alive") as living:
         save_text(tmp_path / "result.yaml", "text")
         assert not dead.exists() and Path(living).read_text() == "alive"
     assert os.listdir(tmp_path) == ["result.yaml"]

@@ -51,7 +51,7 @@ def test_the_answer_comes_first_then_which_effects_where_what_is_left_and_what_t
     found = diagnosis()
     order = positions(
         page.text, "ambiguous", found.sentence, "x 0.30 m (0.25 to 0.35)", "To do for lever_arm", "42.1 mm/s",
-        "Which effects", "Where the gap lies", "Recorded against the simulated twin", "What is left",
+        "Which effects", "Where the gap lies", "Recorded against the simulated twin", "Residual",
         found.next_manoeuvre, "The noise",
     )  # fmt: skip
     assert order == sorted(order)
@@ -64,12 +64,12 @@ def test_held_out_gap_before_and_after_and_the_closure_stand_large(page):
 
 
 def test_beside_a_lag_the_noise_is_not_only_what_high_frequencies_show(page, tmp_path):
-    assert "as high frequencies show it; the messages claim" in page.text
+    assert "estimated from high frequencies; the messages claim" in page.text
     lag = FoundEffect("reference_lag", (), {"time_constant_s": (1.3, 1.2, 1.4)}, 0.85, 1e-20)
     series = diagnosis().series
     traced = replace(series, traces={lag.name: series.traces["lever_arm"]})
     lagging = page_of(tmp_path, diagnosis(effects=(lag,), series=traced))
-    assert "as high frequencies show it, and what the lag has made slow; the messages claim" in lagging.text
+    assert "estimated from high frequencies, and slow noise due to the lag; the messages claim" in lagging.text
 
 
 def test_effects_that_cannot_be_told_apart_are_named_together_and_none_is_preferred(page):
@@ -174,7 +174,7 @@ def test_the_spectrum_of_white_noise_is_flat_at_its_density():
 
 
 def test_what_is_left_is_shown_against_what_it_follows_with_means_and_their_errors(page):
-    assert "What is left to port, against turn rate" in page.text
+    assert "Residual to port, against turn rate" in page.text
     at = np.linspace(-1.0, 1.0, 3000)
     left = 0.01 * at + np.random.default_rng(1).normal(0.0, 0.02, 3000)
     where, mean, std, error = Followed("turn rate, °/s", "x", at, left).groups()

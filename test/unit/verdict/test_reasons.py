@@ -13,7 +13,7 @@ from conftest import ROOT
 from documentation import section
 
 from dvl_calib_ros.verdict.kinds import Kind, Severity
-from dvl_calib_ros.verdict.reasons import KINDS, TABLES, by_severity, finding, of_consequence, table
+from dvl_calib_ros.verdict.reasons import KINDS, TABLES, by_severity, finding, lookup, of_consequence
 
 PACKAGE = ROOT / "dvl_calib_ros"
 MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path.parent.name != "verdict"]
@@ -76,7 +76,7 @@ def test_a_code_is_one_word_in_capitals(code):
 
 @pytest.mark.parametrize("name", TABLES)
 def test_the_troubleshooting_page_has_the_tables(name):
-    assert section(name) == table(TABLES[name]).strip(), "take it from: python -m validation figures --render"
+    assert section(name) == lookup(TABLES[name]).strip(), "take it from: python -m validation figures --render"
 
 
 def test_no_code_stands_in_two_tables():
