@@ -85,7 +85,6 @@ class FullEstimator(Estimator):
             registration=given.registration,
         )  # fmt: skip
         self._worker = AtOnce() if given.worker is None else given.worker
-        self._state_names = model.state_names
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._dvl = _PendingDvl()

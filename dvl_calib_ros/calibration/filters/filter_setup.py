@@ -49,10 +49,6 @@ class Assembler:
             rate[index, : model.n_errors, : model.n_errors] = np.diag(np.square(std))
         self.process_rate = rate if rate.any() else None
 
-    def start_of(self, index: int) -> GaussianState:
-        """State and covariance that one model starts from."""
-        return self._starts[index]
-
     def state(self, index: int, x: Array, p: Array) -> GaussianState:
         """One model's state and covariance out of the filter's x (..., n) and P (..., n, n)."""
         floor = self._floors[index]
