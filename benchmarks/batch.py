@@ -14,9 +14,7 @@ from dvl_calib_ros.calibration.models import LINEAR_MODELS, Needs
 from dvl_calib_ros.calibration.models.base import Observations
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics import kalman
-from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.evaluation.estimation import heave_joined
 
 from . import Measurement, check_same
 
@@ -54,7 +52,7 @@ def measure() -> list[Measurement]:
                 group.update(stamps_ns[at], block, ones[at], known[at])
         return groups
 
-    # z, H, R, what the gate lets through and the rows of heave come for nothing
+    # z, H, R and what the gate lets through come for nothing
     everything = seen(slice(None))
     assemblers = [Assembler([model], parameters) for model in models]
     given = [assembler.measurements(everything, ones, known) for assembler in assemblers]
@@ -71,18 +69,10 @@ def measure() -> list[Measurement]:
             states.append(kalman.GaussianState(peer.x[:, 0], peer.P))
         return states
 
-    def with_heave(at: int, state: kalman.GaussianState) -> Array:
-        if models[at].heave is None:
-            return state.x
-        alone = kalman.GaussianState(state.x[None, None], state.p[None, None])
-        rows = assemblers[at].heave_rows(everything)[None]
-        joined = heave_joined(alone, stamps_ns[None], rows, used[at][None], known[None], parameters, [N_SAMPLES])
-        return joined.x[0, 0]
-
     # the best of several: what else the machine does only ever adds; the peer takes long enough to even it out
     ours, peer = min(_cpu_seconds(run_ours) for _ in range(ROUNDS)), _cpu_seconds(run_peer)
     after = {name: group.standing(1).x[0, k] for group in run_ours() for name, k in group.index.items()}
-    states = [with_heave(at, state) for at, state in enumerate(run_peer())]
+    states = [state.x for state in run_peer()]
     difference = max(
         float(np.abs(after[model.name] - state).max()) for model, state in zip(models, states, strict=True)
     )

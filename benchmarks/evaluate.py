@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from dvl_calib_ros.calibration.filters.filter_setup import Assembler
-from dvl_calib_ros.calibration.filters.vertical_motion import RelativeHeight
+from dvl_calib_ros.calibration.filters.relative_height import RelativeHeight
 from dvl_calib_ros.calibration.models import MODELS, Model, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import Array
-from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import protocol
-from dvl_calib_ros.evaluation.estimation import SensorData, aligned, heave_joined
+from dvl_calib_ros.evaluation.estimation import SensorData, aligned
 from dvl_calib_ros.evaluation.procedure import Procedure, corrections, run_seed, sensor_data
 from dvl_calib_ros.evaluation.protocol import load_folder, own_trajectories
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS
@@ -123,11 +122,7 @@ def _calibrate(model: Model, data: SensorData, parameters: Parameters, ends: Seq
             peer.predict()
             if used[i]:
                 peer.update(given.z[0, i, :m, None], R=r[i], H=given.h[0, i, :m])
-        state = GaussianState(peer.x[None, None, :, 0], peer.P[None, None])
-        if model.heave is not None:
-            rows, stamps_ns = assembler.heave_rows(seen)[None], variants.rows.stamps_ns[None]
-            state = heave_joined(state, stamps_ns, rows, used[None], usable, parameters, [end])
-        yield corrections(model, assembler.state(0, state.x[0, 0], state.p[0, 0]))
+        yield corrections(model, assembler.state(0, peer.x[:, 0], peer.P))
 
 
 def _vrmse(data: SensorData, index: int, matrix: Array) -> float:

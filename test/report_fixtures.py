@@ -239,7 +239,7 @@ def cross_checked(name: str) -> CrossCheck:
     )  # fmt: skip
     other = "tuesday"
     return CrossCheck(
-        bags=(name, other), models=("G1",), n_paired=(10, 10), uncorrected=np.array([0.1, 0.1]),
+        bags=(name, other), models=("full",), n_paired=(10, 10), uncorrected=np.array([0.1, 0.1]),
         corrected=np.array([[[np.nan, 0.02]], [[0.02, np.nan]]]), notes=(), parameters=Parameters().as_dict(),
-        selected=("G1", "G1"), navigation={(name, other): found, (other, name): found},
+        selected=("full", "full"), navigation={(name, other): found, (other, name): found},
     )  # fmt: skip

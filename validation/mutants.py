@@ -37,9 +37,9 @@ class Mutant(NamedTuple):
 MUTANTS = (
     Mutant(
         "sign of H",
-        "dvl_calib_ros/calibration/models/own.py",
-        "h[:, 3:] = -body_from_dvl",
-        "h[:, 3:] = body_from_dvl",
+        "dvl_calib_ros/calibration/models/published.py",
+        "h[:, axis, column] = -r[:, axis]",
+        "h[:, axis, column] = r[:, axis]",
         (UNIT + "calibration/test_models.py::test_h_is_the_derivative_of_the_nonlinear_error_model",),
     ),
     Mutant(

@@ -192,11 +192,11 @@ def evaluate(
     from ..parallel import Workers
 
     found = [] if paths is None else as_paths(paths)
-    known = BY_VELOCITY if len(found) > 1 else EVALUATED
-    names = known if models is None else tuple(models)
+    default = BY_VELOCITY if len(found) > 1 else EVALUATED
+    names = default if models is None else tuple(models)
     for name in names:
-        if name not in known:
-            raise InputError(f"models: {name!r} is none of {', '.join(known)}")
+        if name not in BY_VELOCITY:
+            raise InputError(f"models: {name!r} is none of {', '.join(BY_VELOCITY)}")
     if len(found) > 1:
         given = Given(dvl_topic, gnss_topic, imu_topic, frozenset(parameters))
         return cross_check(found, Parameters.from_mapping(parameters), names, given, Workers())

@@ -14,7 +14,7 @@ from .assessment.dead_reckoning import Navigation, dead_reckoned, doubts, object
 from .assessment.manoeuvre_planner import drift_left_open
 from .estimators.estimator import NEVER, Estimator, Rest
 from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
-from .filters.day_to_day_covariance import day_covariance, offset_covariance
+from .filters.day_to_day_covariance import day_covariance
 from .filters.filter_setup import nis_bounds
 from .filters.observability import MEASURES_VERTICAL, convergence, observability
 from .models import MODELS, Model
@@ -218,10 +218,7 @@ class Estimates:
     def of_recording(self, name: str) -> GaussianState:
         """State and covariance, σ as of the same day: the larger of what the filter claims and what blocks of time
         show."""
-        estimator = self.estimators[name]
-        state, covariance = estimator.of_recording()
-        worse = offset_covariance(MODELS[name], state, estimator.filter_covariance, self.parameters)
-        return GaussianState(state, covariance + worse)
+        return self.estimators[name].of_recording()
 
     def next_recording(self, name: str) -> GaussianState:
         """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it."""

@@ -25,7 +25,7 @@ from .filters.build_observations import Observer, RowsSeen, own_copy
 from .filters.filter_bank import Group, groups_of
 from .filters.heading_diversity import EVERY_NS, Headings
 from .filters.state_history import Counts, Numbers, StateTrace
-from .models import BROKEN, EXTENDED_BY, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
+from .models import BROKEN, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
 from .models.parameter_spec import ParameterError
 from .models.parameters import IAC, Parameters
 from .numerics.frames import Array, Vector
@@ -106,7 +106,6 @@ class Calibrator:
         unknown = () if are_positions(parameters) else (WITH_POSITIONS,)
         self._told = tuple(name for name in self._models if name not in unknown)
         check_model(parameters)
-        self._extended = [base for name in self._models if (base := MODELS[name].extends) is not None]
         self._initial = initial
         self._block_size = block_size
         self._rows_held = max(ROWS_HELD, ROWS_HELD_BLOCKS * block_size)
@@ -133,9 +132,10 @@ class Calibrator:
     def _start(self) -> None:
         self._selection = Selection()
         self._n_selected = 0  # rows that the selection knows of
-        wanted = {*self._models, *self._extended}
+        wanted = {*self._models}
         if self._verified:  # every model is judged by the samples of one with a reference
-            wanted.add(next((name for name in wanted if MODELS[name].aided), "M1"))
+            aided = (model.name for model in LINEAR_MODELS if model.aided and model.name in wanted)
+            wanted.add(next(aided, "M1"))
         linear = [model for model in LINEAR_MODELS if model.name in wanted]
         self._groups = groups_of(linear, self.parameters, self._initial, self._verified)
         self._aligner.before_clearing = self._before_clearing
@@ -167,7 +167,6 @@ class Calibrator:
                 model=model,
                 parameters=self.parameters,
                 aligner=self._aligner,
-                base=None if model.extends is None else self._estimators[model.extends],
                 initial=(self._initial or {}).get(model.name),
                 on_evidence=partial(self._on_evidence, model),
                 verified=self._verified,
@@ -287,10 +286,7 @@ class Calibrator:
     def _on_evidence(self, model: Model, from_ns: int) -> None:
         """Let the selection, and the trace, know what an estimator says by now."""
         estimator = self._estimators[model.name]
-        if model.extends is not None and EXTENDED_BY[model.extends] == model.name:
-            self._selection.extend(from_ns, estimator.evidence)
-        if model.from_positions:
-            self._selection.go_by_positions(from_ns, estimator.evidence)
+        self._selection.take(from_ns, estimator.evidence)
         if self._trace is not None:
             estimator.remember(from_ns)
 
@@ -503,11 +499,10 @@ class Calibrator:
 
     def _result(self) -> Result:
         doubts = [] if self._worker is None else self.doubts(fresh=True)
-        chosen = self._estimators.get(self.selected)  # None where it is not among the models wanted
         return Result(
             selected=self.selected,
             iac_model=self.selection.iac_model(self.parameters),
-            selected_because=self.selection.reason(self.parameters, None if chosen is None else chosen.evidence),
+            selected_because=self.selection.reason(self.parameters),
             estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._told},
             segments=tuple(self.selection.segments),
             counts=self.counts,

@@ -53,7 +53,10 @@ def run(arguments: argparse.Namespace) -> None:
     from ..present import evaluation as present
 
     are_bags = _are_bags(arguments.paths)
-    models = common.chosen("--models", arguments.models, BY_VELOCITY if are_bags else EVALUATED)
+    if arguments.models == "all" and not are_bags:
+        models = list(EVALUATED)
+    else:
+        models = common.chosen("--models", arguments.models, BY_VELOCITY)
     sets = common.chosen("--sets", arguments.sets, [each.name for each in SETS])
     if not 1 <= arguments.seeds <= MAX_SEEDS:
         raise InputError(f"--seeds: {arguments.seeds} is outside 1 .. {MAX_SEEDS}")

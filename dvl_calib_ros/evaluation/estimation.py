@@ -14,16 +14,17 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ..calibration.calibrator import Calibrator
 from ..calibration.filters.build_observations import Observer
 from ..calibration.filters.filter_setup import Assembler
-from ..calibration.filters.vertical_motion import HeaveRows, HeaveSums, RelativeHeight, with_heave
+from ..calibration.filters.relative_height import RelativeHeight
 from ..calibration.models import MODELS, Model, Needs
 from ..calibration.models.base import Observations
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics import kalman
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.kalman import GaussianState
-from ..calibration.numerics.samples import AlignedBlock, Mask, Stamps, Stream, Streams, no_samples, sample_block
+from ..calibration.numerics.samples import AlignedBlock, Mask, Stream, Streams, no_samples, sample_block
 from ..calibration.streams.aligner import align
 from .protocol import Trajectory
 from .results import Failure
@@ -156,9 +157,9 @@ def _estimate(
     models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int]
 ) -> Mapping[str, GaussianState]:
     variants = aligned(data, parameters)
-    found: dict[str, GaussianState] = {}
+    found = {name: _estimate_fed(name, data, parameters, ends) for name in models if MODELS[name].estimator}
     for needs in Needs:
-        group = [MODELS[name] for name in models if MODELS[name].needs is needs]
+        group = [MODELS[name] for name in models if MODELS[name].needs is needs and name not in found]
         if not group:
             continue
         seen = variants.observations(needs, parameters)
@@ -177,12 +178,25 @@ def _estimate_one(
     flat = assembler.measurements(seen, variants.rows.share(model.aided), variants.rows.prior_known)
     usable = variants.has[model.needs]
     x, p = (np.repeat(each, len(usable), axis=0) for each in assembler.start)
-    after, used = _states_after(x, p, _by_variant(flat, usable), ends)
-    if model.heave is not None:
-        rows = assembler.heave_rows(seen).reshape(*usable.shape, 1, model.n_state + 1)
-        stamps_ns = variants.rows.stamps_ns.reshape(usable.shape)
-        after = heave_joined(after, stamps_ns, rows, used, usable, parameters, ends)
+    after = _states_after(x, p, _by_variant(flat, usable), ends)
     return assembler.state(0, after.x, after.p)
+
+
+def _estimate_fed(name: str, data: SensorData, parameters: Parameters, ends: Sequence[int]) -> GaussianState:
+    """Of a model with an estimator of its own: each variant as a recording of it, looked at after so many samples."""
+    prior = true_prior(data, parameters)
+    x, p = [], []
+    for variant in range(len(data.velocity_dvl)):
+        calibrator = Calibrator(parameters, prior_sway_heave=prior, block_size=max(ends), models=(name,))
+        found = []
+        for start, end in pairwise((0, *ends)):
+            part = SensorData(data.run.part(start, end), data.velocity_dvl[:, start:end], data.reference[:, start:end])
+            if end > start:
+                calibrator.feed(streams_of(part, variant))
+            found.append(calibrator.result().estimates[name])
+        x.append([each.state for each in found])
+        p.append([each.recording_covariance for each in found])
+    return GaussianState(np.array(x).swapaxes(0, 1), np.array(p).swapaxes(0, 1))
 
 
 def _heights(seen: Observations, variants: AlignedVariants, given: Mask) -> Array:
@@ -192,30 +206,6 @@ def _heights(seen: Observations, variants: AlignedVariants, given: Mask) -> Arra
     for height, at, stamps_ns, rising in zip(heights, given, *columns, strict=True):
         height[at] = RelativeHeight().add(stamps_ns[at], rising[at])
     return heights.ravel()
-
-
-def heave_joined(
-    after: GaussianState,
-    stamps_ns: Stamps,
-    rows: Array,
-    used: Mask,
-    given: Mask,
-    parameters: Parameters,
-    ends: Sequence[int],
-) -> GaussianState:
-    """Return the filter's states after the first `ends` samples, including rows of heave.
-
-    Returns x (E, B, n), P (E, B, n, n). stamps_ns: (B, N). rows: (B, N, 1, n+1). used, given: (B, N), samples that the
-    filter used and received.
-    """
-    sums = []
-    for at, stamps, row, use in zip(given, stamps_ns, rows, used, strict=True):
-        number = np.concatenate([[0], np.cumsum(at)])  # number of received samples before each
-        taken = HeaveRows(1, rows.shape[-1] - 1, parameters)
-        found = taken.add(stamps[at], row[at], use[at], [int(number[end]) for end in ends])
-        sums.append(HeaveSums.stacked(found))
-    of_all = HeaveSums(*(np.stack(each, axis=1)[:, :, 0] for each in zip(*sums, strict=True)))
-    return with_heave(after, of_all, parameters.motion_std)[0]
 
 
 def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
@@ -235,16 +225,14 @@ def _by_variant(flat: kalman.Measurements, usable: Mask) -> kalman.Measurements:
     )
 
 
-def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> tuple[GaussianState, Mask]:
-    """Return x (E, K, n), P (E, K, n, n) after the first `ends` samples, and used samples (K, N)."""
-    used = data.usable.copy()
+def _states_after(x: Array, p: Array, data: kalman.Measurements, ends: Sequence[int]) -> GaussianState:
+    """Return x (E, K, n) and P (E, K, n, n) after the first `ends` samples."""
     if not np.isfinite(data.gate).any():
-        return kalman.least_squares(x, p, data, ends), used
+        return kalman.least_squares(x, p, data, ends)
     states = []
     for start, end in pairwise((0, *ends)):
         if end > start:
             after = kalman.batch(x, p, data.part(slice(start, end)))
             x, p = after.x, after.p
-            used[:, start:end] = after.used
         states.append((x, p))
-    return GaussianState(*map(np.array, zip(*states, strict=True))), used
+    return GaussianState(*map(np.array, zip(*states, strict=True)))

@@ -43,6 +43,11 @@ class Procedure:
     studies: bool = True
 
     @property
+    def studied(self) -> tuple[str, ...]:
+        """Models of the studies: a filter does all combinations at once, an estimator takes a calibration for each."""
+        return tuple(name for name in self.models if not MODELS[name].estimator)
+
+    @property
     def n_columns(self) -> int:
         """Number of columns: uncalibrated and the models."""
         return 1 + len(self.models)
@@ -93,12 +98,17 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     def data(name: str) -> SensorData:
         return SensorData(procedure.runs[name], measured[name], references(procedure.runs[name], seed))
 
-    def outcome(stretch: SensorData, windows: Sequence[float | None], own_window: float | None) -> RunOutcome:
+    def outcome(
+        models: Sequence[str], stretch: SensorData, windows: Sequence[float | None], own_window: float | None
+    ) -> RunOutcome:
         others = _others(moments, stretch.run.name)
         ends = [stretch.run.first(window) for window in windows]
-        return _calibrate(stretch, ends, windows.index(own_window), others, procedure, failures)
+        return _calibrate(models, stretch, ends, windows.index(own_window), others, procedure, failures)
 
-    by_set = tuple(outcome(data(each.calibration_run), protocol.WINDOWS_S, each.window_s) for each in procedure.sets)
+    by_set = tuple(
+        outcome(procedure.models, data(each.calibration_run), protocol.WINDOWS_S, each.window_s)
+        for each in procedure.sets
+    )
     baselines = np.array(
         [
             [
@@ -109,15 +119,17 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
         ]
     )
     if not procedure.studies:
-        none = np.empty((0, len(curve_keys(procedure.models)), len(TIMES_S), 3))
+        none = np.empty((0, len(curve_keys(procedure.studied)), len(TIMES_S), 3))
         no_pull = np.empty((0, len(NOISE_STUDY_STD), 0))
         return SeedOutcome(by_set, (), (), no_pull, baselines, none, _of_seed(failures, seed))
     with_attitude = runs_with_attitude(procedure.runs)
     legs = [leg for name in with_attitude for leg in _legs(procedure.runs[name])]
     outcome_of_seed = SeedOutcome(
         by_set=by_set,
-        each=tuple(outcome(data(name), [None], None) for name in with_attitude),
-        single_heading=tuple(outcome(_part(data(name), start, end), [None], None) for name, start, end in legs),
+        each=tuple(outcome(procedure.studied, data(name), [None], None) for name in with_attitude),
+        single_heading=tuple(
+            outcome(procedure.studied, _part(data(name), start, end), [None], None) for name, start, end in legs
+        ),
         pull=_noise_study(procedure, data(noise_study_run(procedure).name), seed, failures),
         baselines=baselines,
         convergence=np.stack(
@@ -126,13 +138,13 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
                     procedure.runs[name],
                     measured[name],
                     {std: references(procedure.runs[name], seed, std) for std in REFERENCE_STD},
-                    procedure.models,
+                    procedure.studied,
                     procedure.parameters,
                     failures,
                 )
                 for name in with_attitude
             ]
-            or [np.full((len(curve_keys(procedure.models)), len(TIMES_S), 3), np.nan)]
+            or [np.full((len(curve_keys(procedure.studied)), len(TIMES_S), 3), np.nan)]
         ),
     )
     return replace(outcome_of_seed, failures=_of_seed(failures, seed))
@@ -209,6 +221,7 @@ def true_state(model: Model) -> Array:
 
 
 def _calibrate(
+    models: Sequence[str],
     data: SensorData,
     ends: Sequence[int],
     own: int,
@@ -216,8 +229,8 @@ def _calibrate(
     procedure: Procedure,
     failures: list[Failure],
 ) -> RunOutcome:
-    """Calibrate on one run. own: index of the run's own window."""
-    states = estimate(procedure.models, data, procedure.parameters, ends, failures)
+    """Calibrate some of the procedure's models on one run. own: index of the run's own window."""
+    states = estimate(models, data, procedure.parameters, ends, failures)
     n_variants = len(data.velocity_dvl)
     matrices = np.full((len(ends), procedure.n_columns, n_variants, 3, 3), np.nan)
     matrices[:, 0] = np.eye(3)
@@ -286,7 +299,7 @@ def models_in_noise_study(models: Sequence[str]) -> tuple[str, ...]:
 
 def _noise_study(procedure: Procedure, data: SensorData, seed: int, failures: list[Failure]) -> Array:
     """Return the change of the first scale state by noise of each level in the reference (G, V, B)."""
-    models = models_in_noise_study(procedure.models)
+    models = models_in_noise_study(procedure.studied)
     if not models:
         return np.empty((0, len(NOISE_STUDY_STD), len(protocol.COMBINATIONS)))
 

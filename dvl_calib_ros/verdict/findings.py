@@ -410,7 +410,7 @@ FINDINGS = (
     Kind(
         "REFERENCE_OFFSET",
         "the reference has a constant error of {millimetres:.0f} mm/s towards {course:.0f}°{where}",
-        "A constant error of an inertial navigation, or a current in water track. G1 and `full` estimate it.",
+        "A constant error of an inertial navigation, or a current in water track. `full` estimates it.",
         "judge the drift by another reference",
     ),
     Kind(

@@ -17,7 +17,7 @@ _KINDS = (
         "NO_SAMPLE_USED",
         "no sample was used",
         "No reference, no attitude, or every sample was refused.",
-        "there is nothing to apply",
+        "there is nothing to apply; the model `full` needs 25 s of data",
         Severity.REJECT,
     ),
     Kind(
@@ -271,12 +271,6 @@ SELECTIONS = (
     ),
     _Selected("TRIM_KNOWN", "the trim is known", "The IMU gives roll and pitch.", ""),
     _Selected(
-        "FULL_HAS_DATA",
-        "attitude and angular velocity are known, so that the full model has data",
-        "Attitude and angular velocity are there.",
-        "",
-    ),
-    _Selected(
         "ARM_LOOKS_LIKE_ANGLE",
         "on this track a {metres:g} m error of the lever arm looks like {degrees:.1f}° of {angle}",
         "Turns to one side at one speed confuse lever arm and angle.",
@@ -293,8 +287,5 @@ SELECTIONS = (
         "positions are too infrequent for velocities, so they are compared over legs",
         "Positions more than three `position_window` apart are compared over legs.",
         "",
-    ),
-    _Selected(
-        "NO_EVIDENCE", "{model} explains the data as well", "The data favour neither another lever arm nor a delay.", ""
     ),
 )

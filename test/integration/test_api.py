@@ -51,9 +51,9 @@ def test_five_lines_give_the_mounting_and_a_picture(tmp_path, bag):
 def test_replay_is_what_the_command_gives(calibration, bag, tmp_path, capsys):
     assert main(["replay", str(bag), "--json", str(tmp_path / "o.json")]) == 0
     document = json.loads((tmp_path / "o.json").read_text())
-    state = calibration.replayed.result.estimates["G1"].state
-    np.testing.assert_allclose(state, document["models"]["G1"]["state"], rtol=0, atol=1e-12)
-    assert calibration.verdict == document["verification"]["G1"]["verdict"]
+    state = calibration.replayed.result.estimates["M3"].state
+    np.testing.assert_allclose(state, document["models"]["M3"]["state"], rtol=0, atol=1e-12)
+    assert calibration.verdict == document["verification"]["M3"]["verdict"]
     assert list(calibration.found) == document["discovery"]["found"]
     out, _ = succeed(capsys, "replay", bag)
     assert calibration.mounting.urdf in out
@@ -135,9 +135,9 @@ def test_without_history_what_needs_it_says_so(bag):
 def test_the_other_functions_give_dataclasses(tmp_path, bag):
     made = dc.simulate(tmp_path / "made", seconds=60.0, trajectory="figure8")
     assert dc.doctor(made).verdict == "partly"  # of a minute no yaw to speak of: a replay of it claims ± 2.4°
-    checked = dc.evaluate([bag, made], models=["G1"])
-    assert checked.models == ("G1",)
-    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on G1 leaves ")
+    checked = dc.evaluate([bag, made], models=["M3"])
+    assert checked.models == ("M3",)
+    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on M3 leaves ")
     assert dc.replay([made], gnss_topic="none").model == "F1"
     with pytest.raises(dc.InputError, match="none of"):
         dc.evaluate(models=["M9"])
@@ -199,11 +199,11 @@ def test_a_vehicle_is_diagnosed_against_a_simulator(tmp_path):
 
 def test_topics_are_named_for_an_evaluation_as_for_a_replay(bag, tmp_path):
     other = dc.simulate(tmp_path / "other", seconds=60.0, seed=3)
-    checked = dc.evaluate([bag, other], models=["G1"], dvl_topic="dvl/twist", gnss_topic="gnss/twist")
-    assert checked.models == ("G1",)
-    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on G1 leaves ")
+    checked = dc.evaluate([bag, other], models=["M3"], dvl_topic="dvl/twist", gnss_topic="gnss/twist")
+    assert checked.models == ("M3",)
+    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on M3 leaves ")
     with pytest.raises(dc.InputError, match="no topic 'nowhere'"):
-        dc.evaluate([bag, other], models=["G1"], gnss_topic="nowhere")
+        dc.evaluate([bag, other], models=["M3"], gnss_topic="nowhere")
 
 
 def test_a_damaged_recording_is_salvaged_as_by_the_command(bag, tmp_path):
@@ -251,7 +251,7 @@ def test_results_become_pages_and_json(calibration, bag, tmp_path, capsys):
     assert json.loads((tmp_path / "r.json").read_text()) == json.loads((tmp_path / "command.json").read_text())
     examined = dc.doctor(bag)
     assert json.loads(dc.report(examined, tmp_path / "d.json").read_text())["verdict"] == "yes"
-    checked = dc.evaluate([bag, dc.simulate(tmp_path / "made", seconds=60.0)], models=["G1"])
+    checked = dc.evaluate([bag, dc.simulate(tmp_path / "made", seconds=60.0)], models=["M3"])
     dc.report(checked, tmp_path / "c.html")
     assert "This recording can calibrate the DVL." in dc.report(examined, tmp_path / "d.html").read_text()
     with pytest.raises(dc.InputError, match="str is no result"):

@@ -461,7 +461,7 @@ def test_bad_options_are_refused_in_one_line(saved, monkeypatch, capsys, argumen
         {"verification": {"verdict": "splendid", "reasons": []}},
         {"verification": {"verdict": "reject", "reasons": []}},
         {"verification": []},
-        {"models": {"G1": 3}},
+        {"models": {"full": 3}},
     ],
 )
 def test_a_damaged_result_is_refused(tmp_path, result, capsys, damage):

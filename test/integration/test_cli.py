@@ -213,13 +213,13 @@ def test_replay_json_has_the_documented_structure(document, bag):
     assert document["models"]["M3"]["state_names"][3:] == ["delta_k"]
     assert document["models"]["M4"]["state_names"][3:] == ["delta_k_x"]
     assert document["version"] == __version__
-    assert document["parameters"]["gnss_model"] == "G1"
+    assert document["parameters"]["gnss_model"] == "full"
 
 
 def test_the_selected_segments_follow_each_other_from_the_first_sample_to_the_last(document):
     segments = document["selected"]
-    assert [segment["model"] for segment in segments] == ["F1", "G1", "full"]
-    assert segments[0]["from_s"] == 0.0 and segments[1]["to_s"] == segments[2]["from_s"]
+    assert [segment["model"] for segment in segments] == ["F1", "full"]
+    assert segments[0]["from_s"] == 0.0
     assert segments[0]["to_s"] == segments[1]["from_s"] == pytest.approx(3.0, abs=0.5)
     assert segments[-1]["to_s"] == pytest.approx(40.0, abs=0.5)
 

@@ -32,11 +32,11 @@ def test_g2_of_one_day_corrects_the_other_with_its_lever_arm_and_the_days_own_de
 ):
     drawn(monkeypatch)  # they are counted, not looked at
     page, out = tmp_path / "x.html", tmp_path / "x.json"
-    said, _ = succeed(capsys, "evaluate", *bags, "--models", "G1,full", "--jobs", "1", "--report", page, "--json", out)
+    said, _ = succeed(capsys, "evaluate", *bags, "--models", "M3,full", "--jobs", "1", "--report", page, "--json", out)
     document = json.loads(out.read_text())
     monday, tuesday = map(str, bags)
     by_monday = document["corrected"][monday]
-    assert by_monday["full"][tuesday] < 0.06 and by_monday["full"][tuesday] < 0.6 * by_monday["G1"][tuesday]
+    assert by_monday["full"][tuesday] < 0.06 and by_monday["full"][tuesday] < 0.6 * by_monday["M3"][tuesday]
     assert document["selected"][monday] == "full"
     navigation = document["navigation"][monday][tuesday]
     assert navigation["drift_m_per_km"]["after"] < navigation["drift_m_per_km"]["before"]
@@ -59,7 +59,7 @@ def test_topics_are_found_as_by_replay_and_the_answer_is_said_first_with_warning
     # M3 knows nothing of the arm and the clock that these days differ by
     assert said.startswith("not_better: On bags that were not calibrated on M3 leaves a velocity error of ")
     assert "DVL /a50/velocity" in said and "reference /rtk/velocity" in said
-    assert not any(f"{name}: " in warned for name in ("G1", "full", "M7", "F1"))
+    assert not any(f"{name}: " in warned for name in ("full", "M7", "F1"))
 
 
 def test_the_table_for_spreadsheets_is_for_trajectories_only(bags, tmp_path, capsys):
@@ -76,13 +76,13 @@ def test_a_bag_whose_replay_fails_is_named_and_the_others_are_checked(bags, tmp_
         return real(*asked)
 
     monkeypatch.setattr(evaluation_of_bags, "_replay_one", failing)
-    _, warned = succeed(capsys, "evaluate", *bags, "--models", "G1", "--jobs", "1", "--json", out)
+    _, warned = succeed(capsys, "evaluate", *bags, "--models", "M3", "--jobs", "1", "--json", out)
     why = "failed, and is in none of the figures: replay: ZeroDivisionError: division by zero"
     assert why in " ".join(warned.split())
     document = json.loads(out.read_text())
     assert document["notes"][0] == f"{bags[0]}: {why}"
     assert document["paired"][str(bags[0])] == 0 and document["paired"][str(bags[1])] > 100
     monkeypatch.setattr(evaluation_of_bags, "_replay_one", lambda *_: real())
-    assert main(["evaluate", *map(str, bags), "--models", "G1", "--jobs", "1"]) == 2
+    assert main(["evaluate", *map(str, bags), "--models", "M3", "--jobs", "1"]) == 2
     error = capsys.readouterr().err
     assert "nothing is left to check" in error and "TypeError" in error and error.count("\n") == 1

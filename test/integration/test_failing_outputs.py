@@ -26,7 +26,7 @@ PATIENCE_S = 60.0
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory) -> Path:
-    return write_bag(tmp_path_factory.mktemp("failing") / "bag", run(10.0))
+    return write_bag(tmp_path_factory.mktemp("failing") / "bag", run(30.0))
 
 
 def shell(redirected: str, *arguments, before: str = "", module: str = "cli.main") -> subprocess.CompletedProcess:

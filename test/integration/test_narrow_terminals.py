@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
 
 
 COMMANDS = {
-    "replay": ("replay", "one", "--verbose"),
+    "replay": ("replay", "one", "--verbose", "-p", "model:=M3"),
     "evaluate": ("evaluate", "one", "two", "--jobs", "1"),
     "apply": ("apply", "result.yaml"),
 }
@@ -70,7 +70,7 @@ def test_a_command_says_every_number_and_name_on_any_terminal(monkeypatch, capsy
 
 
 VALUES = {
-    "model": "G1", "why": "auto: GNSS is available", "gnss": "GNSS is available", "convergence": "coarse",
+    "model": "full", "why": "auto: GNSS is available", "gnss": "GNSS is available", "convergence": "coarse",
     "phi_x [deg]": "0.8834", "std phi_x [deg]": "1.4004", "progress phi_x [%]": "25.0",
     "observed phi_x": "no (roll); needs turns or a figure eight", "delta_k_y [%]": "-10.1234",
     "std delta_k_y [%]": "0.5432", "progress delta_k_y [%]": "7.0", "observed delta_k_y": "yes",
@@ -96,7 +96,7 @@ def test_the_live_view_shows_every_number_on_any_terminal(width):
 CELLS = st.one_of(
     st.floats(-1e4, 1e4).map(lambda value: f"{value:+.2f} ± {abs(value) / 7:.2f}"),
     st.integers(0, 10**6).map(str),
-    st.sampled_from(["-", "", "G1 ◄", "[bold]M3[/]", "coarse", "turns, a box or a figure eight in calm water"]),
+    st.sampled_from(["-", "", "full ◄", "[bold]M3[/]", "coarse", "turns, a box or a figure eight in calm water"]),
 )
 
 

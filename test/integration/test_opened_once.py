@@ -52,7 +52,7 @@ def passes(monkeypatch) -> Counter[str]:
     [
         "doctor BAG", "doctor CUT", "doctor BAG OTHER", "replay BAG", "replay BAG OTHER", "replay CUT",
         "replay BAG -p prior_source:=reference", "replay BAG --report REPORT", "diagnose BAG", "diagnose BAG OTHER",
-        "diagnose BAG --simulator OTHER", "compare BAG OTHER", "evaluate BAG OTHER --models G1 --jobs 1",
+        "diagnose BAG --simulator OTHER", "compare BAG OTHER", "evaluate BAG OTHER --models M3 --jobs 1",
         "simulate NEW --duration 20 --motion-of BAG",
     ],
 )  # fmt: skip

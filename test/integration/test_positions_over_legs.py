@@ -82,7 +82,7 @@ def test_a_wrong_calibration_of_positions_is_not_verified(usbl, monkeypatch):
 def test_where_velocities_of_positions_are_good_auto_does_not(tmp_path):
     bag = write_positions(tmp_path / "bag", run(Noise(0.02)))
     result = replay([bag], Parameters(), TOPICS).result
-    assert result.selected in ("G1", "full")
+    assert result.selected == "full"
     assert {segment.model for segment in result.segments}.isdisjoint({WITH_POSITIONS})
 
 

@@ -45,7 +45,7 @@ def test_the_profile_of_the_folder_is_used_and_shown_and_options_win(capsys, fol
     assert shown == f"profile .dvl-calib.yaml: {options}"
     assert (stored["model"], stored["gate_probability"]) == ("M5", 0.5)
     assert stored["mounting_rpy"] == pytest.approx([0.0, 0.0, 0.0174533])
-    assert settled(capsys, "-p", "model:=G1")[0] == stored | {"model": "G1"}
+    assert settled(capsys, "-p", "model:=M3")[0] == stored | {"model": "M3"}
     assert settled(capsys, "--profile", "none") == (without, "")
     assert "/other" in fail_after_the_profile(capsys, "replay", "bag", "--dvl-topic", "/other")
 

@@ -52,7 +52,7 @@ def test_recordings_of_one_mounting_are_averaged_and_the_night_is_no_dropout(pla
     assert not any("dropped out" in note for note in checked.notes)
     assert checked.recordings is not None and checked.recordings.same_mounting
     assert (checked.result.estimate.state == plain.result.estimate.state).all()
-    assert checked.result.verifications["G1"].verdict is plain.result.verifications["G1"].verdict
+    assert checked.result.verifications["M3"].verdict is plain.result.verifications["M3"].verdict
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_a_mounting_that_moved_between_two_is_named_and_not_averaged_in_silence(
     assert "(tuesday) and" in said and "(wednesday): the average of all" in said
     document = json.loads((tmp_path / "r.json").read_text())
     assert document["recordings"]["moved"][0]["first_after"] == "wednesday"
-    assert document["verification"]["G1"]["verdict"] == "reject"
+    assert document["verification"]["M3"]["verdict"] == "reject"
     # applying what was saved of it is refused, as of all that is rejected
     assert "the mounting differs" in fail(capsys, "apply", tmp_path / "r.yaml", "--launch", tmp_path / "x.xml")
 
@@ -99,7 +99,7 @@ def test_a_reference_in_a_bag_of_its_own_belongs_to_the_recording_of_its_time(tm
 
 def test_two_recordings_of_the_same_time_are_said_to_be(place, tmp_path):
     other = recorded(tmp_path / "other", 0, 2.0)
-    verification = checked_replay([place / "monday", other], Parameters()).result.verifications["G1"]
+    verification = checked_replay([place / "monday", other], Parameters()).result.verifications["M3"]
     assert verification.verdict is Severity.REJECT
     assert verification.reasons[0].code == "BAGS_OVERLAP"
 

@@ -292,9 +292,9 @@ def assert_survived(fault: Fault, node: Live) -> None:
 
 
 def assert_near_truth(saved: dict) -> None:
-    """Pitch and yaw of G1; roll takes more than 40 s."""
+    """Pitch and yaw; roll takes more than 40 s."""
     truth, _ = equivalent_error_terms(ERRORS)
-    _, pitch, yaw = np.abs(saved["models"]["G1"]["state"][:3] - truth)
+    _, pitch, yaw = np.abs(saved["models"]["full"]["state"][:3] - truth)
     assert max(pitch, yaw) < math.radians(0.5)
 
 
@@ -399,7 +399,7 @@ def test_a_storm_of_parameters_good_and_bad_costs_no_sample_and_ends_where_it_sh
     saved, expected = node.when_like(replay), replay.calibrator.result()
     for name in BY_VELOCITY:
         np.testing.assert_allclose(saved["models"][name]["state"], expected.estimates[name].state, rtol=0, atol=1e-12)
-    assert saved["counts"] == expected.counts and saved["model"] == "G1"
+    assert saved["counts"] == expected.counts and saved["model"] == "full"
 
 
 def parameter_values() -> list[ParameterValue]:
@@ -480,7 +480,7 @@ def test_subscribers_that_hang_die_and_come_back_cost_nothing_and_get_the_estima
     got = node.world.received(TwistWithCovarianceStamped, f"{NODE}/estimate", LATCHED)
     until(lambda: got, "the latched estimate")
     terms = got[-1].twist.twist.angular
-    np.testing.assert_array_equal([terms.x, terms.y, terms.z], saved["models"]["G1"]["state"][:3])
+    np.testing.assert_array_equal([terms.x, terms.y, terms.z], saved["models"]["full"]["state"][:3])
 
 
 # ---------------------------------------------------------------- disk and power

@@ -21,7 +21,7 @@ from dvl_calib_ros.node.status import status_name
 
 FOXGLOVE = ROOT / "config" / "foxglove_layout.json"
 PLOTJUGGLER = ROOT / "config" / "plotjuggler_layout.xml"
-WORDS = {"model": "G1", "convergence": "coarse", "gnss": "GNSS is available"}
+WORDS = {"model": "full", "convergence": "coarse", "gnss": "GNSS is available"}
 
 
 def twist(stamp: int, frame_id: str, *velocity: float) -> TwistWithCovarianceStamped:
@@ -53,7 +53,7 @@ def published() -> dict[str, Any]:
                 stamp = 1_000_000_000_000 + 200_000_000 * i
                 gnss.publish(twist(stamp, "base_link", 1.5, 0.1 * (i % 7), 0.0))
                 dvl.publish(twist(stamp, "dvl_link", 1.51, 0.1 * (i % 7) + 0.05, 0.02))
-            until(lambda: "model G1" in state(received["/diagnostics"]), "diagnostics with GNSS")
+            until(lambda: "model full" in state(received["/diagnostics"]), "diagnostics with GNSS")
             until(lambda: all(received.values()), "a message on every topic")
             return {topic: messages[-1] for topic, messages in received.items()}
     finally:

@@ -31,7 +31,7 @@ from dvl_calib_ros.verdict.reasons import finding
 
 PATIENCE_S = 30.0
 VALUES = {
-    "model": "G1", "convergence": "coarse", "elapsed [s]": "754",
+    "model": "full", "convergence": "coarse", "elapsed [s]": "754",
     "dvl rate [Hz]": "5.0", "dvl age [s]": "0", "gnss rate [Hz]": "1.0", "gnss age [s]": "3", "imu age [s]": "-",
     "mounting roll [deg]": "0.108", "sigma mounting roll [deg]": "1.177",
     "mounting yaw [deg]": "3.036", "sigma mounting yaw [deg]": "0.116",
@@ -59,7 +59,7 @@ def drawn(*arguments, width=110) -> str:
 
 def test_the_view_shows_the_mounting_what_it_is_worth_and_what_to_drive():
     text = drawn(status(), 100.5)
-    assert text.startswith("model G1   12 min 34 s\n")
+    assert text.startswith("model full   12 min 34 s\n")
     assert "\nDVL 5.0 Hz, 0 s ago   reference 1.0 Hz, 3 s ago   IMU none yet\n" in text
     assert "yaw     3.036 ±0.116°" in text and "arm x   0.300 m, as set" in text
     assert re.search(r"\ndrift  █{18}░{6}  75 %  3.45 m/km, goal 2\n", text)
@@ -159,7 +159,7 @@ WARNINGS = [
 ]
 SEEN = {
     (80, 24): """\
-model G1   12 min 34 s
+model full   12 min 34 s
 drift  ██████████████████░░░░░░  75 %  3.45 m/km, goal 2
 next: drive straight, west (270°), about 75 s ± 43 s until good enough
 s save  r r forget  w warnings  q quit
@@ -179,7 +179,7 @@ DVL 5.0 Hz, 0 s ago   reference 1.0 Hz, 3 s ago   IMU 50.0 Hz, 0 s ago
 headings  N█  NE   E▄  SE   S   SW   W   NW
 [INFO] model auto""",
     (40, 20): """\
-model G1   12 min 34 s
+model full   12 min 34 s
 drift  ██████░░  75 %  3.45 m/km, goal 2
 next: drive straight, west (270°), about
 75 s ± 43 s until good enough
@@ -277,11 +277,11 @@ def test_without_a_terminal_a_line_is_written_when_something_changes_and_now_and
     show(Console(file=out, width=40), SimpleNamespace(latest=lambda _: next(statuses)), lambda: next(running))
     lines = out.getvalue().splitlines()
     assert len(lines) == 4
-    assert lines[0] == line(status()) and lines[0].startswith("G1 coarse: roll 0.108 ±1.177°, ")
-    assert lines[1].startswith("G1 fine:") and lines[2].endswith("; check") and lines[3] == lines[2]
+    assert lines[0] == line(status()) and lines[0].startswith("full coarse: roll 0.108 ±1.177°, ")
+    assert lines[1].startswith("full fine:") and lines[2].endswith("; check") and lines[3] == lines[2]
 
 
-@pytest.mark.parametrize("name", ["G1", "F1"])
+@pytest.mark.parametrize("name", ["full", "F1"])
 def test_progress_goes_from_the_prior_to_fine_by_the_logarithm(name):
     parameters = Parameters()
     calibrator = calibrate(make_samples(MatchedRun(dvl_std=0.01, gnss_std=0.01)), parameters)

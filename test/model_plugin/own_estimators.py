@@ -6,13 +6,15 @@ import numpy as np
 from own_models import PRIOR_STD
 
 from dvl_calib_ros.calibration.estimators.estimator import Estimator, EstimatorSetup
+from dvl_calib_ros.calibration.filters.cross_validation import FOLDS
 from dvl_calib_ros.calibration.filters.filter_bank import ModelCounts
+from dvl_calib_ros.calibration.filters.filter_setup import prior
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
-from dvl_calib_ros.calibration.results.thinned_recording import Terms
+from dvl_calib_ros.calibration.results.thinned_recording import NO_TERMS, Terms
 
 
 class MeanRise(Estimator):
-    """Extends G1's state by one."""
+    """Of the mounting it knows what is known before."""
 
     def __init__(self, given: EstimatorSetup) -> None:
         self._given, self._taken = given, 0
@@ -30,29 +32,25 @@ class MeanRise(Estimator):
         self._sum += float(rise[block.paired].sum())
         self._count += float(np.count_nonzero(block.paired))
 
-    def _with_mean(self, base: GaussianState) -> GaussianState:
-        n = len(base.x)
-        p = np.zeros((n + 1, n + 1))
-        p[:n, :n], p[n, n] = base.p, PRIOR_STD**2 / (1.0 + self._count)
-        return GaussianState(np.append(base.x, self._sum / max(self._count, 1.0)), p)
-
     def state(self) -> GaussianState:
-        return self._with_mean(self._given.base.state())
+        x, p = prior(self._given.model, self._given.parameters)
+        x[-1], p[-1, -1] = self._sum / max(self._count, 1.0), PRIOR_STD**2 / (1.0 + self._count)
+        return GaussianState(x, p)
 
     def of_recording(self) -> GaussianState:
-        return self._with_mean(self._given.base.of_recording())
+        return self.state()
 
     @property
     def counts(self) -> ModelCounts:
-        return self._given.base.counts
+        return ModelCounts(int(self._count), 0, 3.0, 3.0, 0)
 
     def states_at(self, trace, numbers, stamps_ns):
-        base, used, nis_sum = self._given.base.states_at(trace, numbers, stamps_ns)
-        extended = [self._with_mean(GaussianState(*each)) for each in zip(*base, strict=True)]
-        return GaussianState(np.array([s.x for s in extended]), np.array([s.p for s in extended])), used, nis_sum
+        n, (x, p) = len(stamps_ns), self.state()
+        used = np.full(n, self.counts.used)
+        return GaussianState(np.stack([x] * n), np.stack([p] * n)), used, 3.0 * used
 
     def held_out_error(self, judge, rotation_dvl_from_body):
-        return self._given.base.held_out_error(judge, rotation_dvl_from_body)
+        return None
 
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
-        return self._given.base.held_out_terms(n_days)
+        return [[NO_TERMS] * n_days] * FOLDS

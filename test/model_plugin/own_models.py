@@ -1,7 +1,7 @@
 """A linear model, which is one entry, and the entry of a model that an estimator of its own finds (own_estimators.py).
 
-W1: M1 with the scale known, so three angles alone. Y1: G1, and by how much the reference is wrong in the vertical all
-along.
+W1: M1 with the scale known, so three angles alone. Y1: by how much the reference is wrong in the vertical, and
+nothing of the mounting.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import numpy as np
 
 from dvl_calib_ros.calibration.models import Model, Needs, Nuisance
 from dvl_calib_ros.calibration.models.base import SHOWN_WITH_GNSS, Observations
-from dvl_calib_ros.calibration.models.own import G1_NUISANCE, SCALE_PER_AXIS, linearise_g1
 
 PRIOR_STD = 0.1
 
@@ -29,12 +28,9 @@ W1 = Model(
 )  # fmt: skip
 
 Y1 = Model(
-    "Y1", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS,
-    assumes="as G1, with a reference that is wrong in the vertical all along",
+    "Y1", Needs.REFERENCE, 3, _angles, SHOWN_WITH_GNSS,
+    assumes="a reference that is wrong in the vertical all along",
     wrong_when="it heaves",
-    scale_axes=SCALE_PER_AXIS,
-    nuisance=(*G1_NUISANCE, Nuisance("reference_up", "m/s", PRIOR_STD)),
-    in_correction_parameters=True,
-    extends="G1",
+    nuisance=(Nuisance("reference_up", "m/s", PRIOR_STD),),
     estimator="own_estimators:MeanRise",
 )  # fmt: skip

@@ -121,7 +121,7 @@ def test_a_survey_is_the_same_for_a_seed_and_its_judge_sees_what_is_wrong(tmp_pa
         "seed": 7,
         "verdict": "reject",
         "reason": "",
-        "model": "G1",
+        "model": "full",
         "off_deg": [9.0, 0.6, 0.4],
         "std_deg": [0.1] * 3,
         "asked": False,

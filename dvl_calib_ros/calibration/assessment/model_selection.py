@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..models import EXTENDED_BY, WITH_HEADINGS, WITH_POSITIONS
+from ..models import WITH_HEADINGS, WITH_POSITIONS
 from ..models.parameters import AUTO, IAC, Parameters
 from ..numerics.samples import Mask, Stamps
 from ..results.results import Segment
@@ -68,35 +68,19 @@ class GnssAvailability:
 
 
 class Evidence(NamedTuple):
-    """For the model that extends another: chi-square of what only it has, or the share of a variance that only it knows
-    of; and what of the other model that says: the code of a reason, and its numbers beside the model. pairs_elsewhere:
-    it finds references that pairing, at the stamps as they are, does not.
+    """What an estimator has to say to the selection: the code of a reason with its numbers, '' for none yet.
+
+    pairs_elsewhere: it finds references that pairing, at the stamps as they are, does not.
     """
 
-    chi_square: float
-    code: str = "NO_EVIDENCE"
+    code: str = ""
     numbers: Mapping[str, Any] = {}
     pairs_elsewhere: bool = False
 
 
-NO_EVIDENCE = Evidence(0.0)
-# Chi-square (four degrees of freedom at most) from which the extending model is taken, and below which it is left: by
-# chance 30 comes once in 200 000 times, and an effect of a few σ that comes and goes does not flap the output.
-EXTENDED_FROM, EXTENDED_UNTIL = 30.0, 15.0
-
-
-# Evidence comes with every block of 10 s in which there is a reference; without it for so long, there is none.
-EVIDENCE_HOLDS_NS = 12_000_000_000
-
-
-class _Positions(NamedTuple):
-    """That the model of positions is to be taken, and why."""
-
-    evidence: Evidence
-
-
-def _why(evidence: Evidence) -> Reason:
-    return finding(evidence.code, **evidence.numbers)
+NO_EVIDENCE = Evidence()
+# References that are found elsewhere come with every block of 10 s; without them for so long, there are none.
+REFERENCED_NS = 12_000_000_000
 
 
 class Selection:
@@ -105,29 +89,21 @@ class Selection:
     def __init__(self) -> None:
         self.gnss = GnssAvailability()
         self.segments: list[Segment] = []
-        self._evidence = NO_EVIDENCE
-        self._extended = False
         self._referenced_until_ns = 0
         self._headings = self._trimmed = False
         self._by_positions: Evidence | None = None
         # what is to be taken note of once DVL samples reach its stamp: evidence, or that headings show the current
-        self._coming: deque[tuple[int, Evidence | _Positions | None]] = deque()
+        self._coming: deque[tuple[int, Evidence | None]] = deque()
 
-    def extend(self, from_ns: int, evidence: Evidence) -> None:
-        """From this stamp on, go by this evidence for the model that extends the one with GNSS."""
-        self._note(from_ns, evidence)
+    def take(self, from_ns: int, evidence: Evidence) -> None:
+        """From this stamp on, go by what an estimator says: of references elsewhere, or that positions are better."""
+        if evidence.code or evidence.pairs_elsewhere:
+            insort(self._coming, (from_ns, evidence), key=lambda each: each[0])
 
     def headings_show_the_current(self, from_ns: int, trimmed: bool = False) -> None:
         """From this stamp on, a model with attitude can do without GNSS. trimmed: it is the trim that asks for it."""
         self._trimmed = trimmed
-        self._note(from_ns, None)
-
-    def go_by_positions(self, from_ns: int, evidence: Evidence) -> None:
-        """From this stamp on, go by the model of positions, for what velocities made of them are worth."""
-        self._note(from_ns, _Positions(evidence))
-
-    def _note(self, from_ns: int, what: Evidence | _Positions | None) -> None:
-        insort(self._coming, (from_ns, what), key=lambda each: each[0])
+        insort(self._coming, (from_ns, None), key=lambda each: each[0])
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         """Take note of DVL samples (N,), in order of stamps, and of whether they were paired."""
@@ -139,24 +115,17 @@ class Selection:
             stamps_ns, paired = stamps_ns[at:], paired[at:]
             if evidence is None:
                 self._headings = True
-                self.record(int(stamps_ns[0]), parameters)
-                continue
-            if isinstance(evidence, _Positions):
-                self._by_positions = evidence.evidence
-                self.record(int(stamps_ns[0]), parameters)
-                continue
-            self._evidence = evidence
-            self._referenced_until_ns = from_ns + EVIDENCE_HOLDS_NS
-            extended = evidence.chi_square >= (EXTENDED_UNTIL if self._extended else EXTENDED_FROM)
-            if extended != self._extended:
-                self._extended = extended
-                self.record(int(stamps_ns[0]), parameters)
+            elif evidence.pairs_elsewhere:
+                self._referenced_until_ns = from_ns + REFERENCED_NS
+            else:
+                self._by_positions = evidence
+            self.record(int(stamps_ns[0]), parameters)
         if len(stamps_ns):
             self._update(stamps_ns, paired, parameters)
 
     def _update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
-        if self._extended and self._evidence.pairs_elsewhere and parameters.model == AUTO:
+        if parameters.model == AUTO:
             paired = paired | (stamps_ns < self._referenced_until_ns)
         if self.segments and self.gnss.stays_with(stamps_ns, paired):
             return
@@ -184,8 +153,6 @@ class Selection:
             return WITH_POSITIONS
         if not self.gnss.available:
             return WITH_HEADINGS.get(unaided, unaided) if parameters.model == AUTO and self._headings else unaided
-        if parameters.model == AUTO and self._extended:
-            return EXTENDED_BY.get(aided, aided)
         return aided
 
     def iac_model(self, parameters: Parameters) -> str:
@@ -193,20 +160,18 @@ class Selection:
         aided, unaided = published_models(parameters)
         return aided if self.gnss.available else unaided
 
-    def reason(self, parameters: Parameters, evidence: Evidence | None = None) -> Reason:
-        """Why it is that model. evidence: as it is now, for a model that extends another; None: as it was noted."""
+    def reason(self, parameters: Parameters) -> Reason:
+        """Why it is that model."""
         if parameters.model not in (AUTO, IAC):
             return finding("MODEL_NAMED")
         chosen = {"by": parameters.model, "gnss": self.gnss.reason}
         if parameters.model == AUTO and self._by_positions is not None:
-            return finding("MODEL_CHOSEN_AS", **chosen, why=_why(self._by_positions))
+            why = finding(self._by_positions.code, **self._by_positions.numbers)
+            return finding("MODEL_CHOSEN_AS", **chosen, why=why)
         if parameters.model == AUTO and not self.gnss.available and parameters.gnss_free_model in WITH_HEADINGS:
             headings = "TRIM_KNOWN" if self._trimmed else "HEADINGS_TELL_CURRENT"
             return finding("MODEL_CHOSEN_AS", **chosen, why=finding(headings if self._headings else "HEADINGS_TOO_FEW"))
-        if parameters.model == IAC or self.model(parameters) != EXTENDED_BY.get(parameters.gnss_model):
-            return finding("MODEL_CHOSEN", **chosen)
-        seen = evidence or self._evidence
-        return finding("MODEL_CHOSEN_AS", **chosen, why=finding(seen.code, model=parameters.gnss_model, **seen.numbers))
+        return finding("MODEL_CHOSEN", **chosen)
 
 
 def published_models(parameters: Parameters) -> tuple[str, str]:

@@ -8,10 +8,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..filters.day_to_day_covariance import OFFSETS, OFTEN_OFF
 from ..models.parameters import Parameters
 from ..results.mounting_quantities import date
-from ..results.results import ARM, Day, Estimate
+from ..results.results import ARM, OFFSETS, Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
@@ -19,6 +18,8 @@ SUSPICIOUS_GATED = 0.2
 ENOUGH_SAMPLES = 20
 # Share of DVL velocities that repeat the one before exactly above which its driver hangs.
 SUSPICIOUS_REPEATED = 0.05
+# References are off by so many times `reference_offset_std` without being broken.
+OFTEN_OFF = 4.0
 # A constant error of the reference is said if it is larger than this, m/s, and than so many σ.
 OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
 # It is not told apart from the mounting where yaw takes this share of it.

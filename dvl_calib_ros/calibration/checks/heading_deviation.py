@@ -1,7 +1,7 @@
-"""Whether the heading is off by an amount that changes with the heading, or with time, as no mounting does.
+"""Check of the heading for a deviation that changes with the heading or drifts.
 
-Yaw is found against the IMU's heading, of which a constant error is harmless: the same IMU navigates. How it deviates
-beside that is estimated with the mounting (filters/heading_bias.py); here it is judged on the headings driven.
+A constant error of the IMU's heading is harmless, because the same IMU navigates. `full` estimates the deviation with
+the mounting; this check judges it on the headings driven.
 """
 
 from __future__ import annotations

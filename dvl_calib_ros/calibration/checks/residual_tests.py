@@ -23,14 +23,13 @@ import numpy as np
 
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
-from ..filters.day_to_day_covariance import OFFSETS
 from ..models import MODELS
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import alike_of, of_few
 from ..numerics.frames import Array, cross, skew
 from ..numerics.robust import median, robust_std
 from ..numerics.samples import Index
-from ..results.results import ARM, Estimate
+from ..results.results import ARM, OFFSETS, Estimate
 from .imu_rate_consistency import LEVEL_BELOW
 
 # Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.

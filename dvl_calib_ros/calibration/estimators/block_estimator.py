@@ -17,11 +17,10 @@ from typing import ClassVar
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..assessment.model_selection import EXTENDED_FROM, NO_EVIDENCE, Evidence
-from ..filters.cross_validation import HeldOutError, Moments
+from ..assessment.model_selection import Evidence
+from ..filters.cross_validation import FOLDS, HeldOutError, Moments
 from ..filters.filter_bank import ModelCounts
 from ..filters.filter_setup import prior
-from ..filters.heading_bias import BiasCovariance
 from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models.own import BIAS, DELAY, LEVER_ARM, N_STATE, PHI, REFERENCE_ERROR
 from ..numerics.frames import Array
@@ -29,8 +28,9 @@ from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
 from ..numerics.tables import RowTable
 from ..registration.registration import Registration
+from ..results.bias_covariance import BiasCovariance
 from ..results.results import Day
-from ..results.thinned_recording import Terms, ThinnedBlock, ThinnedRecording
+from ..results.thinned_recording import NO_TERMS, Terms, ThinnedBlock, ThinnedRecording
 from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
 from .block_preprocessing import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
@@ -49,6 +49,8 @@ SOLVED_WITHIN_NS = 1_000_000_000
 PAIRED_WITHIN_S = 0.3
 # A state is shown by the data once these have halved its prior σ.
 SHOWN_SHARE = 0.5
+# The lever arm is said to look like an angle when that makes so many times the rest of the angle's variance.
+ARM_SHARE = 30.0
 # What the reference's clock leaves open, in the order of `Registration.left_open`.
 _OPEN: Index = np.r_[PHI, LEVER_ARM, DELAY]
 
@@ -72,9 +74,7 @@ class FullEstimator(Estimator):
 
     def __init__(self, given: EstimatorSetup) -> None:
         """Start from the prior of the states."""
-        assert given.base is not None  # its entry says what it extends
         model, parameters, aligner = given.model, given.parameters, given.aligner
-        self._base = given.base
         self._parameters = parameters
         self._aligner = aligner
         self._on_block = given.on_evidence
@@ -85,7 +85,6 @@ class FullEstimator(Estimator):
             registration=given.registration,
         )  # fmt: skip
         self._worker = AtOnce() if given.worker is None else given.worker
-        self._state_names = model.state_names
         # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._dvl = _PendingDvl()
@@ -133,9 +132,8 @@ class FullEstimator(Estimator):
 
     @property
     def counts(self) -> ModelCounts:
-        """Samples used, spikes and those far from all others, and their mean squared misfit; without data those of the
-        model that this extends."""
-        return self._told.counts if self.claims else self._base.counts._replace(restarted=self._told.counts.restarted)
+        """Samples used, spikes and those far from all others, and their mean squared misfit."""
+        return self._told.counts
 
     @property
     def claims(self) -> bool:
@@ -145,7 +143,7 @@ class FullEstimator(Estimator):
     @property
     def heading_deviation(self) -> GaussianState | None:
         """As `Estimator`."""
-        return deviation_of(self.state()) if self.claims else self._base.heading_deviation
+        return deviation_of(self.state()) if self.claims else None
 
     def state(self) -> GaussianState:
         """The state by the blocks so far."""
@@ -226,11 +224,8 @@ class FullEstimator(Estimator):
 
     @property
     def evidence(self) -> Evidence:
-        """As `Estimator`: with attitude and angular velocity there is nothing that it does not know better."""
-        if not self.claims:
-            return NO_EVIDENCE
-        is_late = abs(float(self.state().x[DELAY])) > PAIRED_WITHIN_S
-        return Evidence(2.0 * EXTENDED_FROM, "FULL_HAS_DATA", pairs_elsewhere=is_late)
+        """As `Estimator`."""
+        return Evidence(pairs_elsewhere=self.claims and abs(float(self.state().x[DELAY])) > PAIRED_WITHIN_S)
 
     @property
     def doubt(self) -> Reason | None:
@@ -243,7 +238,7 @@ class FullEstimator(Estimator):
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, PHI])  # (lever arm, misalignment)
         by_arm = (p[PHI, LEVER_ARM] * turns.T).sum(axis=1)
         rest = np.maximum(np.diag(p)[PHI] - by_arm, 1e-12)
-        if not self.claims or (by_arm / rest).max() < EXTENDED_FROM:
+        if not self.claims or (by_arm / rest).max() < ARM_SHARE:
             return None
         index = int(np.argmax(by_arm / rest))
         degrees = abs(0.1 * math.degrees(np.abs(turns[:, index]).max()))
@@ -464,7 +459,7 @@ class FullEstimator(Estimator):
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
         """For every fold what it corrects on every day, had it not seen that fold."""
         if not self.claims:
-            return self._base.held_out_terms(n_days)
+            return [[NO_TERMS] * n_days] * FOLDS
         return [[Terms.of_state(state.x) for state in states] for states in self._idle_solver().fit.without_folds()]
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:

@@ -78,6 +78,7 @@ class BlockSolver:
         self.fit = JointFit(parameters, prior, unknown)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
+        self._has_imu = False
         self._seen_ahead = self._seen_upwards = False  # whether references measure along these axes of the body
         self._dvl_stream = DvlStream()
         self._turned = False
@@ -151,6 +152,9 @@ class BlockSolver:
             return self.outcome()
         self._spikes += streams.dvl_spikes
         self._look_at(streams)
+        self._has_imu = self._has_imu or len(streams.imu.times) > 0
+        if not self._has_imu and streams.reference.in_body.all():
+            streams = streams._replace(imu=_as_if_still(streams.block, self.epoch_ns))
         if len(streams.dvl.times) < FEWEST_DVL or len(streams.imu.times) < 2:
             return self.outcome()
         try:
@@ -203,6 +207,13 @@ class BlockSolver:
         p = self._parameters
         times, reference_times = streams.dvl.times[at] + p.dvl_time_offset, streams.reference.times
         self._shared_noise.add(times, in_the_body, reference_times + p.reference_time_offset, reference)
+
+
+def _as_if_still(block: Block, epoch_ns: int) -> ImuColumns:
+    """What takes the place of an IMU that is not there, beside a reference in the body's own axes: no turning."""
+    from_s, end_s = seconds(np.array([block.from_ns, block.end_ns]), epoch_ns).tolist()
+    times = np.arange(from_s - MARGIN_S, end_s + MARGIN_S, IMU_EVERY_S)
+    return ImuColumns(times, np.full((len(times), 4), np.nan), np.zeros((len(times), 3)))
 
 
 def _thinned_imu(imu: ImuColumns, from_s: float, end_s: float) -> ImuColumns:

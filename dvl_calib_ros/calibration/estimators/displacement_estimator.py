@@ -191,9 +191,7 @@ class Displacements(Estimator):
         if self._told.fit is None:
             return NO_EVIDENCE
         noise = self._told.noise_mps
-        return Evidence(noise, "POSITIONS_NOISY", {"noise": noise}) if noise < math.inf else Evidence(
-            noise, "POSITIONS_SELDOM"
-        )  # fmt: skip
+        return Evidence("POSITIONS_NOISY", {"noise": noise}) if noise < math.inf else Evidence("POSITIONS_SELDOM")
 
     def remember(self, from_ns: int) -> None:
         """As `Estimator`."""

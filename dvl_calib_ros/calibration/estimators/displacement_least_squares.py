@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..filters.heading_bias import N_HEADING
 from ..models.parameters import Parameters
 from ..numerics.error_model import correction_matrix
 from ..numerics.frames import Array, rotation_from_quaternion
@@ -356,6 +355,8 @@ class Legs(NamedTuple):
 
 
 # Columns of what is summed up: way, and what a deviation of the heading turns it by.
+# Coefficients of the heading's deviation: one and two cycles, and a drift.
+N_HEADING = 5
 N_SUMS = 27 + 3 * N_HEADING
 _WAY, _DRIFTED = slice(0, 27), slice(27, N_SUMS)
 

@@ -19,7 +19,6 @@ from ..assessment.dead_reckoning import Navigation
 from ..assessment.model_selection import NO_EVIDENCE, Evidence
 from ..filters.cross_validation import HeldOutError, Moments, held_out_error
 from ..filters.filter_bank import Group, ModelCounts
-from ..filters.heading_bias import BiasCovariance
 from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models import Model
 from ..models.parameter_spec import ParameterError
@@ -29,6 +28,7 @@ from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, Stamps
 from ..registration.registration import Registration
+from ..results.bias_covariance import BiasCovariance
 from ..results.results import Day
 from ..results.thinned_recording import Terms, ThinnedRecording
 from ..streams.aligner import Aligner
@@ -40,17 +40,15 @@ NEVER = 2**63 - 1
 class EstimatorSetup:
     """What an estimator of a model is made with.
 
-    base: the estimator of the model that this one extends; None where it extends none. initial: a state to start from,
-    of the model. on_evidence: to be told, once something new takes effect, of the stamp from which on DVL samples may
-    go by it. verified: keep what hold-out needs. worker: does what would hold up live messages; None: at once.
-    together: how many blocks of time may be gathered before they are looked at, unless somebody asks. registration: how
-    the instruments stand, where that is known.
+    initial: a state to start from, of the model. on_evidence: to be told, once something new takes effect, of the
+    stamp from which on DVL samples may go by it. verified: keep what hold-out needs. worker: does what would hold up
+    live messages; None: at once. together: how many blocks of time may be gathered before they are looked at, unless
+    somebody asks. registration: how the instruments stand, where that is known.
     """
 
     model: Model
     parameters: Parameters
     aligner: Aligner
-    base: Estimator | None
     initial: GaussianState | None
     on_evidence: Callable[[int], None]
     verified: bool
@@ -64,7 +62,7 @@ class Estimator(ABC):
 
     @property
     def claims(self) -> bool:
-        """Whether the estimate is its own, else it is that of the model that it extends."""
+        """Whether there are any data of its own."""
         return True
 
     @property
@@ -89,7 +87,7 @@ class Estimator(ABC):
 
     @property
     def heading_deviation(self) -> GaussianState | None:
-        """Coefficients x (5,), P (5, 5) of how the heading deviates, as of `heading_states.HeadingStates`; None."""
+        """Coefficients x (5,), P (5, 5) of how the heading deviates, as `Estimate.heading_deviation`; None."""
         return None
 
     @property
@@ -144,7 +142,7 @@ class Estimator(ABC):
 
     @property
     def evidence(self) -> Evidence:
-        """How much speaks for it against the model that it extends."""
+        """What it has to say to the selection."""
         return NO_EVIDENCE
 
     @property
@@ -243,11 +241,6 @@ class LinearEstimator(Estimator):
         return self._group.state(self._model.name)
 
     @property
-    def heading_deviation(self) -> GaussianState | None:
-        """As `Estimator`."""
-        return self._group.heading_deviation(self._model.name)
-
-    @property
     def counts(self) -> ModelCounts:
         """As `Estimator`."""
         return self._group.counts(self._model.name)
@@ -256,12 +249,6 @@ class LinearEstimator(Estimator):
         """As `Estimator`."""
         self._update(self._group)
         return self._group.of_recording(self._model.name)
-
-    @property
-    def of_bias(self) -> BiasCovariance:
-        """As `Estimator`."""
-        self._update(self._group)
-        return self._group.of_bias(self._model.name)
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
         """As `Estimator`."""

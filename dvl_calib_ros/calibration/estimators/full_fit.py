@@ -71,13 +71,11 @@ class Priors:
     """What is known of slow errors before any data, as navigators state it of their instruments.
 
     horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s. heading, tilt: of an AHRS, rad.
-    memory: 10 to 300 s (90 %). climb: vertical speed of a vehicle whose reference measures none, m/s. deviation: share
-    of `heading_deviation_std` that the cycles of the heading have.
+    memory: 10 to 300 s (90 %). deviation: share of `heading_deviation_std` that the cycles of the heading have.
     """
 
     horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
     vertical: LogNormal = field(default_factory=lambda: LogNormal(0.018, 1.7))
-    climb: LogNormal = field(default_factory=lambda: LogNormal(0.02, 3.0))
     heading: LogNormal = field(default_factory=lambda: LogNormal(0.21 * DEG, 1.7))
     tilt: float = 0.1 * DEG
     memory: LogNormal = field(default_factory=lambda: LogNormal(55.0, 2.8))
@@ -137,7 +135,6 @@ class JointFit:
         self._days = [_Day()]
         self._x = prior.x.copy()  # of vehicle and days
         self._linear = self._x.copy()  # the point of linearisation
-        self._is_climbing = False
         self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
         self._slow, self._deviation, self._log_prior = self._points()
         self.used = self._gated = self._left_out = 0
@@ -148,7 +145,7 @@ class JointFit:
         """Slow errors (C, 6), by how much the heading deviates more than its prior (C,), and the logarithm (C,) of how
         much more likely each point is by the prior than by how points are drawn: about what the data have shown."""
         p = self._priors
-        levels = p.horizontal, p.climb if self._is_climbing else p.vertical, p.heading, p.memory, p.deviation
+        levels = p.horizontal, p.vertical, p.heading, p.memory, p.deviation
         median, factor = np.array(levels).T
         at = _UNIT_POINTS + self._centre
         horizontal, vertical, heading, memory, deviation = (median * factor**at).T
@@ -259,7 +256,6 @@ class JointFit:
     def _renew(self) -> None:
         """Gauss-Newton about the newest estimate, over all blocks whose streams are kept."""
         self._forget()
-        self._look_at_vertical()
         self._search_delay(self._days[-1])
         for _ in range(STEPS):
             self._linearise()
@@ -288,14 +284,6 @@ class JointFit:
                         for fold, each in enumerate(before, start=-1)
                     ]
                 day.before = before
-
-    def _look_at_vertical(self) -> None:
-        """Whether the vertical is mostly that of a vehicle that holds its depth, not of a reference."""
-        measured = [block.measured[:, 2] for day in self._days for block in day.blocks]
-        is_climbing = 2 * sum(int(each.sum()) for each in measured) < sum(len(each) for each in measured)
-        if is_climbing != self._is_climbing and all(day.before is None for day in self._days):
-            self._is_climbing = is_climbing
-            self._slow, self._deviation, self._log_prior = self._points()
 
     def _search_delay(self, day: _Day) -> None:
         """Begin from the DVL's delay that fits clearly better than the one so far, if there is one."""

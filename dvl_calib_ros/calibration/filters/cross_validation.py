@@ -106,11 +106,8 @@ class FoldInformation:
             some = rows.take(at, axis=3)
             weighted = some * weight[:, None, None, at]
             flat = (*some.shape[:2], -1)
-            self.add_told(fold, weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2))
-
-    def add_told(self, fold: int | slice, told: Array) -> None:
-        """Add what rows (H, z) of one fold told (K, n+1, n+1), or of several (F, ...)."""
-        self._told.add(fold, told[..., :-1, :-1], told[..., :-1, -1])
+            told = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
+            self._told.add(fold, told[..., :-1, :-1], told[..., :-1, -1])
 
     def without(self, fold: int) -> tuple[Array, Array]:
         """Λ (K, n, n) and Λx (K, n) had they not seen a fold."""

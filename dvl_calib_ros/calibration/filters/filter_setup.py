@@ -11,7 +11,6 @@ from ..models import Model
 from ..models.base import Observations, Unmeasured
 from ..models.parameters import Parameters
 from ..numerics import kalman
-from ..numerics.error_model import PriorOnErrors, of_unseen_roll, to_correction, to_errors
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Mask
@@ -38,17 +37,8 @@ class Assembler:
         begun = initial or {}
         self._starts = [begun.get(model.name) or known for model, known in zip(self.models, priors, strict=True)]
         self._floors = [_floor(model, parameters) for model in self.models]
-        self._roll = of_unseen_roll(parameters.rotation_dvl_from_body)
-        held = [
-            to_correction(state, self._roll) if model.in_correction_parameters else _without(floor, state)
-            for model, floor, state in zip(self.models, self._floors, self._starts, strict=True)
-        ]
+        held = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
         self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
-        self._prior_on_errors = {
-            index: PriorOnErrors(held[index], self._starts[index], self._roll)
-            for index, model in enumerate(self.models)
-            if model.in_correction_parameters
-        }
         # by how many of its rows are left where axes of the reference are not measured
         self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m + 1)])
         self._gate = np.full((len(self.models), 1), self._gates[0])
@@ -59,19 +49,10 @@ class Assembler:
             rate[index, : model.n_errors, : model.n_errors] = np.diag(np.square(std))
         self.process_rate = rate if rate.any() else None
 
-    def start_of(self, index: int) -> GaussianState:
-        """State and covariance that one model starts from."""
-        return self._starts[index]
-
     def state(self, index: int, x: Array, p: Array) -> GaussianState:
         """One model's state and covariance out of the filter's x (..., n) and P (..., n, n)."""
-        held = GaussianState(x.copy(), p.copy())
-        if not self.models[index].in_correction_parameters:
-            floor = self._floors[index]
-            return held if floor is None else GaussianState(held.x, held.p + floor)
-        if self.process_rate is not None:  # what the prior still weighs is then not known
-            return to_errors(held, self._roll)
-        return self._prior_on_errors[index].to_errors(held)
+        floor = self._floors[index]
+        return GaussianState(x.copy(), p.copy() if floor is None else p + floor)
 
     def measurements(self, seen: Observations, weight: Array, prior_known: Mask) -> kalman.Measurements:
         """A block of N samples. weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool, whether prior sway and
@@ -81,9 +62,7 @@ class Assembler:
         z = np.empty((self._m, k, n_samples)).transpose(1, 2, 0)
         h = np.zeros((self._m, self._n, k, n_samples)).transpose(2, 3, 0, 1)
         for index, model in enumerate(self.models):
-            # a model that extends another has columns for what that has; the rest is not shown sample by sample
-            z[index], own = model.linearise(seen)
-            h[index, :, :, : own.shape[2]] = own
+            z[index], h[index] = model.linearise(seen)
         usable = ~self._needs_prior[:, None] | prior_known
         noise = (seen.noise if self._model_noise is None else self._model_noise(seen))[None, :, : self._m, : self._m]
         own_weight = (seen.motion_weight if self._motion_is_noise else weight)[None]
@@ -91,15 +70,6 @@ class Assembler:
             return kalman.Measurements(z, h, noise, own_weight, usable, self._gate)
         noise, gate = self._drop_unmeasured(z, h, noise, seen, seen.unmeasured)
         return kalman.Measurements(z, h, noise, own_weight, usable, gate)
-
-    def heave_rows(self, seen: Observations) -> Array:
-        """(H, z) (N, K, n+1) of models that have `Model.heave`."""
-        rows = np.zeros((len(seen.velocity_dvl), len(self.models), self._n + 1))
-        for index, model in enumerate(self.models):
-            assert model.heave is not None
-            own = model.heave(seen)  # as in `measurements`
-            rows[:, index, : own.shape[1] - 1], rows[:, index, -1] = own[:, :-1], own[:, -1]
-        return rows
 
     def rows_left(self, unmeasured: Unmeasured) -> Array:
         """Rows that each model is told by each sample (K, N)."""
@@ -118,9 +88,7 @@ class Assembler:
             at = np.flatnonzero(axes.any(axis=1))
             if not len(at):
                 continue
-            turned = unmeasured.rotation_reference_from_body[at]
-            if not model.rows_in_body:
-                turned = turned @ seen.rotation_dvl_from_body.T
+            turned = unmeasured.rotation_reference_from_body[at] @ seen.rotation_dvl_from_body.T
             kept = ~axes[at]
             z[index, at] = np.einsum("nij,nj->ni", turned, z[index, at]) * kept
             h[index, at] = turned @ h[index, at] * kept[:, :, None]

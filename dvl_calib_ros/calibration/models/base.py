@@ -61,12 +61,9 @@ class Model:
     What a model may change of how it is filtered: noise: observations -> its own R (N or 1, 3, 3) (m/s)², of which a
     model with fewer rows uses the first ones; None: `Observations.noise`. vertical_from_reference: it takes the
     reference's vertical velocity for a measurement, so does without where there is none (M3 and M4 assume their own).
-    heave: observations -> (H, z) (N, n+1) of what holds of heave in the mean, see vertical_motion.py. rows_in_body:
-    its three rows are those of the body, else those of the DVL. motion_is_noise: its noise is the vehicle's motion, so
-    samples count by `Observations.motion_weight`. in_correction_parameters: its filter's first
-    five states are those of the correction, see `correction_parameters`. extends: the model whose states its own begin
-    with, and which it equals while the data show nothing more. estimator: "module:class" of the `Estimator` that finds
-    its states, '' for the linear filter.
+    motion_is_noise: its noise is the
+    vehicle's motion, so samples count by `Observations.motion_weight`. estimator: "module:class" of the `Estimator`
+    that finds its states, '' for the linear filter.
     sideslip_std: σ (rad) about the body's yaw axis that no data of this model can take away, and that is in its P; 0
     for none. uses_height: it wants `Observations.height`. instead_of: the model that `auto` leaves for this one once
     headings show the current (heading_diversity.py). from_positions: it goes by positions, not by velocities made of
@@ -84,12 +81,8 @@ class Model:
     needs_prior: bool = False
     nuisance: tuple[Nuisance, ...] = ()
     noise: Callable[[Observations], Array] | None = None
-    heave: Callable[[Observations], Array] | None = None
     motion_is_noise: bool = False
     vertical_from_reference: bool = False
-    rows_in_body: bool = False
-    in_correction_parameters: bool = False
-    extends: str | None = None
     estimator: str = ""
     instead_of: str | None = None
     sideslip_std: float = 0.0
@@ -256,13 +249,6 @@ class Observations:
     def velocity_in_body(self) -> Array:
         """Tᵀv: measured velocity at the reference point, turned by the nominal mounting (N, 3) m/s, body frame."""
         return self.velocity_at_reference @ self.rotation_dvl_from_body
-
-    @cached_property
-    def off(self) -> Array:
-        """Reference less measured velocity (N, 3) m/s, DVL frame; zeros without a reference."""
-        if self.reference_body is None:
-            return np.zeros_like(self.velocity_dvl)
-        return self.reference.r - self.velocity_dvl
 
     @cached_property
     def rising(self) -> Array:

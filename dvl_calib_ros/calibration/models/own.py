@@ -1,90 +1,11 @@
-"""Models of our own: G1, F1, A1, and the entries of `full` and D1."""
+"""Models of our own: F1, A1, and the entries of `full` and D1."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..numerics.error_model import ALONG_FROM
 from ..numerics.frames import Array, skew, turned_skew
-from ..numerics.samples import Mask
 from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuisance, Observations
-
-# A DVL axis shows its scale from this speed along it, m/s: a DVL noise of 0.01 m/s then pulls by 0.1 per cent at most,
-# while a scale error of 0.5 per cent that is left out costs 1.5 mm/s.
-# ... and, of a vehicle that is so fast, one that is along its way by ALONG_FROM: whether the velocity is along it says
-# each sample's own noise as well, and of samples chosen by their noise a mean is off by that.
-SCALE_SHOWN_FROM = 0.3
-
-
-def linearise_g1(seen: Observations) -> Linearised:
-    """z = g - Tᵀv, H = [Tᵀ[v×], -Tᵀdiag(v), 0, E] on ψ, κ, h, o; body frame.
-
-    The models of the paper put the noisy GNSS velocity r into H: noise in a regressor pulls its coefficient, here the
-    scale, down ("errors in variables"). Here the correction itself is estimated,
-
-        T v_b = (I - [ψ×] - diag(κ)) v,
-
-    with the DVL's v, twenty times less noisy, in H; what pull is left is σ_dvl²/‖v‖². It is exactly linear in ψ and
-    κ; `correction_parameters` turns them into φ and δk.
-
-    An axis says nothing of its scale while it moves so slowly that its own noise would pull (SCALE_SHOWN_FROM). The
-    heave h is only in the rows of `g1_heave`.
-
-    A reference in an earth frame is wrong by a constant o (east, north) beside its noise: an inertial navigation by
-    some mm/s all along. On one heading no data tell it from yaw and scale, and σ says so; over several it is found
-    (E: its axes in the body). Of one in the body frame no such thing is assumed.
-    """
-    assert seen.reference_body is not None
-    body_from_dvl = seen.rotation_dvl_from_body.T
-    v = seen.velocity_dvl.T
-    # in memory the samples of each element follow each other, as those work on them who are given it
-    h = np.zeros((3, 8, v.shape[1]))
-    h[:, :5] = g1_errors(body_from_dvl, v)
-    if seen.earth_in_body is not None:
-        h[:, 6:] = seen.earth_in_body.transpose(1, 2, 0)
-    return seen.reference_body - seen.velocity_in_body, h.transpose(2, 0, 1)
-
-
-def g1_errors(body_from_dvl: Array, v: Array) -> Array:
-    """[Tᵀ[v×], -Tᵀdiag(v)] (3, 5, N) of velocities v (3, N) m/s in the DVL's frame, as in `linearise_g1`."""
-    h = np.empty((3, 5, v.shape[1]))
-    h[:, :3] = turned_skew(body_from_dvl, v)
-    h[:, 3:] = -body_from_dvl[:, :2, None] * np.where(_show_scale(body_from_dvl, v), v, 0.0)[:2]
-    return h
-
-
-def g1_heave(seen: Observations) -> Array:
-    """(H, z) (N, 9) of 0 = g_z - h, of which `heave.HeaveRows` takes means: z = -(Tᵀv)_z, body frame.
-
-    κ acts on level motion only: what is assumed to be near zero must not be read as a scale that makes it so.
-    """
-    row = np.zeros((9, len(seen.velocity_dvl)))
-    row[:5] = g1_heave_errors(seen.rotation_dvl_from_body.T, seen.velocity_dvl.T)
-    row[5] = -1.0
-    row[8] = -seen.velocity_in_body[:, 2]
-    return row.T
-
-
-def g1_heave_errors(body_from_dvl: Array, v: Array) -> Array:
-    """What ψ and κ are to `g1_heave` (5, N), of velocities v (3, N) m/s in the DVL's frame."""
-    level = body_from_dvl.T[:2, :2] @ (body_from_dvl[:2] @ v)
-    row = np.empty((5, v.shape[1]))
-    row[:3] = turned_skew(body_from_dvl[2:], v)[0]
-    row[3:] = -body_from_dvl[2, :2, None] * np.where(_show_scale(body_from_dvl, v)[:2], level, 0.0)
-    return row
-
-
-def _show_scale(body_from_dvl: Array, v: Array) -> Mask:
-    """Whether axes show their scale by velocities (3, N) m/s in the DVL's frame."""
-    square, along = v * v, np.abs(body_from_dvl[0]) > ALONG_FROM
-    fast = square.sum(axis=0) > SCALE_SHOWN_FROM**2
-    return np.asarray((along[:, None] & fast) | (square > SCALE_SHOWN_FROM**2))
-
-
-def noise_in_body(seen: Observations) -> Array:
-    """R in the body's frame."""
-    return seen.noise_in_body
-
 
 # Sway of a vehicle that turns unseen, m/s
 UNSEEN_TURN_SWAY_STD = 0.1
@@ -162,26 +83,8 @@ def _a1_noise(seen: Observations) -> Array:
 
 
 SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
-# A constant heave, and by what the reference is wrong all along.
-G1_NUISANCE = (
-    Nuisance("heave", "m/s", "heave_offset_std"),
-    Nuisance("reference_east", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
-    Nuisance("reference_north", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
-)
 _SECOND_HEADING = "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)"
-OWN = (
-    Model(
-        "G1", Needs.REFERENCE, 3, linearise_g1, SHOWN_WITH_GNSS,
-        assumes="GNSS velocity, heave near a constant (trim); a scale error for x and one for y",
-        wrong_when="trimmed by more than heave_offset_std, or heaving for minutes beyond motion_std",
-        scale_axes=SCALE_PER_AXIS,
-        nuisance=G1_NUISANCE,
-        noise=noise_in_body,
-        heave=g1_heave,
-        vertical_from_reference=True,
-        rows_in_body=True,
-        in_correction_parameters=True,
-    ),
+WITHOUT_REFERENCE = (
     Model(
         "F1", Needs.NOTHING, 2, _f1, SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
         assumes="no GNSS; sway and heave near unknown constants, as large as current_std and heave_offset_std say",
@@ -234,7 +137,8 @@ def linearise_full(seen: Observations) -> Linearised:
     assert seen.reference_body is not None
     body_from_dvl = seen.rotation_dvl_from_body.T
     h = np.zeros((len(seen.velocity_dvl), 3, N_STATE))
-    h[:, :, :5] = g1_errors(body_from_dvl, seen.velocity_dvl.T).transpose(2, 0, 1)
+    h[:, :, PHI] = turned_skew(body_from_dvl, seen.velocity_dvl.T).transpose(2, 0, 1)
+    h[:, :, SCALE] = -body_from_dvl[:, :2] * seen.velocity_dvl[:, None, :2]
     h[:, :, BIAS] = -body_from_dvl
     if seen.angular_velocity is not None:
         h[:, :, LEVER_ARM] = -skew(seen.angular_velocity)
@@ -259,7 +163,8 @@ REFERENCE_DELAY_STD_S = 0.05
 
 FULL = Model(
     "full", Needs.REFERENCE, 3, linearise_full, SHOWN_WITH_GNSS | _SHOWN_TO_FULL,
-    assumes="attitude and angular velocity; a DVL anywhere on the vehicle whose stamps are off by up to 3 s",
+    assumes="attitude and angular velocity, or a reference in the body's frame; a DVL anywhere on the vehicle, stamps "
+    "off by up to 3 s",
     wrong_when="the delay changes along the run; a vehicle that bends",
     scale_axes=SCALE_PER_AXIS,
     nuisance=(
@@ -279,10 +184,7 @@ FULL = Model(
         Nuisance("reference_north", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
         Nuisance("reference_up", "m/s", "reference_offset_std", of_the_day=True, handed_on=False),
     ),
-    noise=noise_in_body,
-    vertical_from_reference=True,
-    rows_in_body=True,
-    extends="G1",
+    noise=lambda seen: seen.noise_in_body,
     estimator="dvl_calib_ros.calibration.estimators.block_estimator:FullEstimator",
 )  # fmt: skip
 

@@ -46,7 +46,7 @@ class Parameters:
         read_only=False,
     )
     gnss_model: str = _parameter(
-        "G1",
+        "full",
         "Model of auto with GNSS. iac: M3, or M4 if set here.",
         choices=_AIDED,
         read_only=False,
@@ -288,8 +288,7 @@ class Parameters:
     )
     motion_std: float = _parameter(
         ASSUMPTIONS.motion_std,
-        "Standard deviation of sway and heave about the model, straight ahead (A1, F1); of the mean heave of 20 s at "
-        "least (G1, full).",
+        "Standard deviation of sway and heave about the model, straight ahead (A1, F1).",
         unit="m/s",
         low=1e-4,
         high=10.0,
@@ -303,31 +302,29 @@ class Parameters:
     )
     heave_offset_std: float = _parameter(
         ASSUMPTIONS.heave_offset_std,
-        "Prior standard deviation of a constant heave, such as trim (G1, A1, F1).",
+        "Prior standard deviation of a constant heave, such as trim (A1, F1).",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     reference_offset_std: float = _parameter(
         0.005,
-        "Prior standard deviation, east and north, of a constant error of an earth-frame reference (G1, full). On one "
-        "heading σ of yaw and scale includes four times this.",
+        "Prior standard deviation, east, north and up, of a constant error of an earth-frame reference (full).",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     heading_deviation_std: float = _parameter(
         math.radians(0.5),
-        "Prior standard deviation of the heading error: one and two cycles (compass), and drift (gyro, G1). On one "
-        "heading σ of yaw includes it. 0: exact.",
+        "Prior standard deviation of the heading error, one and two cycles (compass). On one heading σ of yaw includes "
+        "it. 0: exact.",
         unit="rad",
         low=0.0,
         high=0.5,
     )
     dvl_bias_std: float = _parameter(
         0.008,
-        "Prior standard deviation of the DVL's velocity bias per axis (G1, full). At one speed σ includes it. 0: no "
-        "bias.",
+        "Prior standard deviation of the DVL's velocity bias per axis (full). At one speed σ includes it. 0: no bias.",
         unit="m/s",
         low=0.0,
         high=1.0,

@@ -51,8 +51,6 @@ def _loaded(name: str, value: str, known: Mapping[str, Model]) -> dict[str, Mode
             raise TypeError(f"{value} is no Model")
         if model.name in known:
             raise ValueError(f"there is a model {model.name!r} already; give it another name")
-        if model.extends is not None and model.extends not in known:
-            raise ValueError(f"it extends {model.extends!r}, which there is not")
     except Exception as error:  # whatever a foreign package does wrong
         raise InputError(
             f"model {name!r} of an installed package: cannot be used ({type(error).__name__}: {error}); mend or "

@@ -48,10 +48,6 @@ class GaussianState(NamedTuple):
         """The same with each standard deviation times a factor (n,); symmetric to the last bit, as P is."""
         return GaussianState(self.x, self.p * (factor[:, None] * factor))
 
-    def turned(self, about: Array, variance: float) -> GaussianState:
-        """The same with so much more variance along a direction (n,)."""
-        return GaussianState(self.x, self.p + variance * (about[:, None] * about)) if variance else self
-
 
 @dataclass(frozen=True)
 class Measurements:
@@ -116,16 +112,6 @@ class Updated:
         found = [each.at for each in models if each.at is not None]
         at = GaussianState(*(np.concatenate(each, axis=1) for each in zip(*found, strict=True))) if found else None
         return Updated(x, p, used, nis, at)
-
-
-def one_after_another(parts: Sequence[Updated]) -> Updated:
-    """Of blocks of samples, each from the state after the one before (or changed between); states wanted of all."""
-    if len(parts) == 1:
-        return parts[0]
-    used, nis = (np.concatenate(each, axis=1) for each in zip(*((part.used, part.nis) for part in parts), strict=True))
-    found = [each.at for each in parts if each.at is not None]
-    at = GaussianState(*(np.concatenate(each) for each in zip(*found, strict=True))) if found else None
-    return Updated(parts[-1].x, parts[-1].p, used, nis, at)
 
 
 def recursion(

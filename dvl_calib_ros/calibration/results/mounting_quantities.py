@@ -13,6 +13,9 @@ from ..models.parameters import Parameters
 from ..numerics.kalman import GaussianState
 from .results import Result, corrected_rpy, rpy_std, scale_and_delay
 
+# Axes of `observability` that only a recording with angular velocities can show.
+_NEED_IMU = ("lever arm x", "lever arm y", "lever arm z", "time offset")
+
 
 class Quantity(NamedTuple):
     """nominal, value, std: as configured, as found, and its σ, in this unit. shown: whether the recording shows it."""
@@ -33,7 +36,7 @@ def quantities(result: Result) -> list[Quantity]:
     """Roll, pitch, yaw of the DVL (°); of models that have them scale of motion ahead (%), lever arm (m), delay (s).
 
     Angles are those of a URDF's origin, within half a turn of the configured ones. One that no motion has told from
-    what is known without data is not shown.
+    what is known without data is not shown. Without an IMU there is neither lever arm nor delay.
     """
     estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
     nominal = np.degrees(parameters.mounting_rpy)
@@ -49,6 +52,8 @@ def quantities(result: Result) -> list[Quantity]:
     if beside.scale_std is not None:
         shown = "scale" not in unseen
         found.append(Quantity("scale", 0.0, 100.0 * beside.scale, 100.0 * beside.scale_std, " %", shown))
+    if not _has_imu(result):
+        return found
     arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")
     if arm_std is not None:
         arm = estimate.lever_arm(parameters.lever_arm)
@@ -74,10 +79,16 @@ def not_shown(result: Result) -> dict[str, str]:
     shown = {each.name for each in quantities(result) if each.shown}
     causes: dict[str, dict[str, None]] = {}
     for entry in result.estimate.observability:
+        if entry.axis in _NEED_IMU and not _has_imu(result):
+            continue
         if entry.missing and entry.axis != "scale across":
             axis = f"the vehicle's {entry.axis} axis" if entry.axis in shown else entry.axis
             causes.setdefault(entry.missing, {})[axis] = None
     return {missing: " and ".join(axes) for missing, axes in causes.items()}
+
+
+def _has_imu(result: Result) -> bool:
+    return result.counts["imu"]["received"] > 0
 
 
 def date(stamp_ns: int) -> str:

@@ -12,7 +12,6 @@ import numpy as np
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, by_severity
 from ..filters.cross_validation import HeldOutError
-from ..filters.heading_bias import BiasCovariance
 from ..filters.observability import Convergence, Observability, observability, scale_std_ahead
 from ..models import MODELS, Model
 from ..models.parameters import FROM_REFERENCE, TOLD, UNKNOWN, Parameters
@@ -20,6 +19,7 @@ from ..numerics.error_model import correct, corrected_mounting
 from ..numerics.frames import FLU_FROM_FRD, Array, near_angles, rpy_from_rotation
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Mask
+from .bias_covariance import BiasCovariance
 from .velocity_correction import NOT_ESTIMATED, lever_arm
 
 
@@ -370,6 +370,7 @@ def scale_and_delay(model: Model, state: GaussianState, parameters: Parameters) 
     return ScaleAndDelay(float(ahead @ state.x), float(std[0]) if len(std) else None, delay, delay_std)
 
 
+OFFSETS = "reference_east", "reference_north"
 ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 # So many σ are no chance, and so many metres no tape measure's error.
 SIGMAS, MEASURED_TO = 5.0, 0.05

@@ -148,7 +148,7 @@ def test_of_a_folder_with_something_that_cannot_be_read_the_rest_is_read_and_it_
     assert found == expected
     for name in ("a.mcap", "z.mcap"):
         assert sum(name in note and "the rest is read" in note for note in notes) == 1
-    assert main(["replay", str(bag)]) == 0
+    assert main(["replay", str(bag), "-p", "model:=M3"]) == 0
 
 
 def test_a_file_in_a_folder_that_may_not_be_read_costs_a_note(tmp_path, monkeypatch):

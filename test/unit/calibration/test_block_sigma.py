@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from runs import ONE_HERTZ, START_NS, MatchedRun, calibrate, make_samples
 
-from dvl_calib_ros.calibration.assessment.manoeuvre_planner import predicted_drift
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.checks.data_warnings import one_heading_warnings, reference_warnings
+from dvl_calib_ros.calibration.checks.data_warnings import one_heading_warnings
 from dvl_calib_ros.calibration.filters.day_to_day_covariance import day_covariance
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -61,7 +60,7 @@ def test_the_full_model_finds_noise_that_lasts_by_itself():
 
 @pytest.mark.parametrize("block_size", [1, 500])
 def test_how_samples_are_gathered_changes_nothing(block_size):
-    names = ("M3", "G1", "F1", "A1")
+    names = ("M3", "full", "F1", "A1")
     one, other = (calibrate(run(0.1, **ONE_HERTZ), CLAIMED, block_size=size, models=names) for size in (64, block_size))
     for name in names:
         found = one.estimate(name).covariance, other.estimate(name).covariance
@@ -76,8 +75,8 @@ def test_a_covariance_is_symmetric_to_the_last_bit_however_much_each_sigma_is_ra
 
 
 def test_a_random_walk_is_left_as_the_filter_has_it():
-    estimate = calibrate(run(0.1), CLAIMED.replace(process_std_misalignment=1e-4), models=("G1",)).estimate("G1")
-    np.testing.assert_allclose(estimate.std[:6], estimate.filter_std[:6])
+    estimate = calibrate(run(0.1), CLAIMED.replace(process_std_misalignment=1e-4), models=("M3",)).estimate("M3")
+    np.testing.assert_allclose(estimate.std, estimate.filter_std)
 
 
 def test_the_state_is_the_same_and_the_result_file_has_both_sigmas():
@@ -91,7 +90,7 @@ def test_the_state_is_the_same_and_the_result_file_has_both_sigmas():
 @cache
 def on_course(offset: tuple[float, float], headings: bool) -> Calibrator:
     """Of `level_course` as claimed; not to be fed any more."""
-    return calibrate(level_course(offset, headings), CLAIMED, models=("G1", "M3"))
+    return calibrate(level_course(offset, headings), CLAIMED, models=("full", "M3"))
 
 
 @cache
@@ -112,90 +111,25 @@ def level_course(offset: tuple[float, float], headings: bool, wander: float = 0.
     return samples
 
 
-def test_a_constant_error_of_the_reference_is_found_over_several_headings():
-    estimate = on_course((0.012, -0.009), True).estimate("G1")
-    assert estimate.state_of("reference_east") == pytest.approx(0.012, abs=0.003)
-    assert estimate.state_of("reference_north") == pytest.approx(-0.009, abs=0.003)
-    assert abs(estimate.state[2]) < 2.5 * estimate.std[2] < np.radians(0.25)
-
-
-def test_a_reference_that_is_off_is_said_with_size_and_course_and_one_that_is_not_is_not():
-    (found,) = reference_warnings(on_course((0.03, 0.0), True).estimate("G1"))
-    assert found.code == "REFERENCE_OFFSET" and not found.numbers["where"]
-    assert 27.0 < found.numbers["millimetres"] < 33.0 and 86.0 < found.numbers["course"] < 94.0
-    assert not reference_warnings(on_course((0.0, 0.0), True).estimate("G1"))
-    assert not reference_warnings(on_course((0.03, 0.0), False).estimate("G1"))
-    assert not reference_warnings(on_course((0.03, 0.0), True).estimate("M3"))
-
-
-def test_on_one_heading_yaw_and_scale_are_no_better_known_than_the_reference_may_be_wrong():
-    """2 cm/s across 1.5 m/s are 0.76 degrees, ahead 1.3 per cent; data of any length do not tell them."""
-    estimate = on_course((0.025, -0.02), False).estimate("G1")
-    assert np.radians(0.7) < estimate.std[2] < np.radians(0.85)
-    assert abs(estimate.state[2]) < 2.0 * estimate.std[2] and abs(estimate.state[3]) < 2.0 * estimate.std[3]
-    trusting = calibrate(
-        level_course((0.006, 0.004), False), CLAIMED.replace(reference_offset_std=1e-6), models=("G1",)
-    )
-    assert abs(trusting.estimate("G1").state[2]) > 2.0 * trusting.estimate("G1").std[2]
-
-
-def test_on_one_heading_pitch_is_no_better_known_than_a_bias_upwards_of_the_same_size_makes_it():
-    """A DVL's bias of 2 cm/s along z was a pitch of 1 degree, ± 0.1, and accepted."""
-    along, around = (on_course((0.0, 0.0), headings).estimate("G1").std for headings in (False, True))
-    assert along[1] == pytest.approx(np.radians(0.76), rel=0.1) and around[1] < np.radians(0.1)
-
-
-@pytest.mark.parametrize("offset", [(0.06, 0.0), (0.0, -0.06), (0.04, 0.04)])
-def test_a_reference_worse_than_its_prior_is_in_sigma_where_headings_hardly_show_it(offset):
-    """A heading that wanders by a degree or two shows that the prior is wrong, and not by how much."""
-    samples = level_course(offset, False, wander=0.03)
-    estimate = calibrate(samples, CLAIMED, models=("G1",)).estimate("G1")
-    assert abs(estimate.state[2]) < 3.0 * estimate.std[2] and abs(estimate.state[3]) < 3.0 * estimate.std[3]
-
-
-def test_at_one_speed_a_bias_of_the_dvl_is_in_sigma_of_the_angles_where_it_is_expected_and_not_in_the_drift():
-    """2 cm/s across 1.5 m/s are 0.76 degrees, to drive with at 1.5 m/s as good as none."""
-    samples = [
-        each._replace(velocity=tuple(np.add(each.velocity, (0.0, 0.02, 0.0)))) if isinstance(each, DvlSample) else each
-        for each in level_course((0.0, 0.0), True)
-    ]
-    expected = CLAIMED.replace(dvl_bias_std=0.01)
-    exact, estimate = (calibrate(samples, each, models=("G1",)).estimate("G1") for each in (CLAIMED, expected))
-    assert abs(exact.state[2]) > 5.0 * exact.std[2] and not exact.of_bias.columns.any()
-    assert abs(estimate.state[2]) < 3.0 * estimate.std[2] < np.radians(1.2)
-    drifts = [predicted_drift(MODELS["G1"], each.velocity_covariance, CLAIMED).side for each in (exact, estimate)]
-    assert drifts[1] == pytest.approx(drifts[0], rel=0.2)
-
-
 def test_on_one_heading_it_is_said_what_a_constant_error_would_be():
-    (said,) = one_heading_warnings(on_course((0.0, 0.0), headings=False).estimate("G1"), CLAIMED, 1.5)
+    (said,) = one_heading_warnings(on_course((0.0, 0.0), headings=False).estimate("full"), CLAIMED, 1.5)
     assert said.code == "ONE_HEADING" and "0.02 m/s would be 0.8° or 1.3 %" in said.says
-    for name, headings in (("G1", True), ("M3", False)):
+    for name, headings in (("full", True), ("M3", False)):
         assert one_heading_warnings(on_course((0.0, 0.0), headings).estimate(name), CLAIMED, 1.5) == []
-
-
-def test_of_a_reference_in_the_body_frame_no_error_fixed_to_the_earth_is_assumed():
-    samples = [
-        each._replace(frame=VelocityFrame.BODY, velocity=(1.5, 0.0, 0.0)) if isinstance(each, ReferenceSample) else each
-        for each in level_course((0.0, 0.0), False)
-    ]
-    estimate = calibrate(samples, CLAIMED, models=("G1",)).estimate("G1")
-    assert estimate.state_of("reference_east") == estimate.state_of("reference_north") == 0.0
-    assert estimate.std[2] < np.radians(0.1)
 
 
 def test_the_sigma_that_is_published_is_that_of_the_next_recording_and_the_recordings_own_stands_beside():
     """0.1 degrees of heading about the body's vertical, 0.3 per cent of scale: no length of data takes them out."""
     mounted = Parameters(gnss_aided_std=0.03, mounting_rpy=(0.0, 0.0, 0.6))
     calibrator = calibrated(0.0), calibrate(run(0.0), CLAIMED.replace(day_std_heading=np.radians(0.1)))
-    alone, another_day = (each.estimate("G1") for each in calibrator)
+    alone, another_day = (each.estimate("full") for each in calibrator)
     np.testing.assert_array_equal(alone.covariance, alone.recording_covariance)
     np.testing.assert_array_equal(another_day.recording_covariance, alone.covariance)
     assert another_day.std[2] ** 2 == pytest.approx(alone.std[2] ** 2 + np.radians(0.1) ** 2)
     np.testing.assert_array_equal(np.delete(another_day.std, 2), np.delete(alone.std, 2))
     assert another_day.convergence is alone.convergence and another_day.observability == alone.observability
     assert not day_covariance(MODELS["M7"], mounted).any()
-    scales = day_covariance(MODELS["G1"], mounted)[3:5, 3:5]
+    scales = day_covariance(MODELS["full"], mounted)[3:5, 3:5]
     np.testing.assert_allclose(scales, 0.003**2)  # sound is as fast along all axes
 
 

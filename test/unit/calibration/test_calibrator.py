@@ -15,7 +15,7 @@ from runs import ONE_HERTZ, SECOND, START_NS, STRETCH, MatchedRun, calibrate, fe
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.checks.data_warnings import recording_warnings
 from dvl_calib_ros.calibration.filters import filter_bank
-from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
+from dvl_calib_ros.calibration.models import BY_VELOCITY, LINEAR_MODELS, MODELS, Needs
 from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
 from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
@@ -45,7 +45,7 @@ def assert_same(a: Calibrator, b: Calibrator, atol=0.0, names=BY_VELOCITY):
 # ---------------------------------------------------------------- what comes out
 
 
-@pytest.mark.parametrize("names", [("M1",), ("F1", "A1"), ("full",), ("G1", "M7")], ids=" ".join)
+@pytest.mark.parametrize("names", [("M1",), ("F1", "A1"), ("full",), ("M3", "M7")], ids=" ".join)
 def test_a_model_without_the_others_is_what_it_is_among_them(names, one_by_one):
     samples = make_samples(variant(NOISY, seconds=30))
     alone = calibrate(samples, models=names, verified=True)
@@ -240,16 +240,6 @@ def test_switching_models_at_any_time_equals_having_run_that_model_from_the_star
             np.testing.assert_array_equal(switched.estimate().covariance, from_start.estimate().covariance)
 
 
-def with_or_without(segments):
-    """Segments with G1 for `full`, which takes over while GNSS is available, and joined."""
-    found = []
-    for each in segments:
-        each = each._replace(model="G1" if each.model == "full" else each.model)
-        if not found or found[-1].model != each.model:
-            found.append(each)
-    return found
-
-
 def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and_hysteresis():
     run = variant(NOISY, seconds=100, gnss_phase=0)
     outage = [
@@ -257,8 +247,8 @@ def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and
         for s in make_samples(run)
         if not (isinstance(s, ReferenceSample) and 40 <= (s.stamp_ns - START_NS) / SECOND < 60)
     ]
-    segments = with_or_without(calibrate(outage).selection.segments)
-    assert [segment.model for segment in segments] == ["F1", "G1", "F1", "G1"]
+    segments = calibrate(outage).selection.segments
+    assert [segment.model for segment in segments] == ["F1", "full", "F1", "full"]
     at = [(segment.from_ns - START_NS) / SECOND for segment in segments]
     # lost 2 s after 39.8 s (the first sample beyond is at 42.0), then 3 s of hysteresis; back 3 s after 60 s
     np.testing.assert_allclose(at, [0.0, 3.0, 45.0, 63.0], atol=1e-6)
@@ -282,7 +272,7 @@ def test_iac_is_the_published_selection_and_switches_when_auto_does(given, expec
     ]
     auto, iac = (calibrate(outage, Parameters(model=model, **given)) for model in ("auto", "iac"))
     assert [segment.model for segment in iac.selection.segments] == [*expected, *expected]
-    assert [s.from_ns for s in iac.selection.segments] == [s.from_ns for s in with_or_without(auto.selection.segments)]
+    assert [s.from_ns for s in iac.selection.segments] == [s.from_ns for s in auto.selection.segments]
     assert iac.result().selected_because.sentence == "iac: GNSS is available"
     for name in BY_VELOCITY:  # what is selected changes no estimate
         np.testing.assert_array_equal(iac.state(name).x, auto.state(name).x)
@@ -468,7 +458,7 @@ def test_at_any_time_each_dvl_sample_that_came_is_in_one_place(seed, block_size)
             calibrator.feed_imu(ImuSample(at, (0.0, 0.0, 0.0, 1.0), source.choice([None, (0.0, 0.0, 0.1)])))
         sent += kind < 4
         sent = 2 if restarted else sent  # the two that showed it
-        for name in source.sample(BY_VELOCITY, 2):
+        for name in source.sample([model.name for model in LINEAR_MODELS], 2):
             found = where(name)
             assert sum(found.values()) == sent and min(found.values()) >= 0
     # what can still come has come: nothing waits but for a sample that confirms the last one's stamp
@@ -856,7 +846,7 @@ def test_a_model_whose_numbers_run_away_goes_on_from_its_last_good_state_and_is_
 def test_a_state_that_no_solver_objects_to_and_is_none_is_not_gone_on_from(poison, monkeypatch):
     samples = make_samples(NOISY)
     calibrator = calibrate(samples[:900])
-    before = {name: calibrator.state(name).x for name in ("M1", "G1")}
+    before = {name: calibrator.state(name).x for name in ("M1", "M3")}
     filtered = filter_bank._filtered
 
     def poisoned(*given):

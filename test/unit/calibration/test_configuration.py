@@ -40,7 +40,7 @@ def motion():
 
 
 def verdict(frame=VelocityFrame.ENU, reference=SAME, attitude=(SAME, SAME), dvl=SAME):
-    """Verdict on G1 where the messages hold these linear functions of what they should."""
+    """Return the verdict on `full` where the messages hold these linear functions of what they should."""
     rng = np.random.default_rng(0)
     stamps, body, rotation, yaw_rate = motion()
     samples = []
@@ -50,7 +50,7 @@ def verdict(frame=VelocityFrame.ENU, reference=SAME, attitude=(SAME, SAME), dvl=
             ReferenceSample(stamp, tuple((reference @ r @ v + rng.normal(0, 0.02, 3)).tolist()), None, frame)
         )
         samples.append(DvlSample(stamp, tuple((dvl @ v + rng.normal(0, 0.005, 3)).tolist())))
-    return calibrate(samples, PARAMETERS, verified=True).verification("G1")
+    return calibrate(samples, PARAMETERS, verified=True).verification("full")
 
 
 def test_a_right_configuration_is_accepted_and_nothing_is_suggested():
@@ -113,7 +113,7 @@ def straight_in_waves(late_s, dvl=SAME):
         seen = rotation @ body(at) + rng.normal(0, 0.02, 3)
         samples.append(ReferenceSample(stamp, tuple(seen.tolist()), None, VelocityFrame.ENU))
         samples.append(DvlSample(stamp, tuple((dvl @ body(at - late_s) + rng.normal(0, 0.005, 3)).tolist())))
-    return calibrate(samples, PARAMETERS, verified=True).verification("G1")
+    return calibrate(samples, PARAMETERS, verified=True).verification("full")
 
 
 @pytest.mark.slow
@@ -127,9 +127,9 @@ def test_a_dvl_that_is_late_by_half_a_wave_is_not_taken_for_one_that_points_down
 
 
 def judged(**changes):
-    state = GaussianState(np.zeros(8), np.eye(8) * 1e-6)
+    state = GaussianState(np.zeros(4), np.eye(4) * 1e-6)
     arguments = {"held_out": HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), "used_and_gated": (1000, 10)} | changes
-    return verify(MODELS["G1"], state, Convergence.FINE, parameters=Parameters(), **arguments)
+    return verify(MODELS["M3"], state, Convergence.FINE, parameters=Parameters(), **arguments)
 
 
 @pytest.mark.parametrize(
@@ -150,9 +150,9 @@ def test_a_verdict_protects(changes, word, code):
 
 
 def test_a_good_calibration_of_a_mounting_to_inspect_is_two_statements():
-    state = GaussianState(np.array([0.0, 0.05, *np.zeros(6)]), np.eye(8) * 1e-6)
+    state = GaussianState(np.array([0.0, 0.05, 0.0, 0.0]), np.eye(4) * 1e-6)
     found = verify(
-        MODELS["G1"], state, Convergence.FINE, HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), Parameters(), (1000, 0)
+        MODELS["M3"], state, Convergence.FINE, HeldOutError(1000, 0.10, 0.05, 0.05, 0.002), Parameters(), (1000, 0)
     )
     assert found.verdict is Severity.ACCEPT
     assert found.mounting is not None and found.mounting.code == "MOUNTING_FAR"
@@ -174,5 +174,5 @@ def test_axes_that_hardly_show_are_not_said_to_be_turned_round(seed):
         seen = rotation @ (1.5, 0.0, 0.0) + rng.normal(0.0, 0.03, 3)
         samples.append(ReferenceSample(stamp, tuple(seen.tolist()), None, VelocityFrame.ENU))
         samples.append(DvlSample(stamp, tuple((turned.T @ (1.5, 0.0, 0.0) + rng.normal(0.0, 0.01, 3)).tolist())))
-    found = calibrate(samples, PARAMETERS, verified=True, models=("G1", "full")).verification("G1")
+    found = calibrate(samples, PARAMETERS, verified=True, models=("full",)).verification("full")
     assert not any("forward-right-down" in each.sentence for each in found.reasons), found.reasons

@@ -33,7 +33,7 @@ PHI = (0.0, 0.01, -0.02)
 NOISE = Parameters(gnss_aided_std=0.021)
 GNSS_STD, DVL_STD = 0.02, 0.005
 BEYOND = [*range(*LEVER_ARM_STATES.indices(20)), DELAY]
-AUTO = ("F1", "G1", "full")  # what a run with a reference is calibrated with; the others cost, and say nothing here
+AUTO = ("F1", "full")  # what a run with a reference is calibrated with; the others cost, and say nothing here
 
 
 @cache
@@ -126,17 +126,17 @@ def test_what_the_run_does_not_show_is_not_claimed(how):
     assert "slowing down" in shown["time_offset"].missing
 
 
-def test_without_attitude_auto_has_the_model_that_needs_none_and_full_has_no_data():
+def test_without_attitude_a_reference_in_the_earths_frame_tells_full_nothing():
     calibrator = calibrate(straight(with_rates=False), NOISE)
-    assert calibrator.selected == "G1"
+    assert calibrator.selected == "full"
     estimate = calibrator.estimate("full")
     assert not estimate.state.any() and not any(each.observed for each in estimate.observability)
 
 
-def test_auto_takes_the_full_model_once_it_has_data_and_says_why():
+def test_auto_takes_the_full_model_where_there_is_a_reference():
     result = found(-1.4).result()
     assert result.selected == "full"
-    assert result.selected_because.numbers["why"].code == "FULL_HAS_DATA"
+    assert result.selected_because.code == "MODEL_CHOSEN"
     assert [segment.model for segment in result.segments][-1:] == ["full"]
 
 
@@ -192,7 +192,7 @@ def test_on_a_circle_what_takes_an_unknown_lever_arm_as_known_is_rejected_with_w
     known_to_full = [each.code for each in unknown.verification("full").reasons]
     assert unknown.verification("full").verdict is Severity.MARGINAL
     assert {"LEVER_ARM_NOT_SHOWN", "NO_ANGLE_SHOWN"} & {*known_to_full}
-    for name in ("M3", "M4", "G1"):
+    for name in ("M3", "M4"):
         verification = unknown.verification(name)
         assert verification.verdict is Severity.REJECT
         turns = [each.numbers["turns"] for each in verification.reasons if each.code == "LEVER_ARM_TURNS_ANGLE"]
@@ -201,8 +201,8 @@ def test_on_a_circle_what_takes_an_unknown_lever_arm_as_known_is_rejected_with_w
         )
     assert "LEVER_ARM_TURNS_ANGLE" not in [each.code for each in unknown.verification("A1").reasons]
     known = calibrate(samples, NOISE.replace(lever_arm=(1.0, 0.3, 0.0), initial_std_lever_arm=0.01), verified=True)
-    assert known.verification("G1").verdict is not Severity.REJECT
-    assert abs(known.estimate("G1").state[2]) < 4.0 * known.estimate("G1").std[2]
+    assert known.verification("full").verdict is not Severity.REJECT
+    assert abs(known.estimate("full").state[2]) < 4.0 * known.estimate("full").std[2]
 
 
 def test_the_position_found_is_that_of_the_parameters_and_what_was_found_beside():
@@ -210,7 +210,7 @@ def test_the_position_found_is_that_of_the_parameters_and_what_was_found_beside(
     np.testing.assert_allclose(
         lever_arm(MODELS["full"], state, (0.1, 0.0, 0.0)), np.add(state.x[LEVER_ARM_STATES], (0.1, 0.0, 0.0))
     )
-    assert lever_arm(MODELS["G1"], found(-1.4).state("G1"), (0.1, 0.0, 0.0)) == (0.1, 0.0, 0.0)
+    assert lever_arm(MODELS["M3"], found(-1.4).state("M3"), (0.1, 0.0, 0.0)) == (0.1, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("block_size", [1, 400])
@@ -381,7 +381,7 @@ def test_a_slow_dvl_that_is_off_now_and_then_costs_no_calibration(seconds):
 
 def test_an_initial_calibration_of_g2_goes_on_where_it_was():
     first = found(-1.4)
-    later = calibrate(late(-1.4, seed=1), NOISE, initial={"full": first.state("full"), "G1": first.state("G1")})
+    later = calibrate(late(-1.4, seed=1), NOISE, initial={"full": first.state("full")})
     assert np.all(later.estimate("full").std[BEYOND[:2]] < first.estimate("full").std[BEYOND[:2]])
     np.testing.assert_allclose(later.estimate("full").state[BEYOND[:2]], LEVER_ARM[:2], atol=0.05)
 

@@ -9,12 +9,11 @@ import pytest
 from conftest import few
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.checks.heading_deviation import FIRST, heading_deviation, heading_warnings, severity_of
+from dvl_calib_ros.calibration.checks.heading_deviation import heading_deviation, heading_warnings
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.verdict.kinds import Severity
 
 START_NS, STEP_S, LEG_S = 1_600_000_000_000_000_000, 0.5, 40.0
 YAW = math.radians(1.0)  # of the DVL in the vehicle
@@ -27,7 +26,7 @@ def recorded(seed, off, offset=(0.0, 0.0), legs=16, every=math.pi / 4.0, **param
     """
     rng = np.random.default_rng(seed)
     exact_dvl = Parameters(gnss_aided_std=0.03, dvl_bias_std=0.0, **parameters)
-    calibrator = Calibrator(exact_dvl, block_size=64, models=("G1",))
+    calibrator = Calibrator(exact_dvl, block_size=64, models=("full",))
     time = np.arange(0.0, LEG_S * legs, STEP_S)
     yaw = np.floor(time / LEG_S) * every + 0.2
     for at, heading in zip(time.tolist(), yaw.tolist(), strict=True):
@@ -74,7 +73,7 @@ def test_yaw_is_within_its_sigma(legs, every, size):
     for seed in range(4):
         deviates = lambda yaw, _, at=seed: math.radians(size) * math.sin(yaw + 1.6 * at)  # noqa: E731
         calibrator, *_ = recorded(seed, deviates, legs=legs, every=every)
-        estimate = calibrator.estimate("G1")
+        estimate = calibrator.estimate("full")
         off.append((estimate.state[2] - YAW) / estimate.recording_std[2])
         assert estimate.recording_std[2] < math.radians(0.3 + 0.5 * size)
     assert np.abs(off).max() < 3.0, off
@@ -82,44 +81,9 @@ def test_yaw_is_within_its_sigma(legs, every, size):
 
 def test_on_one_heading_sigma_of_yaw_holds_what_the_heading_may_be_off_by():
     calibrator, *_ = recorded(0, lambda *_: math.radians(0.8), every=0.0, reference_offset_std=0.001)
-    estimate = calibrator.estimate("G1")
+    estimate = calibrator.estimate("full")
     assert math.radians(0.5) < estimate.recording_std[2] < math.radians(0.8)
     assert abs(estimate.state[2] - YAW) < 2.0 * estimate.recording_std[2]
-
-
-def test_a_gyro_that_drifts_is_named_by_time_and_beyond_three_degrees_the_compass_comes_first():
-    found = deviation(2, lambda yaw, _: math.radians(6.0) * math.sin(yaw))
-    assert found.rms > FIRST and "calibrate the compass first" in heading_warnings(found).remedy
-    drifts = deviation(2, lambda _, time: math.radians(5.0) * time / (16 * LEG_S))
-    assert drifts.by_time and "with time" in heading_warnings(drifts).says
-
-
-@pytest.mark.parametrize("degrees, is_first", [(2.0, False), (6.0, True)])
-def test_a_compass_whose_worst_headings_are_gated_comes_first_whatever_is_left(degrees, is_first):
-    """The gate throws away what it turns most, so by the rest the compass is better than it is."""
-    size = math.radians(degrees)
-    calibrator, time, yaw = recorded(3, lambda yaw, _: size * math.sin(yaw + 1.2), every=math.pi)
-    found, estimate = heading_deviation(time, yaw, calibrator.heading_deviation), calibrator.estimate("G1")
-    assert found is not None and not found.by_time
-    severity = severity_of(found._replace(rms=math.radians(2.0)), estimate)
-    assert severity is (Severity.REJECT if is_first else Severity.WARNING)
-    # where the reference is so good that 0.7 degrees are gated, σ of yaw holds them
-    severity = severity_of(found._replace(rms=math.radians(0.7)), estimate)
-    assert severity is (Severity.MARGINAL if is_first else Severity.WARNING)
-
-
-@pytest.mark.parametrize("degrees", [2.0, 4.0])
-def test_a_heading_that_drifts_is_not_accepted(degrees):
-    """σ of yaw holds it, and nobody knows when it was right: 2.4 of it was accepted."""
-    calibrator, time, yaw = recorded(2, lambda _, time: math.radians(degrees) * time / (16 * LEG_S))
-    found, estimate = heading_deviation(time, yaw, calibrator.heading_deviation), calibrator.estimate("G1")
-    assert found.by_time and severity_of(found, estimate) is Severity.MARGINAL
-
-
-def test_sigma_of_yaw_holds_a_drift_from_the_beginning_on():
-    calibrator, *_ = recorded(4, lambda _, time: math.radians(2.0) * time / (16 * LEG_S))
-    estimate = calibrator.estimate("G1")
-    assert math.radians(0.3) < abs(estimate.state[2] - YAW) < 2.5 * estimate.recording_std[2]
 
 
 def test_few_headings_or_nothing_at_all_say_nothing():

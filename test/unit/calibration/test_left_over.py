@@ -202,10 +202,10 @@ def test_a_bias_that_sigma_of_its_own_axis_holds_is_said_and_no_reject(rng, axis
 
 def test_what_a_bias_looks_like_is_by_the_axes_of_the_body():
     """Of a DVL at 90 degrees a turn about its own x is a pitch of the body."""
-    names = MODELS["G1"].state_names
+    names = MODELS["full"].state_names
     p = np.zeros((len(names), len(names)))
     p[0, 0], p[2, 2] = 0.01**2, 0.02**2
-    estimate: Any = SimpleNamespace(model="G1", recording_covariance=p)
+    estimate: Any = SimpleNamespace(model="full", recording_covariance=p)
     turned = std_along(estimate, Parameters(mounting_rpy=(0.0, 0.0, math.pi / 2.0)))
     assert turned == pytest.approx([0.0, 0.02, 0.01], abs=1e-12)
     assert std_along(estimate, Parameters()) == pytest.approx([0.0, 0.02, 0.0], abs=1e-12)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,13 +10,13 @@ from scipy.stats import chi2
 
 from dvl_calib_ros.calibration.filters.filter_bank import groups_of
 from dvl_calib_ros.calibration.filters.filter_setup import Assembler
-from dvl_calib_ros.calibration.filters.vertical_motion import HeaveRows, RelativeHeight, with_heave
+from dvl_calib_ros.calibration.filters.relative_height import RelativeHeight
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
 from dvl_calib_ros.calibration.models.base import Observations
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics import kalman
 from dvl_calib_ros.calibration.numerics.error_model import correct, distort
-from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rotation_from_rpy, skew
+from dvl_calib_ros.calibration.numerics.frames import FLU_FROM_FRD, rotation_from_rpy
 
 # T = rotation_dvl_from_body: flush, a DVL turned by 45 degrees, a tilted one, and one hung upside down
 MOUNTINGS = {"none": (0, 0, 0), "yaw45": (0, 0, np.pi / 4), "tilted": (0.1, -0.2, 0.8), "inverted": (np.pi, 0.1, 0)}
@@ -31,7 +30,7 @@ each_frame = pytest.mark.parametrize("frame", FRAMES)
 def body_velocities(model, rng, n=200):
     """Velocities that fulfil the model's own assumptions, nuisance states zero."""
     velocity = np.column_stack([rng.uniform(0.8, 2.5, n), rng.normal(0, 0.3, n), rng.normal(0, 0.3, n)])
-    if model.name in ("M3", "M4", "G1"):
+    if model.name in ("M3", "M4"):
         velocity[:, 2] = 0.0
     if not model.aided:
         velocity[:, 1:] = PRIOR if model.needs_prior else 0.0
@@ -82,12 +81,6 @@ def predicted_z(model, state, seen):
     phi, dk = state_to_terms(model, state)
     speed = np.linalg.norm(velocity_dvl, axis=1)
     expected = np.column_stack([speed, np.tile(PRIOR, (len(speed), 1))])
-    if model.in_correction_parameters:  # G1: the state is ψ, κ, heave, error of the reference east and north
-        body = (
-            velocity_dvl @ (np.eye(3) - skew(phi)).T @ t - shows_scale(velocity_dvl, t) * velocity_dvl @ np.diag(dk) @ t
-        )
-        error = np.einsum("nei,e->ni", seen.rotation_enu_from_body, [*state[6:8], 0.0])
-        return body - velocity_dvl @ t + error
     if model.aided:  # the measured velocity is what the errors make of the reference
         level = velocity_body * [1, 1, 0] if model.name in ("M3", "M4") else velocity_body
         return level @ t.T - distort(level, phi, dk, t)
@@ -121,32 +114,6 @@ def test_h_is_the_derivative_of_the_nonlinear_error_model(name, mounting, frame,
         state[column] = step
         plus, minus = predicted_z(model, state, seen), predicted_z(model, -state, seen)
         np.testing.assert_allclose(h[:, :, column], (plus - minus) / (2 * step), atol=1e-8)
-
-
-def test_a_samples_own_noise_does_not_say_whether_it_shows_the_scale_of_an_axis(rng):
-    """At 30 degrees and 0.7 m/s those did that noise made faster: a scale of 8 percent, and 3 degrees of roll."""
-    t = rotation_from_rpy((0.0, 0.0, math.radians(30.0))).T
-    velocity_dvl = [0.7, 0.1, 0.0] @ t.T + rng.normal(0, 0.03, (200, 3))
-    _, h = MODELS["G1"].linearise(observations(velocity_dvl, velocity_dvl @ t, t))
-    assert (h[:, :, 3:5] != 0.0).any(axis=1).all()
-
-
-@each_mounting
-@each_frame
-def test_the_row_of_heave_is_the_derivative_of_what_is_taken_for_none(mounting, frame, rng):
-    model, t = MODELS["G1"], rotation_from_rpy(MOUNTINGS[mounting]).T
-    velocity_dvl = rng.normal([1.5, 0.2, 0.1], 0.3, (20, 3)) @ FRAMES[frame].T @ t.T
-    row = model.heave(observations(velocity_dvl, velocity_dvl @ t, t, frame=frame))
-    level = shows_scale(velocity_dvl, t) * ((velocity_dvl @ t) * [1, 1, 0] @ t.T)  # scale acts on level motion only
-
-    def heave(state):
-        phi, dk = state_to_terms(model, state)
-        corrected = velocity_dvl @ (np.eye(3) - skew(phi)).T - level @ np.diag(dk)
-        return (corrected @ t)[:, 2] - state[5]
-
-    np.testing.assert_allclose(row[:, -1], -heave(np.zeros(model.n_state)), atol=1e-12)
-    for column, step in enumerate(1e-6 * np.eye(model.n_state)):
-        np.testing.assert_allclose(row[:, column], (heave(step) - heave(-step)) / 2e-6, atol=1e-8)
 
 
 @each_model
@@ -189,14 +156,6 @@ def test_noiseless_errors_are_recovered(name, mounting, frame, rng):
     np.testing.assert_allclose(correct(measured, *state_to_terms(model, state), t), velocity, atol=1e-7)
     if len(model.scale_axes) == 1:  # one per axis cannot all be told apart from tilts of a tilted mounting
         np.testing.assert_allclose(state, truth, atol=2e-8)  # second order: 4e-5 squared
-
-
-def test_a_scale_is_no_yaw_of_a_dvl_whose_axis_is_fast_at_times(rng):
-    """Survey 34169: at 30° and 0.7 m/s one axis is now above 0.3 m/s and now below; 0.6° of yaw were made of 0.8 %."""
-    model, t = MODELS["G1"], rotation_from_rpy((0.0, 0.0, np.pi / 6.0)).T
-    velocity = np.column_stack([rng.uniform(0.45, 0.75, 400), rng.normal(0.0, 0.03, 400), np.zeros(400)])
-    state = run_filter(model, distort(velocity, np.zeros(3), np.full(3, -0.008) * [1, 1, 0], t), velocity, t)
-    assert abs(np.degrees(state[2])) < 0.15  # what the prior of the scale leaves
 
 
 @pytest.mark.parametrize("name", ["M5", "M6"])
@@ -247,13 +206,8 @@ def test_a_model_beside_others_in_its_group_is_the_model_alone(name, rng):
         kalman.Measurements(z[None], h[None], r[None], weight[None], np.ones((1, 60), dtype=bool), np.array([[gate]])),
     )
     after, k = group.standing(1), group.index[name]
-    expected = kalman.GaussianState(alone.x, alone.p)
-    if model.heave is not None:
-        rows = HeaveRows(1, model.n_state, parameters)
-        rows.add(stamps_ns, model.heave(seen)[:, None], alone.used[0])
-        expected, _ = with_heave(expected, rows.sums(), parameters.motion_std)
-    np.testing.assert_allclose(after.x[0, k], expected.x[0], atol=1e-12)
-    np.testing.assert_allclose(after.p[0, k], expected.p[0], atol=1e-12)
+    np.testing.assert_allclose(after.x[0, k], alone.x[0], atol=1e-12)
+    np.testing.assert_allclose(after.p[0, k], alone.p[0], atol=1e-12)
 
 
 def test_a_tilted_mounting_keeps_its_known_tilt_when_heave_is_zeroed(rng):

@@ -79,7 +79,7 @@ def test_an_axis_that_the_data_do_not_show_is_where_it_was_said_to_be_or_unknown
 
 
 def test_what_a_model_does_not_estimate_is_the_parameters_with_variance_minus_one(rng):
-    found = mounting_pose(MODELS["G1"], state_of("G1", rng), PARAMETERS)
+    found = mounting_pose(MODELS["M3"], state_of("M3", rng), PARAMETERS)
     assert found.position == PARAMETERS.lever_arm
     np.testing.assert_array_equal(found.covariance[:3, :3], -np.eye(3))
     beside = scale_and_delay(MODELS["F1"], state_of("F1", rng), PARAMETERS)
@@ -102,7 +102,7 @@ def test_scale_and_delay_are_what_was_set_and_what_was_found(rng):
 )
 def test_the_std_of_roll_pitch_and_yaw_is_that_of_angles_drawn_from_the_state(rng, rpy):
     """Of a DVL at 45 degrees, a roll of the body that is not known is as much pitch as roll."""
-    parameters, model = Parameters(mounting_rpy=rpy), MODELS["G1"]
+    parameters, model = Parameters(mounting_rpy=rpy), MODELS["full"]
     t = parameters.rotation_dvl_from_body
     p = np.zeros((model.n_state, model.n_state))
     p[:3, :3] = t @ np.diag([0.02, 0.001, 0.002]) ** 2 @ t.T

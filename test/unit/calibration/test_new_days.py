@@ -75,29 +75,10 @@ def test_held_out_samples_are_judged_with_the_delay_of_their_own_day():
     assert verification.held_out.corrected < 0.05 < verification.held_out.uncorrected
 
 
-def test_what_g1_knows_of_two_days_is_what_either_alone_tells_of_the_vehicle():
-    """Against the product of what each day alone says of all but the reference's error.
-
-    Of heave itself both days together know more: they show by how much it varies.
-    """
-    samples = [late(0.0, arm=(0.0, 0.0, 0.0)), late(0.0, seed=1, arm=(0.0, 0.0, 0.0))]
-    both = calibrate([*samples[0], *shifted(samples[1], NIGHT_NS)], NOISE).state("G1")
-    on = slice(0, 6)  # misalignment, scale, heave
-    prior = Calibrator(NOISE).state("G1")
-    information, vector = -np.linalg.inv(prior.p[on, on]), np.zeros(6)
-    for own in samples:
-        x, p = calibrate(own, NOISE).state("G1")
-        information = information + np.linalg.inv(p[on, on])
-        vector = vector + np.linalg.inv(p[on, on]) @ x[on]
-    p = np.linalg.inv(information)
-    assert np.all(np.abs(both.x[on] - p @ vector)[:5] < 0.05 * np.sqrt(np.diag(p)[:5]))
-    np.testing.assert_allclose(np.diag(both.p)[:5], np.diag(p)[:5], rtol=0.02)
-
-
 @pytest.mark.slow
 def test_how_samples_are_gathered_changes_nothing_about_days():
     one, other = found(), calibrate(two_days(), NOISE, block_size=40, verified=True)
-    for name in ("G1", "full", "F1", "A1"):
+    for name in ("full", "F1", "A1"):
         a, b = one.estimate(name), other.estimate(name)
         np.testing.assert_allclose(a.state, b.state, rtol=0, atol=1e-12)
         np.testing.assert_allclose(a.covariance, b.covariance, rtol=0, atol=1e-12)

@@ -6,77 +6,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from runs import MatchedRun, calibrate, make_samples, only
 
-from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.error_model import correct, correction_from_errors, errors_from_correction
-from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy, skew
+from dvl_calib_ros.calibration.numerics.error_model import correct
+from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.simulation.sensors import DvlErrors, equivalent_error_terms, measure_dvl
 
 SECOND = 1_000_000_000
-errors_at_5_degrees = st.lists(st.floats(-0.09, 0.09), min_size=5, max_size=5).map(np.array)
 
 
-# ---------------------------------------------------------------- correction parameters
-
-
-def test_a_correction_without_an_inverse_is_refused_alone_as_among_others():
-    nothing_is_left_of_x = np.array([0.0, 0.0, 0.0, 1.0, 0.0])
-    for correction in (nothing_is_left_of_x, np.array([np.zeros(5), nothing_is_left_of_x])):
-        with pytest.raises(np.linalg.LinAlgError):
-            errors_from_correction(correction)
-
-
-def test_many_corrections_at_once_give_what_each_gives_alone(rng):
-    corrections = rng.normal(0.0, 0.2, (50, 5))
-    together = errors_from_correction(corrections)
-    for index, correction in enumerate(corrections):
-        alone = errors_from_correction(correction)
-        np.testing.assert_allclose(together.errors[index], alone.errors, atol=1e-14)
-        np.testing.assert_allclose(together.jacobian[index], alone.jacobian, atol=1e-14)
-
-
-@given(errors_at_5_degrees)
-def test_correction_parameters_and_errors_are_each_others_inverse(errors):
-    correction = correction_from_errors(errors)
-    np.testing.assert_allclose(errors_from_correction(correction).errors, errors, atol=1e-14)
-
-
-@given(errors_at_5_degrees)
-def test_the_inverse_of_the_correction_is_the_error_model_but_for_its_symmetric_part(correction):
-    errors = errors_from_correction(correction).errors
-    inverse = np.linalg.inv(np.eye(3) - skew(correction[:3]) - np.diag([*correction[3:], 0.0]))
-    scale = np.array([*errors[3:], inverse[2, 2] - 1])
-    rest = inverse / (1 + scale[:, None]) - (np.eye(3) + skew(errors[:3]))
-    np.testing.assert_allclose(np.diag(rest)[:2], 0.0, atol=1e-14)
-    np.testing.assert_allclose(rest, rest.T, atol=1e-14)
-
-
-@given(errors_at_5_degrees)
-def test_the_covariance_is_carried_over_by_the_derivative_of_the_map(correction):
-    jacobian = errors_from_correction(correction).jacobian
-    for column in range(5):
-        step = 1e-6 * np.eye(5)[column]
-        plus, minus = errors_from_correction(correction + step), errors_from_correction(correction - step)
-        np.testing.assert_allclose(jacobian[:, column], (plus.errors - minus.errors) / 2e-6, atol=1e-8)
-
-
-# ---------------------------------------------------------------- G1: with GNSS
+# ---------------------------------------------------------------- full: with GNSS
 
 
 @pytest.mark.slow
-def test_noise_of_the_receiver_pulls_the_scale_of_m1_down_but_not_of_g1():
-    """Straight ahead at 1.5 m/s with 0.2 m/s of noise: M1 is pulled by -3 σ²/‖v‖² = -5.3 %, G1 is not."""
+def test_noise_of_the_receiver_pulls_the_scale_of_m1_down_but_not_of_full():
+    """Straight ahead at 1.5 m/s with 0.2 m/s of noise: M1 is pulled by -3 σ²/‖v‖² = -5.3 %, full is not."""
     parameters = Parameters(initial_std_scale=0.5, gnss_aided_std=0.2)
     found = []
     for seed in range(10):
         run = MatchedRun("straight", 600.0, gnss_std=0.2, dvl_std=0.01, seed=seed)
-        calibrator = calibrate(make_samples(run), parameters, models=("M1", "G1"))
-        found.append([calibrator.estimate(name).scale[0] for name in ("M1", "G1")])
+        calibrator = calibrate(make_samples(run), parameters, models=("M1", "full"))
+        found.append([calibrator.estimate(name).scale[0] for name in ("M1", "full")])
     pulled, free = np.mean(found, axis=0)
     assert pulled == pytest.approx(-3 * 0.04 / 1.5**2, rel=0.15)
     assert abs(free) < 0.002
@@ -89,50 +41,31 @@ def calibrated_on(velocity, measured, **parameters):
         for i, (v, g) in enumerate(zip(measured.tolist(), velocity.tolist(), strict=True))
         for sample in (ReferenceSample(i * SECOND, tuple(g)), DvlSample(i * SECOND, tuple(v)))
     ]
-    return calibrate(samples, Parameters(**parameters), models=("M3", "G1"))
+    return calibrate(samples, Parameters(**parameters), models=("M3", "full"))
 
 
-def test_g1_finds_a_scale_of_its_own_for_each_axis_that_the_motion_shows(rng):
+def test_full_finds_a_scale_of_its_own_for_each_axis_that_the_motion_shows(rng):
     scale = np.array([0.005, -0.01, 0.0])
     velocity = np.column_stack([rng.uniform(1, 2, 400), rng.normal(0, 0.6, 400), np.zeros(400)])
     estimate = calibrated_on(velocity, velocity * (1 + scale), gnss_aided_std=0.01, initial_std_scale=0.02).estimate(
-        "G1"
+        "full"
     )
     np.testing.assert_allclose(estimate.scale[:2], scale[:2], atol=3e-4)
 
 
-@pytest.mark.parametrize("dvl_bias_std", [0.0, 0.01])
-def test_noise_of_the_dvl_does_not_make_a_scale_of_an_axis_that_hardly_moves(rng, dvl_bias_std):
-    """Its own noise would pull the scale of y by (0.01/0.06)² = 3 %; with a bias, at one speed, that of x to 1.6 %."""
-    velocity = np.column_stack([np.full(6000, 1.5), rng.normal(0, 0.06, 6000), np.zeros(6000)])
-    parameters = {"gnss_aided_std": 0.01, "dvl_bias_std": dvl_bias_std}
-    estimate = calibrated_on(velocity, velocity + rng.normal(0, 0.01, velocity.shape), **parameters).estimate("G1")
-    assert not estimate.observability[4].observed
-    assert abs(estimate.scale[1]) < 0.001
-    assert abs(estimate.scale[0]) < (0.003 if dvl_bias_std else 0.001)
-
-
 @pytest.mark.parametrize("degrees", [(5.0, -0.5, 2.5), (-1.0, -2.5, -3.0)])
-def test_g1_finds_5_degrees_but_for_what_the_error_model_cannot_hold(degrees, rng):
-    """At up to 2 m/s; M3 is exact in this noiseless case, too, G1 is so with a noisy reference as well."""
+def test_full_finds_5_degrees_but_for_what_the_error_model_cannot_hold(degrees, rng):
+    """At up to 2 m/s; M3 is exact in this noiseless case, full is so with a noisy reference as well."""
     velocity = np.column_stack([rng.uniform(1, 2, 400), rng.normal(0, 0.4, 400), np.zeros(400)])
     errors = DvlErrors(misalignment_rpy=tuple(np.deg2rad(degrees)), scale=(0.005,) * 3)
     measured = measure_dvl(velocity, errors, np.eye(3), rng)
     wide = {"initial_std_misalignment": 0.5, "initial_std_scale": 0.5, "gnss_aided_std": 0.001, "gnss_axes": "xyz"}
-    estimate = calibrated_on(velocity, measured, **wide).estimate("G1")
+    estimate = calibrated_on(velocity, measured, **wide).estimate("full")
     misalignment, scale = equivalent_error_terms(errors)
     np.testing.assert_allclose(estimate.misalignment, misalignment, atol=2.5e-3)
     np.testing.assert_allclose(estimate.scale[:2], scale[:2], atol=5e-4)
     residual = np.linalg.norm(estimate.corrected_velocity(measured, np.eye(3)) - velocity, axis=1)
     assert residual.max() < 0.01  # the symmetric part of a rotation, which neither ψ and κ nor φ and δk hold
-
-
-def test_g1_takes_a_saved_state_and_gives_it_back(rng):
-    samples = make_samples(MatchedRun("box", 120.0, phi=(0.05, -0.08, 0.06), scale=0.01, gnss_std=0.05, dvl_std=0.01))
-    state = calibrate(samples, models=("G1",)).state("G1")
-    again = Calibrator(Parameters(), initial={"G1": state}).state("G1")
-    np.testing.assert_allclose(again.x, state.x, atol=1e-14)
-    np.testing.assert_allclose(again.p, state.p, atol=1e-14)
 
 
 # ---------------------------------------------------------------- A1, F1: without GNSS
@@ -260,7 +193,7 @@ def test_auto_runs_a1_on_one_heading_too_where_the_vehicle_is_trimmed_and_says_s
 
 def test_with_gnss_headings_change_nothing():
     segments = calibrate(make_samples(MatchedRun("box", 120.0, gnss_std=0.05))).selection.segments
-    assert [segment.model for segment in segments] == ["F1", "G1", "full"]
+    assert [segment.model for segment in segments] == ["F1", "full"]
 
 
 def test_f1_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):

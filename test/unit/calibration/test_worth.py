@@ -31,7 +31,7 @@ EASTWARD = RecentMotion(1.5, 0.0, True, 0.05**2)
 def test_the_predicted_drift_is_that_of_calibrations_drawn_from_the_covariance(yaw):
     parameters = Parameters(mounting_rpy=(math.radians(20.0), 0.0, math.radians(yaw)))
     rng = np.random.default_rng(1)
-    model = MODELS["G1"]
+    model = MODELS["full"]
     root = 1e-3 * rng.normal(size=(model.n_state, model.n_state))
     drift = predicted_drift(model, root @ root.T, parameters)
     t = rotation_from_rpy(parameters.mounting_rpy).T
@@ -43,27 +43,27 @@ def test_the_predicted_drift_is_that_of_calibrations_drawn_from_the_covariance(y
 
 
 def test_a_leg_is_predicted_to_bring_what_the_filter_learns_on_it():
-    parameters = Parameters(gnss_aided_std=0.05, model="G1")
-    before = calibrate([], parameters).estimate("G1")
-    after = calibrate(make_samples(replace(RUN, trajectory="straight", seconds=60.0)), parameters).estimate("G1")
+    parameters = Parameters(gnss_aided_std=0.05, model="full")
+    before = calibrate([], parameters).estimate("full")
+    after = calibrate(make_samples(replace(RUN, trajectory="straight", seconds=60.0)), parameters).estimate("full")
     course = _manoeuvres(EASTWARD)["east"][1]
-    gain = _information(MODELS["G1"], parameters, EASTWARD, *course)
+    gain = _information(MODELS["full"], parameters, EASTWARD, *course)
     predicted = np.linalg.inv(np.linalg.inv(before.filter_covariance) + gain)
-    expected = predicted_drift(MODELS["G1"], after.filter_covariance, parameters)
-    assert predicted_drift(MODELS["G1"], predicted, parameters) == pytest.approx(expected, rel=0.1)
+    expected = predicted_drift(MODELS["full"], after.filter_covariance, parameters)
+    assert predicted_drift(MODELS["full"], predicted, parameters) == pytest.approx(expected, rel=0.1)
 
 
 def test_the_noise_of_a_second_is_what_the_information_was_gathered_with():
-    parameters = Parameters(gnss_aided_std=0.05, model="G1")
-    estimate = calibrate(make_samples(replace(RUN, trajectory="straight", seconds=120.0)), parameters).estimate("G1")
+    parameters = Parameters(gnss_aided_std=0.05, model="M3")
+    estimate = calibrate(make_samples(replace(RUN, trajectory="straight", seconds=120.0)), parameters).estimate("M3")
     assert noise_of_a_second(estimate, parameters, 120.0, 1.5**2) == pytest.approx(0.05**2, rel=0.1)
-    assert noise_of_a_second(calibrate([], parameters).estimate("G1"), parameters, 0.0, 0.0) == 0.05**2
+    assert noise_of_a_second(calibrate([], parameters).estimate("M3"), parameters, 0.0, 0.0) == 0.05**2
 
 
 def said(seconds, motion=EASTWARD, before=None, trajectory="straight", **changes):
-    parameters = Parameters(gnss_aided_std=0.05, model="G1", **changes)
+    parameters = Parameters(gnss_aided_std=0.05, model="full", **changes)
     samples = make_samples(replace(RUN, trajectory=trajectory, seconds=seconds)) if seconds else []
-    return outlook(calibrate(samples, parameters).estimate("G1"), parameters, motion, before)
+    return outlook(calibrate(samples, parameters).estimate("full"), parameters, motion, before)
 
 
 def test_after_one_leg_another_heading_or_a_turn_is_asked_for_with_the_time_it_takes():

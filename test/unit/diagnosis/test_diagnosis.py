@@ -1218,8 +1218,8 @@ def test_what_was_found_can_be_applied_and_the_gap_is_gone(bag_with_lever_arm, t
     assert found["gap"]["before_mps"] > 1.1 * found["gap"]["noise_floor_mps"]
     errors = []
     for options in ([], ["--params", applied]):
-        succeed(capsys, "replay", bag_with_lever_arm, "--json", after, "--models", "G1", *options)
-        errors.append(json.loads(after.read_text())["verification"]["G1"]["held_out"]["corrected_mps"])
+        succeed(capsys, "replay", bag_with_lever_arm, "--json", after, "--models", "M3", *options)
+        errors.append(json.loads(after.read_text())["verification"]["M3"]["held_out"]["corrected_mps"])
     assert errors[1] < errors[0]
 
 

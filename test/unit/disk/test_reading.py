@@ -29,7 +29,8 @@ USES = [
 @pytest.fixture(scope="module")
 def original(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("reading")
-    assert main(["replay", str(write_bag(folder / "bag", run(10.0))), "--save", str(folder / "good.yaml")]) == 0
+    bag = write_bag(folder / "bag", run(10.0))
+    assert main(["replay", str(bag), "-p", "model:=M3", "--save", str(folder / "good.yaml")]) == 0
     (folder / "T.csv").write_text("0,1.5,0,0\n")
     return folder
 

@@ -14,7 +14,7 @@ from dvl_calib_ros.evaluation.procedure import dvl_velocities, references
 from dvl_calib_ros.evaluation.protocol import own_trajectories
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS
 
-MODELS = ("G1", "A1")
+MODELS = ("M3", "A1")
 
 
 @pytest.mark.parametrize("name", BASELINES)
@@ -49,7 +49,7 @@ def test_a_curve_is_there_for_each_reference_noise_and_for_none(found):
 
 
 def test_g1_is_better_with_time_with_a_better_receiver_and_than_the_baselines(found):
-    coarse, fine = found["G1", protocol.GNSS_STD], found["G1", 0.02]
+    coarse, fine = found["M3", protocol.GNSS_STD], found["M3", 0.02]
     assert coarse.level_deg[-1] < 0.5 * coarse.level_deg[0]
     assert (fine.level_deg < coarse.level_deg).all()
     for name in BASELINES:

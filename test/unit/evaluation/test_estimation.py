@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from runs import feed
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS, Needs
+from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import SampleUse
 from dvl_calib_ros.evaluation.estimation import SensorData, aligned, estimate, streams_of, true_prior
 from dvl_calib_ros.evaluation.procedure import sensor_data
 from dvl_calib_ros.evaluation.protocol import own_trajectories
+from dvl_calib_ros.evaluation.validation_study import EVALUATED
 
 N_SAMPLES, N_VARIANTS = 80, 3
 HELD = slice(30, 35)  # five equal samples
@@ -45,7 +46,7 @@ def calibrated(data: SensorData, variant: int, parameters: Parameters):
 
 def check(data: SensorData, parameters: Parameters):
     variants = aligned(data, parameters)
-    states = estimate(BY_VELOCITY, data, parameters, [N_SAMPLES], [])
+    states = estimate(EVALUATED, data, parameters, [N_SAMPLES], [])
     for variant in range(N_VARIANTS):
         calibrator, (row, verdict, pairing) = calibrated(data, variant, parameters)
         own = slice(variant * N_SAMPLES, (variant + 1) * N_SAMPLES)
@@ -54,13 +55,10 @@ def check(data: SensorData, parameters: Parameters):
         refused = np.setdiff1d(np.arange(N_SAMPLES), row)
         assert len(refused) == calibrator.counts["dvl"]["invalid"]
         assert not any(has[variant, refused].any() for has in variants.has.values())
-        for name, model in ((name, MODELS[name]) for name in BY_VELOCITY):
+        for name, model in ((name, MODELS[name]) for name in EVALUATED):
             expected = calibrator.estimate(name)
-            if not model.needs_prior and model.extends is None:
+            if not model.needs_prior:
                 assert variants.has[model.needs][variant].sum() == expected.used + expected.gated
-            if model.extends is not None:  # which goes by references, not by DVL samples
-                continue
-            # where G1's short Newton steps end differs by 1e-10 rad
             np.testing.assert_allclose(states[name].x[-1, variant], expected.state, rtol=0, atol=1e-9)
             np.testing.assert_allclose(states[name].p[-1, variant], expected.filter_covariance, rtol=0, atol=1e-9)
     return variants

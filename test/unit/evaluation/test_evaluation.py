@@ -123,11 +123,11 @@ def test_the_truth_to_find_is_in_the_frame_of_the_estimates(runs):
     run = runs["T02"]
     data = SensorData(run, dvl_velocities(run, seed=0), references(run, seed=0, gnss_std=0.0))
     parameters = Parameters(**DEFAULTS, gnss_aided_std=0.005, initial_std_misalignment=0.5, initial_std_scale=0.1)
-    found = estimate(("G1",), data, parameters, [len(data.run.time)], [])["G1"].x[0]
-    truth = true_state(MODELS["G1"])
+    found = estimate(("M3",), data, parameters, [len(data.run.time)], [])["M3"].x[0]
+    truth = true_state(MODELS["M3"])
     error = found[:, : truth.shape[1]] - truth
     assert np.degrees(np.abs(error[:, 1:3]).max()) < 0.4
-    assert np.abs(error[:, 3]).max() < 0.01
+    assert np.abs(error[:, 3]).max() < 0.015  # one scale for all axes
 
 
 def test_vrmse_from_moments_is_that_of_the_samples(rng):
@@ -183,11 +183,11 @@ def test_calibrations_are_judged_on_samples_that_they_had_not_seen(evaluation):
     }
     for each in found.values():
         assert sum(each.verdicts.values()) == len(protocol.MISALIGNMENTS_DEG)
-    g1 = found["E4", "G1"]
+    m3 = found["E4", "M3"]
     gnss_noise = 0.2 * np.sqrt(3)
-    assert gnss_noise * 0.95 < g1.corrected < gnss_noise * 1.05
-    assert g1.corrected < g1.uncorrected - 0.005
-    assert g1.corrected == pytest.approx(g1.predicted, rel=0.03)
+    assert gnss_noise * 0.95 < m3.corrected < gnss_noise * 1.05
+    assert m3.corrected < m3.uncorrected - 0.005
+    assert m3.corrected == pytest.approx(m3.predicted, rel=0.03)
 
 
 def test_a_verdict_is_worked_out_with_the_models_that_are_evaluated_alone(runs, monkeypatch):
@@ -196,18 +196,18 @@ def test_a_verdict_is_worked_out_with_the_models_that_are_evaluated_alone(runs, 
     monkeypatch.setattr(
         validation_study, "Calibrator", lambda *given, **named: made.append(Calibrator(*given, **named)) or made[-1]
     )
-    procedure = Procedure(runs, ("M4", "G1"), protocol.SETS[:1], Parameters(**DEFAULTS), studies=False)
+    procedure = Procedure(runs, ("M4", "M3"), protocol.SETS[:1], Parameters(**DEFAULTS), studies=False)
     held_out, failures = validation_study.verify_set(procedure, 0, procedure.sets[0])
-    assert [each.model for each in held_out] == ["M4", "G1"] and not failures
-    assert {name for each in made for name in each.result().estimates} == {"M4", "G1"}
+    assert [each.model for each in held_out] == ["M4", "M3"] and not failures
+    assert {name for each in made for name in each.result().estimates} == {"M4", "M3"}
 
 
 def test_errors_in_variables_pull_the_scale_as_predicted(evaluation):
     study = evaluation.errors_in_variables
-    assert dict(zip(study.models, study.noisy_axes, strict=True)) == {"M1": 3, "M2": 1, "M3": 2, "M4": 1, "G1": 0}
+    assert dict(zip(study.models, study.noisy_axes, strict=True)) == {"M1": 3, "M2": 1, "M3": 2, "M4": 1}
     assert (np.abs(study.measured - study.predicted) < 4 * study.standard_error + 0.1 * np.abs(study.predicted)).all()
     at_300_mm = study.measured[:, -1]
-    assert at_300_mm[0] < -0.05 and abs(at_300_mm[-1]) < 0.01
+    assert at_300_mm[0] < -0.1 and abs(at_300_mm[-1]) < 0.05
 
 
 def test_a_run_of_one_heading_is_told_from_one_of_many(evaluation):

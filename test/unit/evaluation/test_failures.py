@@ -18,8 +18,8 @@ from dvl_calib_ros.evaluation.results import Failure
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS, evaluate
 
 N_SAMPLES, ENDS = 60, (20, 60)
-MODELS = ("M4", "G1", "A1")
-COMMAND = ("evaluate", "--models", "M4,G1", "--sets", "E4", "--jobs", "1")
+MODELS = ("M4", "M3", "A1")
+COMMAND = ("evaluate", "--models", "M4,M3", "--sets", "E4", "--jobs", "1")
 
 
 @pytest.fixture
@@ -44,12 +44,12 @@ def test_one_variant_of_one_model_that_raises_is_named_and_costs_no_other(data, 
     parameters = Parameters(**DEFAULTS)
     whole = estimate(MODELS, data, parameters, ENDS, [])
     failures: list[Failure] = []
-    refuse(monkeypatch, "G1", data.velocity_dvl[1, 5])
+    refuse(monkeypatch, "M3", data.velocity_dvl[1, 5])
     found = estimate(MODELS, data, parameters, ENDS, failures)
-    assert [str(each) for each in failures] == ["G1, T03, combination 1: LinAlgError: Singular matrix"]
-    assert np.isnan(found["G1"].x[:, 1]).all() and np.isnan(found["G1"].p[:, 1]).all()
+    assert [str(each) for each in failures] == ["M3, T03, combination 1: LinAlgError: Singular matrix"]
+    assert np.isnan(found["M3"].x[:, 1]).all() and np.isnan(found["M3"].p[:, 1]).all()
     for name in MODELS:
-        left = [0, 2] if name == "G1" else [0, 1, 2]
+        left = [0, 2] if name == "M3" else [0, 1, 2]
         np.testing.assert_allclose(found[name].x[:, left], whole[name].x[:, left], rtol=0, atol=1e-12)
         np.testing.assert_allclose(found[name].p[:, left], whole[name].p[:, left], rtol=0, atol=1e-12)
 
@@ -58,7 +58,7 @@ def test_one_variant_of_one_model_that_raises_is_named_and_costs_no_other(data, 
 def test_the_command_counts_what_raised_says_which_and_why_and_goes_on(monkeypatch, tmp_path, capsys):
     told = sensor_data(own_trajectories()["T15"], seed=0).velocity_dvl[7, 5]
     assert main([*COMMAND, "--json", str(tmp_path / "whole.json")]) == 0
-    refuse(monkeypatch, "G1", told)
+    refuse(monkeypatch, "M3", told)
     drawn(monkeypatch)  # the pictures are looked at elsewhere
     outputs = [
         "--json",
@@ -69,18 +69,18 @@ def test_the_command_counts_what_raised_says_which_and_why_and_goes_on(monkeypat
         str(tmp_path / "e.html"),
     ]
     assert main([*COMMAND, *outputs]) == 0
-    why = "G1, T15, seed 0, combination 7: LinAlgError: Singular matrix"
+    why = "M3, T15, seed 0, combination 7: LinAlgError: Singular matrix"
     assert f"1 failed and is in none of the figures: {why}" in " ".join(capsys.readouterr().err.split())
     assert "combination 7: LinAlgError" in (tmp_path / "e.html").read_text()
     whole, found = (json.loads((tmp_path / name).read_text()) for name in ("whole.json", "e.json"))
     assert whole["failures"] == []
     assert [(each["what"], each["run"], each["combination"], each["seed"]) for each in found["failures"]] == [
-        ("G1", "T15", 7, 0)
+        ("M3", "T15", 7, 0)
     ]
     assert found["avg_vrmse"]["E4"]["M4"] == pytest.approx(whole["avg_vrmse"]["E4"]["M4"], rel=1e-12)
-    one, other = (each["avg_vrmse"]["E4"]["G1"] for each in (found, whole))
+    one, other = (each["avg_vrmse"]["E4"]["M3"] for each in (found, whole))
     assert one != other and one == pytest.approx(other, rel=0.2)
-    assert found["coverage"]["G1"]["errors"] == whole["coverage"]["G1"]["errors"] - 1
+    assert found["coverage"]["M3"]["errors"] == whole["coverage"]["M3"]["errors"] - 1
 
 
 @pytest.mark.slow

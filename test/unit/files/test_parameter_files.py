@@ -273,7 +273,7 @@ def test_angles_of_an_override_may_be_in_degrees_and_ros_gets_radians(text, expe
 
 
 def test_an_override_that_is_no_angle_goes_to_ros_as_it_was_typed():
-    for text in ("min_speed:=0.5", "model:=G1", "result_file:=", "result_file:=a b.yaml", "lever_arm:=[1,2,3]"):
+    for text in ("min_speed:=0.5", "model:=M3", "result_file:=", "result_file:=a b.yaml", "lever_arm:=[1,2,3]"):
         assert ros_override(text) == text
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import os
 import shlex
@@ -50,7 +49,7 @@ def bag(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def result(bag) -> Result:
     return replayed(
-        bag, mounting_rpy=MOUNTING, lever_arm=(1.0, 0.0, -0.5), dvl_position="told", gate_probability=0.0, model="G1"
+        bag, mounting_rpy=MOUNTING, lever_arm=(1.0, 0.0, -0.5), dvl_position="told", gate_probability=0.0, model="full"
     ).result
 
 
@@ -78,19 +77,18 @@ def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
     loaded = load_initial_calibration(saved, MOUNTING)
     for name, estimate in result.estimates.items():
         x, p = estimate.state.copy(), estimate.recording_covariance.copy()
-        if name in ("G1", "full"):  # the constant error of the reference
-            of_day = [6, 7] if name == "G1" else [16, 17, 18, 19]
+        if name == "full":  # the delay and the constant error of the reference
+            of_day = [16, 17, 18, 19]
             x[of_day] = p[of_day] = p[:, of_day] = 0.0
             p[of_day, of_day] = Parameters().reference_offset_std ** 2
-            if name == "full":
-                p[16, 16] = REFERENCE_DELAY_STD_S**2
+            p[16, 16] = REFERENCE_DELAY_STD_S**2
         np.testing.assert_array_equal(loaded[name].x, x)
         np.testing.assert_array_equal(loaded[name].p, p)
 
 
 @pytest.fixture(scope="module")
 def of_biased(bag) -> Result:
-    return replayed(bag, model="G1", dvl_bias_std=0.01).result
+    return replayed(bag, model="full", dvl_bias_std=0.01).result
 
 
 def test_what_a_bias_of_the_dvl_makes_comes_back_and_two_files_of_one_dvl_share_it(of_biased, tmp_path):
@@ -99,7 +97,7 @@ def test_what_a_bias_of_the_dvl_makes_comes_back_and_two_files_of_one_dvl_share_
     found = load_extrinsics(path, "monday")
     assert found.dvl == "dvl_a50, flu"
     yaw_by_across = found.by_bias[2, 1]  # at about 1 m/s
-    assert abs(yaw_by_across) == pytest.approx(0.01, rel=0.2)
+    assert 0.002 < abs(yaw_by_across) < 0.012
     again = Difference.between(found, replace(found, name="tuesday"))
     other = Difference.between(found, replace(found, dvl="dvl_port, flu"))
     assert other.covariance[2, 2] - again.covariance[2, 2] > 1.9 * yaw_by_across**2
@@ -112,7 +110,7 @@ def test_a_file_of_before_the_bias_was_kept_is_read_and_one_that_claims_too_much
     save_text(path, result_text(document))
     with pytest.raises(InputError, match="damaged, its by_dvl_bias is more than its covariance"):
         load_extrinsics(path, "a")
-    document["models"]["G1"]["by_dvl_bias"] = [[1.0, 2.0]]
+    document["models"]["full"]["by_dvl_bias"] = [[1.0, 2.0]]
     save_text(path, result_text(document))
     with pytest.raises(InputError, match="damaged, or of another version"):
         load_extrinsics(path, "a")
@@ -397,22 +395,6 @@ def test_a_file_of_before_the_end_was_announced_is_read(saved, result):
     assert [*load_initial_calibration(change(saved, as_before))["M7"].x] == [*result.estimates["M7"].state]
 
 
-def test_a_file_of_before_g1_had_the_error_of_the_reference_is_read_with_its_prior(saved):
-    now = load_initial_calibration(saved)["G1"]
-
-    def as_before(content):
-        g1 = content["models"]["G1"]
-        g1["state_names"], g1["state"] = g1["state_names"][:6], g1["state"][:6]
-        g1["covariance"] = [row[:6] for row in g1.pop("covariance_of_recording")[:6]]
-        if content["model"] == "G1":
-            content.update(copy.deepcopy(g1))
-
-    before = load_initial_calibration(change(saved, as_before))["G1"]
-    np.testing.assert_array_equal(before.x, [*now.x[:6], 0.0, 0.0])
-    np.testing.assert_array_equal(before.p[:6, :6], now.p[:6, :6])
-    np.testing.assert_array_equal(before.p[6:], np.eye(8)[6:] * Parameters().reference_offset_std ** 2)
-
-
 def test_files_that_are_no_result_file_are_refused(tmp_path):
     with pytest.raises(InputError, match="no such result file"):
         load_initial_calibration(tmp_path / "missing.yaml")
@@ -421,7 +403,7 @@ def test_files_that_are_no_result_file_are_refused(tmp_path):
         load_initial_calibration(tmp_path / "garbage.yaml")
 
 
-def test_a_run_continued_from_a_file_ends_as_if_both_had_been_one(tmp_path):
+def test_a_filter_continued_from_a_file_ends_as_if_both_had_been_one(tmp_path):
     samples = steady_run(400)
     whole = estimates(write_bag(tmp_path / "whole", samples))
     first = replayed(write_bag(tmp_path / "first", samples[:400])).result
@@ -429,9 +411,10 @@ def test_a_run_continued_from_a_file_ends_as_if_both_had_been_one(tmp_path):
     second = write_bag(tmp_path / "second", samples[400:])
     continued = estimates(second, initial_calibration=str(tmp_path / "first.yaml"))
     for name, expected in whole.items():
-        # G1's prior is on errors that its linear filter does not hold, so a cut costs it the second order; the motion's
-        # news is shared with the sample before, which the first of a run has not (F1, A1)
-        exact = not (MODELS[name].in_correction_parameters or MODELS[name].motion_is_noise)
+        if MODELS[name].estimator:  # works in whole blocks, and each run has a rest
+            continue
+        # the motion's news is shared with the sample before, which the first of a run has not (F1, A1)
+        exact = not MODELS[name].motion_is_noise
         tolerance = {"rel": 1e-9, "abs": 1e-12} if exact else {"rel": 5e-3, "abs": 3e-4}
         assert continued[name] == pytest.approx(expected, **tolerance)
     assert estimates(second)["M3"] != pytest.approx(whole["M3"], rel=1e-3)

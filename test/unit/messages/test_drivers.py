@@ -187,7 +187,8 @@ def test_a_mounting_in_the_urdf_of_the_drivers_own_frame_does_as_well_with_axes_
 
 def test_the_transform_of_the_result_is_of_the_drivers_frame_and_the_mounting_of_what_is_calibrated(tmp_path):
     bag = write_driver_bag(tmp_path / "bag", steady_run(100), MARINE)
-    assert main(["replay", str(bag), "-p", "dvl_position:=told", "--save", str(tmp_path / "result.yaml")]) == 0
+    options = ["-p", "model:=M3", "-p", "dvl_position:=told", "--save", str(tmp_path / "result.yaml")]
+    assert main(["replay", str(bag), *options]) == 0
     mounting = load_yaml(tmp_path / "result.yaml", "result file")["mounting"]
     words = mounting["static_transform_publisher"].split()
     frame = rotation_from_quaternion([float(words[words.index(f"--{name}") + 1]) for name in ("qx", "qy", "qz", "qw")])
@@ -453,7 +454,7 @@ def test_a_motion_is_taken_from_an_odometry_reference_too(tmp_path):
 def test_the_replay_says_what_the_dvls_data_are_in_the_terminal_and_in_json(tmp_path, capsys):
     changes = {5: lambda m: setattr(m, "num_good_beams", 1)}
     bag = write_driver_bag(tmp_path / "bag", steady_run(50), MARINE, changes=changes)
-    assert main(["replay", str(bag), "-v", "--json", str(tmp_path / "out.json")]) == 0
+    assert main(["replay", str(bag), "-v", "-p", "model:=M3", "--json", str(tmp_path / "out.json")]) == 0
     said = "marine_acoustic_msgs/msg/Dvl, converted from forward-right-down to forward-left-up"
     shown = capsys.readouterr().out
     assert said in shown and "1 few beams" in shown

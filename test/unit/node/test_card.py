@@ -62,7 +62,7 @@ def test_rates_are_those_of_the_last_seconds_and_ages_since_something_came():
 
 
 def test_the_card_has_the_estimate_its_worth_and_the_heading():
-    calibrator = calibrate(make_samples(RUN), Parameters(model="G1"))
+    calibrator = calibrate(make_samples(RUN), Parameters(model="full"))
     card = Card(0.0)
     values(card, Going(calibrator, 1.0), counts(1), 1.0)
     said = values(card, Going(calibrator, 2.0), counts(6), 2.0)
@@ -70,7 +70,7 @@ def test_the_card_has_the_estimate_its_worth_and_the_heading():
     drift = predicted_drift_of(calibrator, estimate)
     assert float(said["worth"]) == pytest.approx(drift.both, abs=0.01) and said["target"] == "2"
     assert float(said["mounting yaw [deg]"]) == pytest.approx(-math.degrees(0.05), abs=0.5)
-    assert said["sigma mounting arm x [m]"] == "not estimated" and float(said["sigma mounting yaw [deg]"]) < 1.0
+    assert 0.0 < float(said["sigma mounting arm x [m]"]) < 0.2 and float(said["sigma mounting yaw [deg]"]) < 1.0
     motion = calibrator.latest_motion()
     sector = SECTORS[round((90.0 - math.degrees(motion.heading)) / 45.0) % 8]
     assert motion.in_earth and 0.8 < motion.speed < 1.8
@@ -89,7 +89,7 @@ def test_what_to_drive_next_is_thought_of_now_and_then(monkeypatch):
 
     real = module.outlook
     monkeypatch.setattr(module, "outlook", lambda *given: calls.append(1) or real(*given))
-    card, calibrator = Card(0.0), calibrate(make_samples(RUN), Parameters(model="G1"))
+    card, calibrator = Card(0.0), calibrate(make_samples(RUN), Parameters(model="full"))
     for second in range(11):
         values(card, calibrator, counts(second), float(second))
     assert len(calls) == 1 + 10 // THOUGHT_OF_EVERY_S
@@ -107,9 +107,9 @@ def looks(card, calibrator, factors, rate=1.0, since_s=0.0):
 def at_the_goal() -> Calibrator:
     """A calibration whose predicted drift is 0.9 of its target."""
     samples = make_samples(RUN)
-    known = calibrate(samples, Parameters(model="G1"))
+    known = calibrate(samples, Parameters(model="full"))
     target = predicted_drift_of(known, known.estimate()).both / 0.9
-    return calibrate(samples, Parameters(model="G1", target_drift=target))
+    return calibrate(samples, Parameters(model="full", target_drift=target))
 
 
 def test_bars_that_are_full_and_what_to_drive_next_say_the_same_at_once(at_the_goal):
@@ -168,14 +168,14 @@ def test_a_sigma_that_has_grown_for_good_takes_good_enough_back_and_says_so_unti
 def test_another_model_takes_good_enough_back_at_once_and_is_named():
     worth, drift = RecentWorth(), PredictedDrift(1.0, 1.0, 1.4)
     for second in range(40):
-        worth.look("G1", drift, 2.0, float(second), rejected=False)
+        worth.look("full", drift, 2.0, float(second), rejected=False)
     assert worth.is_good and worth.taken_back is None
     worth.look("A1", drift, 2.0, 40.0, rejected=False)
     assert not worth.is_good and "A1" in worth.taken_back.sentence and worth.seconds_left(41.0) == STANDS_S - 1.0
 
 
 def test_a_standing_vehicle_drives_no_heading():
-    card, calibrator = Card(0.0), calibrate(make_samples(RUN), Parameters(model="G1"))
+    card, calibrator = Card(0.0), calibrate(make_samples(RUN), Parameters(model="full"))
     for second in range(5):
         said = values(card, calibrator, counts(7), float(second))
     assert sum(float(said[f"driven {name} [s]"]) for name in SECTORS) == 0.0
@@ -226,7 +226,7 @@ def test_a_time_that_runs_out_as_promised_is_without_a_word_and_a_vehicle_that_l
 
 
 def test_the_time_that_is_told_includes_that_for_which_the_goal_has_to_stand_and_counts_down():
-    calibrator = calibrate(make_samples(RUN), Parameters(model="G1", target_drift=8.0))
+    calibrator = calibrate(make_samples(RUN), Parameters(model="full", target_drift=8.0))
     said = list(looks(Card(0.0), calibrator, [1.2] * 8))
     seconds = [float(each["seconds"]) for each in said]
     assert seconds[0] > STANDS_S and float(said[0]["seconds spread"]) == pytest.approx(SPREAD * seconds[0], abs=1.0)

@@ -71,7 +71,7 @@ class _Waits:
 
 def first_known(worker) -> int:
     """Stamp (ns) of the DVL sample from which on a running calibration knows how the clocks stand."""
-    calibrator = Calibrator(Parameters(), worker=worker, models=("G1", "full"))
+    calibrator = Calibrator(Parameters(), worker=worker, models=("full",))
     feed = {DvlSample: calibrator.feed_dvl, ReferenceSample: calibrator.feed_reference, ImuSample: calibrator.feed_imu}
     for sample in make_samples(MatchedRun("box", 95.0, frame=VelocityFrame.ENU, gnss_std=0.01, **ONE_HERTZ)):
         feed[type(sample)](sample)

@@ -16,11 +16,11 @@ from dvl_calib_ros.calibration.results.results import Result
 
 @cache
 def straight(yaw: int) -> Result:
-    """G1 on a straight leg, whose vehicle does not roll, with a DVL that is mounted with this yaw (degrees)."""
+    """`full` on a straight leg, whose vehicle does not roll, with a DVL that is mounted with this yaw (degrees)."""
     rpy = (0.0, 0.0, float(np.radians(yaw)))
     run = MatchedRun("straight", 60.0, dvl_std=0.01, gnss_std=0.01, mounting_rpy=rpy)
-    result = calibrate(make_samples(run), Parameters(mounting_rpy=rpy), models=("G1",)).result()
-    return replace(result, selected="G1")
+    result = calibrate(make_samples(run), Parameters(mounting_rpy=rpy), models=("full",)).result()
+    return replace(result, selected="full")
 
 
 @pytest.mark.parametrize("yaw", [0, 30, 45, 90, 180])

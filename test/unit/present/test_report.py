@@ -201,10 +201,12 @@ def test_the_data_of_an_explorable_figure_is_what_the_figure_draws():
     seconds = np.arange(3000)
     time = TimeAxis(SECOND * seconds)
     value = np.where(seconds == 7, np.nan, np.sin(seconds / 300.0))
-    figure = estimate_over_time(time, SECOND * seconds, [ModelLine("G1", value, 0.5 + 0.0 * value)], "G1", "roll, °")
+    figure = estimate_over_time(
+        time, SECOND * seconds, [ModelLine("full", value, 0.5 + 0.0 * value)], "full", "roll, °"
+    )
     plot = json.loads(zlib.decompress(base64.b64decode(explorable(figure))))
     (line,), (sleeve,) = plot["lines"], plot["sleeves"]
-    assert (line["name"], plot["y_label"], plot["x_label"]) == ("G1", "roll, °", "time from the start, min")
+    assert (line["name"], plot["y_label"], plot["x_label"]) == ("full", "roll, °", "time from the start, min")
     assert 500 <= len(line["x"]) == len(line["y"]) <= 1500 and len(sleeve["x"]) > 500
     expected = np.interp(60.0 * np.array(line["x"]), seconds, np.sin(seconds / 300.0))
     np.testing.assert_allclose(np.array(line["y"], dtype=float), expected, atol=1e-3)
@@ -226,7 +228,7 @@ def test_the_points_of_a_track_lie_where_the_map_shows_them():
 
 
 def test_a_figure_that_is_not_over_time_has_no_data_for_the_script():
-    assert explorable(held_out_errors(["G1"], *np.ones((3, 1)))) == ""
+    assert explorable(held_out_errors(["full"], *np.ones((3, 1)))) == ""
 
 
 # ------------------------------------------------------------------ unusual data
