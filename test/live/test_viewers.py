@@ -21,7 +21,7 @@ from dvl_calib_ros.node.status import status_name
 
 FOXGLOVE = ROOT / "config" / "foxglove_layout.json"
 PLOTJUGGLER = ROOT / "config" / "plotjuggler_layout.xml"
-WORDS = {"model": "full", "convergence": "coarse", "gnss": "GNSS is available"}
+WORDS = {"model": "full", "convergence": "collecting", "gnss": "GNSS is available"}
 
 
 def twist(stamp: int, frame_id: str, *velocity: float) -> TwistWithCovarianceStamped:

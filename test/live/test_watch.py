@@ -281,7 +281,7 @@ def test_without_a_terminal_a_line_is_written_when_something_changes_and_now_and
     assert lines[1].startswith("full fine:") and lines[2].endswith("; check") and lines[3] == lines[2]
 
 
-@pytest.mark.parametrize("name", ["full", "F1"])
+@pytest.mark.parametrize("name", ["M3", "F1"])
 def test_progress_goes_from_the_prior_to_fine_by_the_logarithm(name):
     parameters = Parameters()
     calibrator = calibrate(make_samples(MatchedRun(dvl_std=0.01, gnss_std=0.01)), parameters)
