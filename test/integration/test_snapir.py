@@ -53,7 +53,10 @@ def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, t
     assert pairing["not_oriented"] + pairing["awaiting_attitude"] == dvl["usable"]
     for model, estimate in result.estimates.items():
         given = 0 if MODELS[model].needs is Needs.ATTITUDE else dvl["usable"]
-        assert estimate.used + estimate.gated == given
+        if MODELS[model].estimator:  # whole blocks of 10 s; at 1 Hz, its last samples wait for theirs
+            assert given - 25 < estimate.used + estimate.gated <= given
+        else:
+            assert estimate.used + estimate.gated == given
 
 
 @pytest.mark.slow
