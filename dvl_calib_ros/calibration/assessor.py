@@ -29,7 +29,7 @@ from .results.held_out_verification import SEVERAL, verify
 from .results.results import Estimate, Verification, estimates_lever_arm
 from .results.thinned_recording import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers
 
-# What is said of a running calibration on the way: of the rest its diagnostics say more than a verdict does.
+# Reason codes of a verdict that a live calibration reports; its diagnostics cover the others.
 JUDGED_LIVE = {
     "HELD_OUT_WORSE", "HELD_OUT_SEVERAL_TIMES", "HELD_OUT_IMPLAUSIBLE", "HELD_OUT_OUTLIERS", "MISALIGNMENT_LARGE",
     "SCALE_LARGE", "LEVER_ARM_TURNS_ANGLE",
@@ -37,14 +37,14 @@ JUDGED_LIVE = {
 
 
 class Assessor:
-    """Judges the estimates of one calibrator."""
+    """Assessment of the estimates of one calibrator."""
 
     def __init__(self, estimates: Estimates) -> None:
         self._estimates, self._further = estimates, estimates.further
-        self._compared: tuple[ThinnedRecording, Compared] | None = None  # as mounted
+        self._compared: tuple[ThinnedRecording, Compared] | None = None  # comparison without corrections
 
     def verification(self, name: str, moments: Moments) -> Verification:
-        """The verdict on one model's calibration, by hold-out. moments: of the samples that it is judged by."""
+        """Return the hold-out verdict on one model's calibration. moments: sums over the samples, by fold."""
         estimate = self._estimates.without_tilt(self._estimates.estimate(name))
         model, state = MODELS[name], GaussianState(estimate.state, estimate.covariance)
         held_out = self._held_out(name, moments)
@@ -56,7 +56,7 @@ class Assessor:
         return self._judged(estimate, held_out, typical, (float(samples), vv), self._further.suggestion)
 
     def so_far(self, name: str, *, fresh: bool) -> Verification:
-        """The same of a running calibration, by what the worker looked at; nothing is waited for unless fresh."""
+        """Return the verdict of a running calibration, by the worker's latest evaluation unless `fresh`."""
         estimate, further = self._estimate(name, fresh=fresh), self._further
         rest, suggestion = further.rest(fresh=fresh), further.suggestion if fresh else further.suggestion_so_far
         if MODELS[name].from_positions:
@@ -82,7 +82,7 @@ class Assessor:
         judged: tuple[float, Array],
         suggestion: Reason | None,
     ) -> Verification:
-        """As of `verify`. judged: as of `calibration_error`."""
+        """Return the verdict, see `verify`. judged: samples and velocity products, see `calibration_error`."""
         name, p = estimate.model, self._estimates.parameters
         model, estimator = MODELS[name], self._estimates.estimators[name]
         of_velocity = self._estimates.of_recording(name).p - estimator.of_bias.covariance
@@ -102,10 +102,10 @@ class Assessor:
         )
 
     def doubts(self, name: str, of_clocks: Sequence[Reason], *, fresh: bool) -> list[Reason]:
-        """What the data say against one model's calibration, as bad as that is to a verdict; of a running one.
+        """Return the reasons against one model's running calibration, weighed by their effect on the verdict.
 
-        of_clocks: what clocks say against every calibration. fresh: by a look at all there is, else by one that the
-        worker took a little ago.
+        of_clocks: reasons of the clocks against any calibration. fresh: evaluate all data now, else use the worker's
+        latest evaluation.
         """
         further, p = self._further, self._estimates.parameters
         suggested, rest = further.suggestion if fresh else further.suggestion_so_far, further.rest(fresh=fresh)
@@ -129,8 +129,10 @@ class Assessor:
         return [*found, *objections(navigation, known_to), *(each for each in held_out if each.code in JUDGED_LIVE)]
 
     def navigation(self, name: str, deviation: GaussianState | None) -> Navigation | None:
-        """What one model's calibration is worth to dead reckoning, on data that it had not seen. None without
-        reference, or with hardly any motion. deviation: how the heading deviates."""
+        """Return one model's dead-reckoning drift on held-out data; None without reference or motion.
+
+        deviation: heading deviation, as `Estimate.heading_deviation`.
+        """
         with self._further.settled():
             own = self._estimates.estimators[name].navigation()
         if own is not None:
@@ -144,21 +146,21 @@ class Assessor:
         except np.linalg.LinAlgError:
             return None
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + epoch_ns
-        # of every fold and day what corrects it
+        # one correction per fold and day
         n_days, p = len(terms[0]), self._estimates.parameters
         parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
         corrections = [each for of_days in terms for each in of_days]
         return dead_reckoned(recording, parts, corrections, p, epoch_ns, deviation)
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
-        """For every fold what one model corrects on every day, had it not seen that fold.
+        """Return, per fold and day, one model's corrections estimated without that fold.
 
-        Raises numpy.linalg.LinAlgError for a configuration so wrong that there is no estimate without a fold.
+        Raises numpy.linalg.LinAlgError if a grossly wrong configuration leaves no estimate without a fold.
         """
         return self._estimates.estimators[name].held_out_terms(self._further.n_days)
 
     def typical_error(self, model: Model, state: GaussianState) -> float | None:
-        """Velocity error of a state, m/s rms, without outliers; None where nothing was kept."""
+        """Return a state's velocity error (m/s rms) on the kept streams without outliers; None if none were kept."""
         kept, p = self._further.recording, self._estimates.parameters
         if kept is None:
             return None
@@ -174,10 +176,10 @@ class Assessor:
 
 
 class Estimates:
-    """The estimates of a calibrator's models.
+    """Estimates of a calibrator's models.
 
-    estimators: by model. further: those of them that are more than the linear filter. models: names of those that are
-    wanted. parameters: those that can change at run time are set here.
+    estimators: by model name. further: the estimators beyond the linear filter. models: names of the models in use.
+    parameters: replaced by the calibrator when parameters change at run time.
     """
 
     def __init__(
@@ -192,11 +194,11 @@ class Estimates:
         self._day_covariances: dict[str, Array] = {}
 
     def estimate(self, name: str) -> Estimate:
-        """Estimate of one model, with all that is known about it."""
+        """Return the complete estimate of one model."""
         model, estimator = MODELS[name], self.estimators[name]
         state, covariance = self.of_recording(name)
         of_bias = estimator.of_bias
-        of_velocity = covariance - of_bias.covariance  # more of the same motion tells no more of a bias
+        of_velocity = covariance - of_bias.covariance  # repeating the same motion does not reduce the bias
         used, gated, mean_nis, rows, _ = estimator.counts
         return Estimate(
             model=name,
@@ -216,12 +218,11 @@ class Estimates:
         )
 
     def of_recording(self, name: str) -> GaussianState:
-        """State and covariance, σ as of the same day: the larger of what the filter claims and what blocks of time
-        show."""
+        """Return the state with σ for this recording: the larger of the filter's and of the scatter of time blocks."""
         return self.estimators[name].of_recording()
 
     def next_recording(self, name: str) -> GaussianState:
-        """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it."""
+        """Return `of_recording` with day-to-day variation added, as σ for the next recording."""
         state = self.of_recording(name)
         return GaussianState(state.x, state.p + self._day_covariance(name))
 
@@ -232,13 +233,16 @@ class Estimates:
 
     @property
     def arm_finders(self) -> Iterator[Model]:
-        """Wanted models that find the lever arm, the best first."""
+        """Models in use that estimate the lever arm, the best first."""
         return (MODELS[name] for name in self._models if results.estimates_lever_arm(MODELS[name]))
 
     def without_tilt(self, estimate: Estimate) -> Estimate:
-        """An estimate that claims no roll and pitch where those of the vehicle are not known, or no reference measures
-        the vertical, which leaves the arm's height open too; and no roll where another lever arm is found than was
-        told: an attitude of another time makes one, and in waves a roll."""
+        """Return the estimate with prior uncertainty on tilt that the data cannot show.
+
+        Roll and pitch need an IMU that measures them and a reference with vertical velocity, which the lever arm's
+        height needs too. Roll alone is uncertain if the configured lever arm is contradicted: attitude of another time
+        causes both.
+        """
         model, p = MODELS[estimate.model], self.parameters
         needs = ""
         if self.further.is_level:
@@ -251,7 +255,7 @@ class Estimates:
         level = p.rotation_dvl_from_body[:, :unknown_axes]
         unknown = np.zeros((model.n_state, model.n_state))
         unknown[:3, :3] = p.initial_std_misalignment**2 * (level @ level.T)
-        if needs == MEASURES_VERTICAL and results.estimates_lever_arm(model):  # nor does anything show its height
+        if needs == MEASURES_VERTICAL and results.estimates_lever_arm(model):  # the height is not observable either
             height = model.state_names.index("lever_arm_z")
             unknown[height, height] = p.initial_std_lever_arm**2
         own = estimate.velocity_covariance + unknown
@@ -265,7 +269,7 @@ class Estimates:
 
     @property
     def _finds_another_arm(self) -> bool:
-        """Whether the lever arm that was told is contradicted."""
+        """Return whether the data contradict the configured lever arm."""
         model = next(self.arm_finders, None)
         if model is None:
             return False
@@ -279,7 +283,7 @@ _Answer = TypeVar("_Answer")
 
 
 class NonlinearEstimators:
-    """Those of a calibrator, in the order of their models. Names and answers are those of `Estimator`."""
+    """Estimators beyond the linear filter, in the order of their models, with the interface of `Estimator`."""
 
     def __init__(self, estimators: Sequence[Estimator]) -> None:
         self._all = tuple(estimators)
@@ -292,66 +296,66 @@ class NonlinearEstimators:
 
     @property
     def n_taken(self) -> int:
-        """Number of the first aligned row that one of them has not copied."""
+        """Smallest number of the first aligned row that an estimator has not copied."""
         return min((each.n_taken for each in self._all), default=NEVER)
 
     @property
     def n_told(self) -> tuple[int, ...]:
-        """What grows when one of them may have more to say, by estimator."""
+        """Counters, by estimator, that grow when it may have new results."""
         return tuple(each.n_told for each in self._all)
 
     @property
     def told_until_ns(self) -> int | None:
-        """Stamp of the first DVL sample that may go by something that is only gathered; None."""
+        """Stamp of the first DVL sample that gathered blocks may still affect; None without any."""
         return min((until for each in self._all if (until := each.told_until_ns) is not None), default=None)
 
     @property
     def reference_claims(self) -> bool:
-        """Whether it is the reference's messages that say how noisy it is, and no parameter."""
+        """Return whether the reference's noise comes from its messages instead of a parameter."""
         return any(each.reference_claims for each in self._all)
 
     @property
     def is_level(self) -> bool:
-        """Whether references were turned into the body by a heading alone: roll and pitch then hold the trim."""
+        """Return whether the IMU gives a heading only, so that roll and pitch hold the vehicle's trim."""
         return any(each.is_level for each in self._all)
 
     @property
     def is_horizontal(self) -> bool:
-        """Whether no reference measures the vertical."""
+        """Return whether no reference measures the vertical."""
         return any(each.is_horizontal for each in self._all)
 
     @property
     def are_clocks_known(self) -> bool:
-        """Whether the data show how the clocks stand, in time or not."""
+        """Return whether the data determine the clock offsets, zero or not."""
         return any(each.registration is not None and each.registration.are_known for each in self._all)
 
     @property
     def doubt(self) -> Reason | None:
-        """What is known against models that take for granted what these find."""
+        """Reason against models that assume what these estimators estimate."""
         return self._first(lambda each: each.doubt)
 
     @property
     def suggestion(self) -> Reason | None:
-        """What configuration the data fit, where the one given is grossly wrong."""
+        """Configuration that fits the data, if the given one is grossly wrong."""
         return self._first(lambda each: each.suggestion)
 
     @property
     def suggestion_so_far(self) -> Reason | None:
-        """`suggestion` as it was seen a little ago, which nobody has to wait for."""
+        """`suggestion` by the latest evaluation, without waiting."""
         return self._first(lambda each: each.suggestion_so_far)
 
     @property
     def registration_so_far(self) -> Registration | None:
-        """How the instruments stand, as it was seen a little ago; None where that is not known."""
+        """Registration of clocks and frames by the latest evaluation; None if not known."""
         return self._first(lambda each: each.registration_so_far)
 
     def rest(self, *, fresh: bool) -> Rest | None:
-        """What the calibration leaves, by a look at all there is or, not fresh, by one a little ago; None for none."""
+        """Return the calibration's residuals, evaluated now if `fresh`, else the latest; None if not available."""
         return self._first(lambda each: each.rest(fresh=fresh))
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:
-        """What was kept of all streams for verification, and the stamp (ns) of its time 0; None for nothing."""
+        """Streams kept for verification, and the stamp (ns) of their time 0; None if nothing was kept."""
         return self._first(lambda each: each.recording)
 
     @property
@@ -360,13 +364,13 @@ class NonlinearEstimators:
         return max((each.n_days for each in self._all), default=1)
 
     def day_of(self, stamps_ns: Stamps) -> Index:
-        """Which day (N,) stamps are of, from 0, as far as `recording` goes."""
+        """Return the day (N,), from 0, of each stamp (ns), for stamps within `recording`."""
         days = [each.day_of(stamps_ns) for each in self._all]
         return np.max(days, axis=0) if days else np.zeros(len(stamps_ns), dtype=np.intp)
 
     @contextmanager
     def settled(self) -> Iterator[None]:
-        """All that is complete has taken effect, in here."""
+        """Let all complete blocks take effect inside this context."""
         with ExitStack() as each_settled:
             for each in self._all:
                 each_settled.enter_context(each.settled())

@@ -1,10 +1,10 @@
-"""The calibration of one DVL: feed it samples, read estimates.
+"""Calibration of one DVL: takes samples, returns estimates.
 
-    samples ─► Aligner: rows of DVL samples with what the other streams say ─► groups of models ─► estimates
-                                        └─► Selection: is there GNSS, which model is the one
+    samples ─► Aligner: rows of DVL samples with the other streams' values ─► groups of models ─► estimates
+                                        └─► Selection: GNSS availability, selected model
 
-The node, the replay and the evaluation all use this class. The node feeds it sample by sample, recordings come as
-columns; that, and block_size, change nothing but the speed.
+The node, the replay and the evaluation all use this class. The node feeds single samples, recordings feed columns.
+Neither that nor block_size changes the results, only the speed.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ from .streams.aligner import Aligner, counted
 from .streams.position_velocities import are_positions, check_model
 from .streams.stream_order import parts_by_day
 
-# DVL rows that wait to be copied for the full model: by the dozen that costs a tenth of one by one.
+# DVL rows that are copied together for the full model; copying them singly costs ten times as much.
 COPIED_AT_ONCE = 64
-# Rows, and blocks of samples, that may wait for who has no use for them yet: without an IMU some never have.
+# Rows, and blocks of samples, that may wait for a model that has no use for them yet, for example without an IMU.
 ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
-# the full model's blocks are gathered like samples: one of 10 s counts for so many of these.
+# Samples that one 10 s block of the full model counts for when blocks are gathered.
 SAMPLES_OF_A_BLOCK = 128
 
 _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
@@ -62,21 +62,21 @@ _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
     Needs.ATTITUDE: lambda block: block.oriented,
     Needs.REFERENCE: lambda block: block.paired,
 }
-# Imported now, for no live message waits for an import.
+# Imported here because no live message may wait for an import.
 _KINDS = {model.name: kind_of(model) for model in MODELS.values() if model.estimator}
 
 
 class Calibrator:
-    """Calibrates with all models at once, see the module's picture.
+    """Calibration with all models in parallel; the module docstring has the data flow.
 
-    models: names of those that it calibrates with, where not all are wanted: each costs. Of others nothing is known.
-    prior_sway_heave: prior for ``prior_source: reference`` (m/s), found by the caller. initial: states to start from,
-    by model name. block_size: samples that are gathered before the models are updated, if nobody asks for their state
-    earlier. on_event: told of restarts in words. on_rows: given the aligned rows, in order, once all models have had
-    them. on_restart: called when all of them are to be forgotten. verified: keep what hold-out verification needs.
-    trace: filled with the models' states over time. recordings_ns: stamps between one recording and the next, each of
-    which is a day of its own. worker: does what would hold up live messages; None: all is done at once, and comes to
-    the same. registration: how the instruments stand, where it was asked of the data before.
+    models: names of the models to run; each costs time, and the others have no estimate. prior_sway_heave: prior for
+    ``prior_source: reference`` (m/s), from the caller. initial: initial states by model name. block_size: number of
+    samples gathered before an update, unless a state is requested earlier. on_event: receives a sentence at every
+    restart. on_rows: receives the aligned rows in order, once all models have had them. on_restart: called at a
+    restart, which forgets all samples. verified: keep what hold-out verification needs. trace: filled with the models'
+    states over time. recordings_ns: stamps between recordings; each recording is a day of its own. worker: runs slow
+    work in a thread so that live messages do not wait; None runs it immediately, with the same results. registration:
+    registration of the clocks and frames, if already computed.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class Calibrator:
             raise ParameterError("prior_source: reference needs recorded data; live, use fixed or initial_window")
         self.parameters = parameters
         self._models = tuple(name for name in MODELS if name in models)
-        # of positions nothing is to be said where there are none
+        # without positions the position model is not reported
         unknown = () if are_positions(parameters) else (WITH_POSITIONS,)
         self._told = tuple(name for name in self._models if name not in unknown)
         check_model(parameters)
@@ -124,16 +124,17 @@ class Calibrator:
     # ------------------------------------------------------------------ state
 
     def reset(self) -> None:
-        """Forget all samples and what was learnt from them."""
+        """Forget all samples and estimates."""
         self.restarts = 0
         self._aligner.reset()
         self._start()
 
     def _start(self) -> None:
+        """Make filters, estimators and selection from the current parameters."""
         self._selection = Selection()
-        self._n_selected = 0  # rows that the selection knows of
+        self._n_selected = 0  # rows given to the selection
         wanted = {*self._models}
-        if self._verified:  # every model is judged by the samples of one with a reference
+        if self._verified:  # every model is verified with the samples of an aided one
             aided = (model.name for model in LINEAR_MODELS if model.aided and model.name in wanted)
             wanted.add(next(aided, "M1"))
         linear = [model for model in LINEAR_MODELS if model.name in wanted]
@@ -148,19 +149,19 @@ class Calibrator:
         for name in self._models:
             if MODELS[name].estimator:
                 self._estimators[name] = self._made(MODELS[name])
-        # those that are more than the linear filter
+        # estimators beyond the linear filter
         self._further = NonlinearEstimators([self._estimators[name] for name in self._models if MODELS[name].estimator])
         self._estimates = Estimates(self._estimators, self._further, self._models, self.parameters)
         self._judge = Assessor(self._estimates)
         self._headings = Headings(self.parameters)
-        self._n_headings = 0  # rows that it has had
+        self._n_headings = 0  # rows given to `_headings`
         self._seen: dict[Needs, RowsSeen] = {}
         self._doubted: tuple[tuple[object, ...], Sequence[Reason]] | None = None
         if self._trace is not None:
             self._trace.start(self._groups)
 
     def _made(self, model: Model) -> Estimator:
-        """The estimator that a model names."""
+        """Make the estimator that a model names."""
         together = 1 if self._worker is not None else max(1, self._block_size // SAMPLES_OF_A_BLOCK)
         return _KINDS[model.name](
             EstimatorSetup(
@@ -190,7 +191,7 @@ class Calibrator:
     # ------------------------------------------------------------------ input
 
     def feed_dvl(self, sample: DvlSample) -> DvlSample | None:
-        """Take a DVL sample; None unless it is valid and in order, else as it goes on: in time, covariance screened."""
+        """Take a DVL sample. Return it time-corrected and with screened covariance; None if invalid or out of order."""
         self._clocks.arrived(Stream.DVL, sample.stamp_ns)
         taken = self._aligner.take_dvl(sample)
         if taken is not None:
@@ -210,7 +211,7 @@ class Calibrator:
         self._advance()
 
     def feed(self, streams: Streams) -> None:
-        """Take a stretch of a recording, all streams."""
+        """Take a stretch of a recording with all streams."""
         if self._verified or self._worker is not None:
             self._clocks.add(streams)
         self._aligner.take(streams)
@@ -218,16 +219,16 @@ class Calibrator:
         self._aligner.forget_old()
 
     def feed_fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
-        """Take a position of the reference point (3,) m, ENU from anywhere, and its variances (3,), nan if unknown."""
+        """Take a position (3,) m of the reference point, ENU from any origin, and variances (3,) m², nan if unknown."""
         for each in self._further:
             each.take_fix(stamp_ns, position, variance)
 
     def refuse(self, stream: str, reason: str) -> None:
-        """Count a message of a stream (dvl, reference, imu) that could not be made a sample of, and why."""
+        """Count a message of a stream (dvl, reference, imu) that is no valid sample, under its reason."""
         self._aligner.refuse(Stream(stream), reason)
 
     def _advance(self) -> None:
-        """Let the selection know what is paired, and update the models if enough samples have come together."""
+        """Pass new pairings to the selection, and update the models that have enough samples."""
         aligner = self._aligner
         for each in self._further:
             if aligner.partners.n_judged - each.n_taken >= COPIED_AT_ONCE:
@@ -243,13 +244,13 @@ class Calibrator:
             self._forget_rows()
 
     def _is_due(self, group: Group) -> bool:
-        """Whether enough samples have come together for a group, or rows that hold none, which nobody can forget."""
+        """Return whether a group has a full block of samples, or too many rows without samples to keep."""
         if self._aligner.partners.given[group.needs] - group.n_given >= self._block_size:
             return True
         return self._decided(group.needs) - group.next_row >= self._rows_held
 
     def _select(self) -> None:
-        """Let the selection know what is paired, but for what may go by what is only gathered."""
+        """Pass new pairings to the selection, up to the first sample that gathered blocks may still affect."""
         rows, end = self._aligner.rows, self._aligner.partners.n_paired
         first = self._n_selected - rows.base
         stamps_ns = rows.stamps_ns[first : end - rows.base]
@@ -262,7 +263,7 @@ class Calibrator:
             self._n_selected += len(stamps_ns)
 
     def _look_at_headings(self) -> None:
-        """Let the selection know once headings show the current: later than the last row could be decided."""
+        """Tell the selection once the headings make the current observable, a fixed delay after the last row."""
         aligner, rows = self._aligner, self._aligner.rows
         first, decided = self._n_headings, aligner.partners.n_oriented
         if self._headings.shown or decided == first:
@@ -284,7 +285,7 @@ class Calibrator:
                 self._selection.headings_show_the_current(shown_ns + wait_ns, self._headings.trimmed)
 
     def _on_evidence(self, model: Model, from_ns: int) -> None:
-        """Let the selection, and the trace, know what an estimator says by now."""
+        """Pass an estimator's new evidence to the selection and its state to the trace."""
         estimator = self._estimators[model.name]
         self._selection.take(from_ns, estimator.evidence)
         if self._trace is not None:
@@ -293,12 +294,12 @@ class Calibrator:
     # ------------------------------------------------------------------ models
 
     def _update(self, group: Group) -> None:
-        """Give a group's models the rows that are decided and that they have not had."""
+        """Give a group's models the decided rows that they have not had."""
         if self._give_decided(group):
             self._forget_rows()
 
     def _give_decided(self, group: Group) -> bool:
-        """`_update` that forgets nothing; whether there were any."""
+        """Do as `_update` without forgetting rows. Return whether there were any."""
         decided = self._decided(group.needs)
         first, group.next_row = group.next_row, decided
         if decided == first:
@@ -310,7 +311,7 @@ class Calibrator:
         return True
 
     def _give(self, group: Group, first: int, decided: int) -> None:
-        """Give a group's models the rows first .. decided - 1, of one day."""
+        """Give a group's models the rows first .. decided - 1, all of one day."""
         seen = self._observed(group.needs, first, decided)
         wanted = None if self._trace is None else self._trace.wanted(first, decided)
         ends = None if wanted is None or not len(wanted) else np.searchsorted(seen.numbers, wanted, side="right")
@@ -325,14 +326,14 @@ class Calibrator:
             self._trace.add(wanted, group, after)
 
     def _decided(self, needs: Needs) -> int:
-        """Number of the first row that is not decided for models with these needs."""
+        """Return the number of the first row that is not decided for models with these needs."""
         partners = self._aligner.partners
         return {
             Needs.NOTHING: partners.n_judged, Needs.ATTITUDE: partners.n_oriented, Needs.REFERENCE: partners.n_paired,
         }[needs]  # fmt: skip
 
     def _observed(self, needs: Needs, first: int, decided: int) -> RowsSeen:
-        """Rows first .. decided - 1 as models with these needs see them; several groups ask for the same."""
+        """Return observations of rows first .. decided - 1 for models with these needs, cached for other groups."""
         seen = self._seen.get(needs)
         if seen is None or (seen.first, seen.decided) != (first, decided):
             block = self._aligner.rows.block(first, decided)
@@ -347,7 +348,7 @@ class Calibrator:
         return seen
 
     def _forget_rows(self) -> None:
-        """Give up the rows that all have had."""
+        """Forget the rows that all models have had."""
         rows = self._aligner.rows
         done = min(self._n_selected, self._further.n_taken, *(group.next_row for group in self._groups))
         done = done if self._headings.shown else min(done, self._n_headings)
@@ -357,7 +358,7 @@ class Calibrator:
             rows.forget_before(done - rows.base)
 
     def finish(self) -> None:
-        """Update all models with what is decided at the end, and tell on_rows of the rest, which may still wait."""
+        """Update all models with the decided rows, and give all remaining rows to on_rows."""
         for each in self._further:
             each.finish()
         for group in self._groups:
@@ -370,13 +371,13 @@ class Calibrator:
 
     @property
     def counts(self) -> dict[str, dict[str, int]]:
-        """Where the messages went, since the start or the last restart, see `counted`."""
+        """Message counters since the start or the last restart, see `counted`."""
         restarted = {name: self._estimators[name].counts.restarted for name in self._models}
         return counted(self._aligner, self.selection.gnss.losses, self.restarts, restarted)
 
     @property
     def refused_as(self) -> Mapping[str, set[str]]:
-        """By stream, those of its counters that refused messages are under."""
+        """Names of the counters that hold refused messages, by stream."""
         return self._aligner.refused_as
 
     @property
@@ -391,7 +392,7 @@ class Calibrator:
 
     @property
     def longest_dropout_ns(self) -> int:
-        """The longest dropout of the DVL since the start or the last restart."""
+        """Longest DVL dropout (ns) since the start or the last restart."""
         return self._aligner.dropouts.longest_ns
 
     @property
@@ -400,17 +401,17 @@ class Calibrator:
         return self._aligner.newest_ns
 
     def latest_angular_velocity(self, stamp_ns: int) -> Vector | None:
-        """Newest angular velocity (rad/s, body), if not older than imu_timeout: for output without delay."""
+        """Return the newest angular velocity (rad/s, body) for output without delay; None if older than imu_timeout."""
         return self._aligner.latest_angular_velocity(stamp_ns)
 
     def latest_motion(self) -> RecentMotion | None:
-        """How the vehicle moves, by its newest samples; None before the first. Its noise is not known here."""
+        """Return the motion by the newest samples, its noise unknown (nan); None before the first sample."""
         return recent_motion(self._aligner)
 
     @property
     def selection(self) -> Selection:
-        """Which model is the one, over time."""
-        if self._worker is None:  # else nothing is gathered, and other threads may look
+        """Model selection over time."""
+        if self._worker is None:  # with a worker nothing is gathered, and other threads may read
             for each in self._further:
                 each.settle()
             self._select()
@@ -424,80 +425,77 @@ class Calibrator:
     def set_parameters(self, parameters: Parameters) -> None:
         """Change parameters that can change at run time (`ParameterSpec.read_only` False)."""
         check_model(parameters)
-        selection = self.selection  # by what was so far
+        selection = self.selection  # with the old parameters
         self.parameters = self._aligner.parameters = self._estimates.parameters = parameters
         self._doubted = None
         if self._n_selected:
             selection.record(self._aligner.partners.decided_ns, parameters)
 
     def n_given(self, name: str) -> int:
-        """Number of samples that a model was given so far; it grows when there may be a new estimate."""
+        """Return the number of samples given to a model; it grows when there may be a new estimate."""
         return self._aligner.partners.given[MODELS[name].needs]
 
     def state(self, name: str) -> GaussianState:
-        """State and covariance of one model."""
+        """Return state and covariance of one model."""
         return self._estimators[name].state()
 
     def published(self, name: str) -> GaussianState:
-        """As `of_recording`, with σ worth believing of the next recording: with what another day makes of it.
-
-        Under the parameter ``model: iac`` as the paper's filters say it, which is `state`.
-        """
+        """Return the published state of one model: `next_recording`, or `state` with the parameter ``model: iac``."""
         if self.parameters.model == IAC:
             return self.state(name)
         return self.next_recording(name)
 
     def next_recording(self, name: str) -> GaussianState:
-        """As `of_recording`, with σ worth believing of the next recording, whatever is published."""
+        """Return `of_recording` with day-to-day variation added, as σ for the next recording."""
         return self._estimates.next_recording(name)
 
     def of_recording(self, name: str) -> GaussianState:
-        """As `state`, with σ as of the same day: the larger of what the filter claims and what blocks of time show."""
+        """Return the state with σ for this recording: the larger of the filter's and of the scatter of time blocks."""
         return self._estimates.of_recording(name)
 
     def states_at(
         self, name: str, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps
     ) -> tuple[GaussianState, Counts, Array]:
-        """Return states x (E, n), P (E, n, n), samples used (E,) and their sum of νᵀS⁻¹ν (E,) of one model after E rows
-        of a trace, with their stamps (E,)."""
+        """Return x (E, n), P (E, n, n), samples used and sums of νᵀS⁻¹ν (E,) of a model after E rows of a trace."""
         return self._estimators[name].states_at(trace, numbers, stamps_ns)
 
     def estimate(self, name: str | None = None) -> Estimate:
-        """Estimate of one model, by default the selected one, with all that is known about it."""
+        """Return the complete estimate of one model, by default the selected one."""
         return self._estimates.estimate(name or self.selected)
 
     def verification(self, name: str) -> Verification:
-        """The verdict on one model's calibration, by hold-out; for a calibrator made with ``verified``."""
+        """Return the hold-out verdict on one model's calibration; needs ``verified``."""
         judge = next(group for group in self._groups if group.needs is Needs.REFERENCE)
         self._update(judge)
         return self._judge.verification(name, judge.moments)
 
     def navigation(self, name: str) -> Navigation | None:
-        """Return the drift of dead reckoning on unseen data, None without motion or reference; for ``verified``."""
+        """Return the drift of dead reckoning on held-out data; None without motion or reference. Needs ``verified``."""
         return self._judge.navigation(name, self.heading_deviation)
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
-        """For every fold what one model corrects on every day, had it not seen that fold; for one made ``verified``.
+        """Return, per fold and day, one model's corrections estimated without that fold; needs ``verified``.
 
-        Raises numpy.linalg.LinAlgError for a configuration so wrong that there is no estimate without a fold.
+        Raises numpy.linalg.LinAlgError if a grossly wrong configuration leaves no estimate without a fold.
         """
         return self._judge.held_out_terms(name)
 
     def day_of(self, stamps_ns: Stamps) -> Index:
-        """Which day (N,) stamps are of, from 0, as far as `recording` goes."""
+        """Return the day (N,), from 0, of each stamp (ns), for stamps within `recording`."""
         return self._further.day_of(stamps_ns)
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:
-        """What was kept for verification of all streams, and the stamp (ns) of its time 0; None for nothing."""
+        """Streams kept for verification, and the stamp (ns) of their time 0; None if nothing was kept."""
         return self._further.recording
 
     def result(self) -> Result:
-        """Everything that the samples so far tell, also where it takes effect only when later ones have come."""
+        """Return all results, including those that would take effect only at later stamps."""
         with self._further.settled():
             return self._result()
 
     def _result(self) -> Result:
+        """Collect all results as of now."""
         doubts = [] if self._worker is None else self.doubts(fresh=True)
         return Result(
             selected=self.selected,
@@ -517,7 +515,7 @@ class Calibrator:
         )
 
     def _verifications(self, doubts: Sequence[Reason]) -> dict[str, Verification]:
-        """Verdicts by model: live that of the selected one, with all that speaks against it."""
+        """Return verdicts by model; live, only of the selected model, with all reasons against it."""
         if self._verified:
             return {name: self.verification(name) for name in self._told}
         if self._worker is None:
@@ -529,20 +527,20 @@ class Calibrator:
 
     @property
     def verdict_so_far(self) -> Severity:
-        """Verdict on the selected model's calibration, by what the worker looked at a little ago."""
+        """Verdict on the selected model's calibration, by the worker's latest evaluation."""
         return self._judge.so_far(self.selected, fresh=False).verdict
 
     def doubts(self, *, fresh: bool) -> list[Reason]:
-        """What the data say against the calibration, as bad as that is to a verdict; of one with a worker.
+        """Return the reasons against the calibration, weighed by their effect on the verdict; needs a worker.
 
-        fresh: by a look at all there is, for which a result waits; else by one that the worker took a little ago.
+        fresh: evaluate all data now, which takes time; else use the worker's latest evaluation.
         """
         return self._judge.doubts(self.selected, self.clock_objections(fresh=fresh), fresh=fresh)
 
     @property
     def doubts_so_far(self) -> Sequence[Reason]:
-        """`doubts` that are not fresh, thought of anew only where there may be others: it takes a few milliseconds."""
-        clocks = self.clock_objections(fresh=False)  # of clocks that are apart nothing is told
+        """`doubts` by the latest evaluation, recomputed (some milliseconds) only when its inputs have changed."""
+        clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_told
         of = (self.selected, *self._further.n_told, *(each.code for each in clocks))
         if self._doubted is None or self._doubted[0] != of:
             self._doubted = of, self._judge.doubts(self.selected, clocks, fresh=False)
@@ -550,7 +548,7 @@ class Calibrator:
 
     @property
     def is_level(self) -> bool:
-        """Whether references were turned into the body by a heading alone: roll and pitch then hold the trim."""
+        """Return whether the IMU gives a heading only, so that roll and pitch hold the vehicle's trim."""
         return self._further.is_level
 
     def _days_of(self, name: str) -> tuple[Day, ...]:
@@ -558,38 +556,37 @@ class Calibrator:
 
     @property
     def days(self) -> tuple[Day, ...]:
-        """What belongs to each day, where there are several and an estimator finds something of each; else none."""
+        """Values estimated per day; empty with one day or without an estimator that has them."""
         return next((days for name in self._models if (days := self._days_of(name))), ())
 
     @property
     def heading_deviation(self) -> GaussianState | None:
-        """How the heading deviates, as `Estimate.heading_deviation`, by the model that knows most of it."""
+        """Heading deviation, see `Estimate.heading_deviation`, by the last model that has one; else None."""
         each = [estimator.heading_deviation for estimator in reversed(self._estimators.values())]
         return next((found for found in each if found is not None), None)
 
     @property
     def suggestion(self) -> Reason | None:
-        """What configuration the data fit, where the one given is grossly wrong."""
+        """Configuration that fits the data, if the given one is grossly wrong."""
         return self._further.suggestion
 
     @property
     def are_clocks_known(self) -> bool:
-        """Whether the data show how the clocks stand, in time or not."""
+        """Return whether the data determine the clock offsets, zero or not."""
         return self._further.are_clocks_known
 
     def clock_objections(self, *, fresh: bool) -> list[Reason]:
-        """What stamps say that are far apart, unless the data show how the clocks stand: then it does not matter when
-        messages arrived. fresh: as of `doubts`."""
+        """Return reasons against large clock offsets; none if the data determine the offsets. fresh: see `doubts`."""
         seen = self.registration_so_far
         is_known = self.are_clocks_known if fresh else seen is not None and seen.are_known
         return [] if is_known else self._clocks.objections(self.parameters)
 
     @property
     def registration_so_far(self) -> Registration | None:
-        """How the instruments stand, as it was seen a little ago; None where that is not known."""
+        """Registration of clocks and frames by the latest evaluation; None if not known."""
         return self._further.registration_so_far
 
     @property
     def suggestion_so_far(self) -> Reason | None:
-        """`suggestion`, live: what a look that is not made anew for every message says."""
+        """`suggestion` by the latest live evaluation, which is not repeated for every message."""
         return self._further.suggestion_so_far
