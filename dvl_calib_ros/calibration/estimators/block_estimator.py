@@ -1,9 +1,8 @@
-"""`full` beside the other models: fed from the aligner, in blocks of time that stamps decide.
+"""Estimator of `full`: copies time blocks from the aligner, and has them solved.
 
-A delay of 3 s needs what comes 3 s later, so its samples are used when the others' have long been. What
-the aligner holds of a block is copied as soon as all that may belong to it has come or is overdue, and solved: at once,
-or by a worker while the node goes on receiving. Either way the outcome takes effect when the stamps have gone on by
-SOLVED_WITHIN_NS, so that a live run and a replay of its recording agree whatever the machine was doing.
+A delay of up to 3 s needs later samples, so `full` uses samples later than the other models. A block is copied once all
+its data have arrived or are overdue, and is solved immediately or by a worker. The result takes effect when stamps have
+advanced by SOLVED_WITHIN_NS, so a live run and a replay agree at any machine speed.
 """
 
 from __future__ import annotations
@@ -38,25 +37,25 @@ from .block_solver import BlockSolver, Outcome
 from .estimator import AtOnce, Estimator, EstimatorSetup, Rest, Solved
 from .full_forward_model import deviation_of
 
-BLOCK_NS = 10_000_000_000
-# How fast the DVL is shows after so long; room for so many times as many of its samples is taken then.
+BLOCK_NS = 10_000_000_000  # length of a block
+# Time after which the DVL's rate is known, ns; memory is then reserved for this multiple of its samples.
 RATE_FROM_NS, ROOM = 3_000_000_000, 1.1
 LONGEST_DELAY_NS = round(LONGEST_DELAY_S * 1e9)
-# From a block's last data until its outcome takes effect, in stamps. A worker needs a hundredth of it; the stamps of a
-# recording that is played fast come sooner, and then the node waits for the worker.
+# From a block's last data until its result takes effect, in stamps, ns. A worker needs a hundredth of it; when a
+# recording is played fast, the node waits for the worker.
 SOLVED_WITHIN_NS = 1_000_000_000
-# A DVL that is late by more may find no reference at the stamps as they are, s.
+# Delay of the DVL, s, beyond which pairing at the uncorrected stamps may find no reference.
 PAIRED_WITHIN_S = 0.3
-# A state is shown by the data once these have halved its prior σ.
+# A state is observable once the data have reduced its prior σ to this share.
 SHOWN_SHARE = 0.5
-# The lever arm is said to look like an angle when that makes so many times the rest of the angle's variance.
+# The lever arm is reported to look like an angle if it causes this multiple of the angle's other variance.
 ARM_SHARE = 30.0
-# What the reference's clock leaves open, in the order of `Registration.left_open`.
+# States that the reference's clock offset makes uncertain, in the order of `Registration.left_open`.
 _OPEN: Index = np.r_[PHI, LEVER_ARM, DELAY]
 
 
 class _PendingDvl(RowTable):
-    """Usable DVL samples that blocks to come need."""
+    """Usable DVL samples that later blocks need."""
 
     IS_REUSED = True  # blocks have copies
     LAYOUT: ClassVar = {
@@ -70,7 +69,7 @@ class _PendingDvl(RowTable):
 
 
 class FullEstimator(Estimator):
-    """Feeds a `BlockSolver` from an aligner; tells the aligner which past of its tracks is still wanted."""
+    """Estimator of `full`, which feeds a `BlockSolver` and tells the aligner which data it still needs."""
 
     def __init__(self, given: EstimatorSetup) -> None:
         """Start from the prior of the states."""
@@ -85,22 +84,22 @@ class FullEstimator(Estimator):
             registration=given.registration,
         )  # fmt: skip
         self._worker = AtOnce() if given.worker is None else given.worker
-        # until a block is complete: what it needs of the others, later than it can still come, and judged by the IMU
+        # a block is complete after its margin, the longest lag of a stream, and the IMU's timeout
         self._wait_ns = MARGIN_NS + aligner.lag_ns + round(parameters.imu_timeout * 1e9)
         self._dvl = _PendingDvl()
         self._has_room = False
-        self._n_taken = 0  # rows of the aligner that have been looked at
+        self._n_taken = 0  # aligned rows copied so far
         self._block_ns: int | None = None  # start of the next block
-        self._day_starts_ns: list[int] = []  # of the blocks that days after the first began with
+        self._day_starts_ns: list[int] = []  # start of the first block of each day after the first
         self._last_told = self._solver.outcome()
         self._n_told = 0
         self._together = given.together
         self._gathered: list[Block] = []
-        # by the stamp from which on they are told: those that are being solved, and the number of each among them
+        # blocks being solved: stamp of effect, result, index in the result
         self._coming: deque[tuple[int, Solved[list[Outcome]], int]] = deque()
-        self._gathered_ns: list[int] = []  # the same of those that are not
+        self._gathered_ns: list[int] = []  # stamps of effect of the gathered blocks
         self._is_telling = self._is_settled = False
-        self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # asked for by each model's verification
+        self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # cached for each model's verification
         self._suggested: tuple[Outcome, Reason | None] | None = None
         self._remembered: list[tuple[int, GaussianState, int, float]] = []
         for track in (aligner.reference, aligner.imu):
@@ -110,61 +109,61 @@ class FullEstimator(Estimator):
 
     @property
     def _told(self) -> Outcome:
-        """The newest outcome whose time has come."""
+        """Newest result in effect."""
         self.settle()
         return self._last_told
 
     @property
     def n_taken(self) -> int:
-        """Number of the first row of the aligner that it has not copied yet."""
+        """Number of the first aligned row that it has not copied."""
         return self._n_taken
 
     @property
     def told_until_ns(self) -> int | None:
-        """Stamp of the first DVL sample that may go by a block that has been gathered only; None for none."""
+        """Stamp of the first DVL sample that a gathered block may still affect; None without any."""
         return self._gathered_ns[0] if self._gathered_ns else None
 
     def settle(self) -> None:
-        """Have blocks solved that are gathered, and let those take effect whose time has come."""
+        """Solve the gathered blocks, and let due results take effect."""
         if self._gathered and not self._is_telling:
             self._solve_gathered()
             self._let_take_effect(self._aligner.reached_ns)
 
     @property
     def counts(self) -> ModelCounts:
-        """Samples used, spikes and those far from all others, and their mean squared misfit."""
+        """Samples used, outliers (spikes and rejected residuals), and mean squared residual."""
         return self._told.counts
 
     @property
     def claims(self) -> bool:
-        """Whether there are any data."""
+        """Return whether it has used any data."""
         return bool(self._told.days)
 
     @property
     def heading_deviation(self) -> GaussianState | None:
-        """As `Estimator`."""
+        """See `Estimator`."""
         return deviation_of(self.state()) if self.claims else None
 
     def state(self) -> GaussianState:
-        """The state by the blocks so far."""
+        """Return the state of the newest day."""
         days = self._told.days
         return days[-1] if days else self._prior
 
     def of_recording(self) -> GaussianState:
-        """As `state`: σ holds all that is known of noise, and what the reference's clock leaves open."""
+        """Return `state` with the covariance of the reference's clock offset added."""
         x, p = self.state()
         return GaussianState(x, p + self.left_open)
 
     @property
     def left_open(self) -> Array:
-        """As `Estimator`: attitudes of another time look like an arm at one speed, and like a yaw in a steady turn."""
+        """Covariance (n, n) due to the reference's clock offset, which looks like a lever arm, or like yaw in turns."""
         found: Array = np.zeros((N_STATE, N_STATE))
         if not self.claims:
             return found
         registration = self._solver.registration() if self._is_settled else self._told.looked.registration
         if registration is not None:
             own = np.eye(len(_OPEN))
-            own[:3, :3] = -self._parameters.rotation_dvl_from_body  # a turn is a misalignment the other way round
+            own[:3, :3] = -self._parameters.rotation_dvl_from_body  # rotation and misalignment have opposite signs
             if any(self._parameters.lever_arm):
                 own[3:] = 0.0
             found[np.ix_(_OPEN, _OPEN)] = own @ registration.left_open @ own.T
@@ -172,67 +171,67 @@ class FullEstimator(Estimator):
 
     @property
     def of_bias(self) -> BiasCovariance:
-        """As `Estimator`."""
+        """See `Estimator`."""
         p = self.state().p
         values, vectors = np.linalg.eigh(p[BIAS, BIAS])
         root = np.sqrt(np.maximum(values, 1e-300))
         columns = np.where(values > 0.0, p[:, BIAS] @ vectors / root, 0.0)
-        return BiasCovariance((1.0 - 1e-6) * columns)  # what is left of a bias itself is positive, rounding aside
+        return BiasCovariance((1.0 - 1e-6) * columns)  # keeps the remaining variance positive despite rounding
 
     @property
     def suggestion(self) -> Reason | None:
-        """What configuration the data fit, where the one given is grossly wrong."""
+        """Configuration that fits the data, if the given one is grossly wrong."""
         newest = self._newest()
-        if self._suggested is None or self._suggested[0] is not newest:  # asked for more often than there is a block
+        if self._suggested is None or self._suggested[0] is not newest:  # requested more often than once per block
             self._suggested = newest, self._solver.suggestion()
         return self._suggested[1]
 
     @property
     def registration(self) -> Registration | None:
-        """How the instruments stand, by their data alone; None where these do not show it."""
+        """Registration of clocks and frames from the data alone; None if they do not determine it."""
         self._newest()
         return self._solver.registration()
 
     @property
     def is_level(self) -> bool:
-        """As `Estimator`."""
+        """See `Estimator`."""
         return self._idle_solver().is_level
 
     @property
     def is_horizontal(self) -> bool:
-        """As `Estimator`."""
+        """See `Estimator`."""
         return self._idle_solver().is_horizontal
 
     def rest(self, *, fresh: bool) -> Rest | None:
-        """As `Estimator`."""
+        """See `Estimator`."""
         return self._idle_solver().rest() if fresh else self._told.looked.rest
 
     @property
     def registration_so_far(self) -> Registration | None:
-        """The same, as it was seen a little ago, which stamps decide."""
+        """Registration by the newest result in effect."""
         return self._told.looked.registration
 
     @property
     def suggestion_so_far(self) -> Reason | None:
-        """The same, as of the newest block that has taken effect: messages do not wait for one that is being solved."""
+        """Suggestion by the newest result in effect, so that messages do not wait for a block being solved."""
         return self._told.suggestion
 
     @property
     def n_told(self) -> int:
-        """As `Estimator`: blocks."""
+        """Number of blocks in effect."""
         return self._n_told
 
     @property
     def evidence(self) -> Evidence:
-        """As `Estimator`."""
+        """See `Estimator`."""
         return Evidence(pairs_elsewhere=self.claims and abs(float(self.state().x[DELAY])) > PAIRED_WITHIN_S)
 
     @property
     def doubt(self) -> Reason | None:
-        """How much of an angle is the lever arm's; None if the motion tells them apart.
+        """Reason that the lever arm cannot be separated from an angle; None if the motion separates them.
 
-        On a circle at one speed a DVL that sits elsewhere looks like a turned one, and σ of a model that takes the
-        lever arm as known is worth nothing.
+        On a circle at constant speed a displaced DVL looks like a rotated one. A model that assumes the lever arm then
+        claims a σ that is too small.
         """
         p = self.state().p
         turns = np.linalg.solve(p[LEVER_ARM, LEVER_ARM], p[LEVER_ARM, PHI])  # (lever arm, misalignment)
@@ -245,12 +244,12 @@ class FullEstimator(Estimator):
         return finding("ARM_LOOKS_LIKE_ANGLE", metres=0.1, degrees=degrees, angle=("roll", "pitch", "yaw")[index])
 
     def remember(self, from_ns: int) -> None:
-        """Keep the state as of now, for `states_at`."""
+        """Keep the current state for `states_at`."""
         used, _, mean_nis, _, _ = self._told.counts
         self._remembered.append((from_ns, self.state(), used, used * mean_nis if used else 0.0))
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
-        """As `Estimator`."""
+        """See `Estimator`."""
         rows = [(LONG_AGO_NS, self._prior, 0, 0.0), *self._remembered]
         at = np.searchsorted([row[0] for row in rows], stamps_ns, side="right") - 1
         told = [rows[index] for index in at.tolist()]
@@ -259,7 +258,7 @@ class FullEstimator(Estimator):
 
     @contextmanager
     def settled(self) -> Iterator[None]:
-        """All blocks that are complete have taken effect, in here: for a result, which no later sample decides on."""
+        """Let all complete blocks take effect inside this context, for results that do not depend on later samples."""
         told = self._told
         self._last_told, self._is_settled = self._newest(), True
         try:
@@ -268,7 +267,7 @@ class FullEstimator(Estimator):
             self._last_told, self._is_settled = told, False
 
     def _newest(self) -> Outcome:
-        """The outcome of the last block that is complete; nothing is being solved then."""
+        """Wait for the last complete block and return its result."""
         self._solve_gathered()
         if not self._coming:
             return self._last_told
@@ -278,7 +277,7 @@ class FullEstimator(Estimator):
     # ------------------------------------------------------------------ blocks
 
     def advance(self) -> None:
-        """Copy the blocks that are complete, and let those take effect whose time has come."""
+        """Copy the complete blocks, and let due results take effect."""
         aligner = self._aligner
         if self._block_ns is None:
             if aligner.first_ns is None:
@@ -301,16 +300,16 @@ class FullEstimator(Estimator):
         )
 
     def finish(self) -> None:
-        """No samples come any more: all blocks that are complete take effect."""
+        """Let all complete blocks take effect after the last sample."""
         self.settle()
         while self._coming:
             self._let_take_effect(self._coming[-1][0])
 
     def _submit(self, block_ns: int) -> None:
-        """Have a block solved, by itself or with some more."""
+        """Solve a block now, or gather it."""
         block = self._copied(block_ns)
         from_ns = block.end_ns + self._wait_ns + SOLVED_WITHIN_NS
-        if self._together == 1:  # live, where other threads may look at what is known meanwhile
+        if self._together == 1:  # live, other threads may read the results meanwhile
             self._solve([block], [from_ns])
             return
         self._gathered.append(block)
@@ -325,12 +324,13 @@ class FullEstimator(Estimator):
             self._solve(blocks, told_ns)
 
     def _solve(self, blocks: list[Block], told_ns: list[int]) -> None:
-        """Have blocks solved. told_ns: stamps from which on each is told."""
+        """Submit blocks to the worker. told_ns: stamps from which their results take effect."""
         solver = self._solver
         solved = self._worker.submit(lambda: solver.solve(blocks))
         self._coming.extend((from_ns, solved, number) for number, from_ns in enumerate(told_ns))
 
     def _let_take_effect(self, reached_ns: int) -> None:
+        """Let results take effect that are due at a stamp, waiting for the worker if necessary."""
         if not self._coming or self._coming[0][0] > reached_ns:
             return
         self._is_telling = True
@@ -345,6 +345,7 @@ class FullEstimator(Estimator):
             self._is_telling = False
 
     def _copied(self, block_ns: int) -> Block:
+        """Copy a block with its margins from the aligner."""
         dvl, reference, imu = self._dvl, self._aligner.reference, self._aligner.imu
         end_ns = block_ns + BLOCK_NS
         from_ns, to_ns = block_ns - MARGIN_NS, end_ns + MARGIN_NS
@@ -363,7 +364,7 @@ class FullEstimator(Estimator):
         )
 
     def _new_days(self, block_ns: int) -> int:
-        """How many days start with the block: it may have references of their first DVL sample, however late."""
+        """Count the days that begin with a block, which may hold delayed references of a day's first DVL sample."""
         before, starts_ns = len(self._day_starts_ns), self._aligner.day_starts_ns
         while len(self._day_starts_ns) < len(starts_ns):
             if starts_ns[len(self._day_starts_ns)] - LONGEST_DELAY_NS >= block_ns + BLOCK_NS:
@@ -372,7 +373,7 @@ class FullEstimator(Estimator):
         return len(self._day_starts_ns) - before
 
     def _next_block(self, block_ns: int, last_ns: int) -> int:
-        """The next block that has a reference; else the first one that is not complete."""
+        """Return the start of the next block with a reference, or of the first incomplete block."""
         track = self._aligner.reference
         stamps_ns = track.stamps_ns[track.begin : track.size]
         at = int(np.searchsorted(stamps_ns, block_ns + BLOCK_NS))
@@ -387,7 +388,7 @@ class FullEstimator(Estimator):
             track.needed_from[self] = self._block_ns - MARGIN_NS
 
     def take_rows(self) -> None:
-        """Copy the DVL samples that are judged, before the aligner forgets them."""
+        """Copy the judged DVL samples before the aligner forgets them."""
         aligner, rows = self._aligner, self._aligner.rows
         first, end = self._n_taken - rows.base, aligner.partners.n_judged - rows.base
         if end <= first:
@@ -402,7 +403,7 @@ class FullEstimator(Estimator):
             self._take_room()
 
     def _take_room(self) -> None:
-        """Take all room that the DVL's samples will need at once, as soon as it is known how fast they come."""
+        """Reserve memory for the DVL's samples once their rate is known."""
         stamps_ns = self._dvl.stamps_ns[self._dvl.begin : self._dvl.size]
         span_ns = int(stamps_ns[-1] - stamps_ns[0]) if len(stamps_ns) else 0
         if span_ns >= RATE_FROM_NS:
@@ -411,7 +412,7 @@ class FullEstimator(Estimator):
             self._dvl.reserve(round(ROOM * len(stamps_ns) * longest_ns / span_ns))
 
     def _dvl_is_silent(self, stamp_ns: int) -> bool:
-        """Whether the DVL stops here for so long that tracks forget what was before."""
+        """Return whether the DVL pauses here so long that tracks drop earlier data."""
         stamps_ns = self._dvl.stamps_ns[self._dvl.begin : self._dvl.size]
         at = int(np.searchsorted(stamps_ns, stamp_ns))
         return at == len(stamps_ns) or int(stamps_ns[at]) - stamp_ns > LONGEST_NS // 2
@@ -420,16 +421,16 @@ class FullEstimator(Estimator):
 
     @property
     def reference_claims(self) -> bool:
-        """Whether it is the reference's messages that say how noisy it is, and no parameter."""
+        """Return whether the reference's noise comes from its messages instead of a parameter."""
         return self._told.claims > 0
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:
-        """All that was kept for verification, and the stamp (ns) of its time 0; None for nothing."""
+        """Streams kept for verification, and the stamp (ns) of their time 0; None if nothing was kept."""
         solver = self._idle_solver()
         if not solver.kept:
             return None
-        newest = solver.kept[-1]  # another one once anything is kept or left out
+        newest = solver.kept[-1]  # changes with every kept block
         if self._recording is None or self._recording[0] is not newest:
             self._recording = newest, ThinnedRecording.of(solver.kept)
         return self._recording[1], solver.epoch_ns
@@ -440,11 +441,11 @@ class FullEstimator(Estimator):
         return 1 + len(self._day_starts_ns)
 
     def day_of(self, stamps_ns: Stamps) -> Index:
-        """Which day (N,) stamps are of, from 0."""
+        """Return the day (N,), from 0, of each stamp."""
         return np.searchsorted(np.array(self._day_starts_ns, dtype=np.int64), stamps_ns, side="right")
 
     def days_from(self, first_ns: Sequence[int]) -> tuple[Day, ...]:
-        """As `Estimator`."""
+        """See `Estimator`."""
         nominal, days = self._parameters.dvl_time_offset, []
         known, offset = self._unknown.p[DELAY, DELAY], np.arange(N_STATE)[REFERENCE_ERROR][:2]
         states = self._told.days if self._day_starts_ns else ()
@@ -457,13 +458,13 @@ class FullEstimator(Estimator):
         return tuple(days)
 
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
-        """For every fold what it corrects on every day, had it not seen that fold."""
+        """Return, per fold and day, the corrections estimated without that fold."""
         if not self.claims:
             return [[NO_TERMS] * n_days] * FOLDS
         return [[Terms.of_state(state.x) for state in states] for states in self._idle_solver().fit.without_folds()]
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
-        """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
+        """Return the velocity error on every fold, each by the state without it; None for too few samples."""
         try:
             return self._idle_solver().fit.held_out_error()
         except np.linalg.LinAlgError:

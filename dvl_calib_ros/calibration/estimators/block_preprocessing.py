@@ -1,8 +1,7 @@
-"""Blocks of all streams as they are compared: copied, thinned, in seconds, without outliers.
+"""Time blocks of all streams prepared for the fit: copied, thinned, in seconds, without outliers.
 
-Of a fast stream, neighbours tell a sample that is far off (outliers.py). Between the samples of a slow one a vehicle
-can turn: there neighbours only raise a suspicion, and the references about it decide. Without a sample that is wrong
-they fit much better, with whatever delay they are beside it; without one that is right they do not.
+In a fast stream, neighbours identify an outlier (outliers.py). Between samples of a slow stream a vehicle may turn, so
+there `full` tests suspicious samples by the references near them (`JointFit`).
 """
 
 from __future__ import annotations
@@ -21,21 +20,21 @@ from ..streams.outliers import without_spikes
 from ..streams.position_velocities import are_positions, of_moments
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
-# No vehicle with a DVL turns faster, rad/s.
+# Largest turn rate of a vehicle with a DVL, rad/s.
 FASTEST_TURN = 20.0
 _BITS = np.array([1, 2, 4], dtype=np.uint8)
-# A stream that scatters by less about what its neighbours tell is taken to do so by this, m/s; one whose samples are
-# further apart than this, s, by more: a vehicle turns between them, though not by metres per second.
+# Smallest scatter about interpolation, m/s, assumed of a stream. SLOW_S: interval (s) from which the larger value
+# applies, because a vehicle turns between samples.
 LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
 
 
 class Cleaned(NamedTuple):
-    """A block's samples.
+    """Samples of a block, without outliers.
 
-    raw: its own references (J,) as the messages had them, thinned; own: places of them in the block. reference: without
-    outliers. dvl: without outliers; binned_dvl: as a curve is read from it.
-    dvl_ns, reference_ns: stamps. noise_dvl: (3, 3) (m/s)², the DVL's mean covariance. own_dvl, own_imu: places of the
-    block's own samples. are_compared: whether it has references, and the others there are for them.
+    raw: its references (J,) from the messages, thinned. own: their indices in the block. reference: without outliers.
+    dvl: without outliers. binned_dvl: for interpolation. dvl_ns, reference_ns: stamps. noise_dvl: (3, 3) (m/s)², mean
+    covariance. own_dvl, own_imu: the block's own samples, without margins. are_compared: whether it has references and
+    DVL data for them.
     """
 
     block: Block
@@ -56,7 +55,7 @@ class Cleaned(NamedTuple):
 
 
 def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
-    """A block's samples. epoch_ns: stamp of time 0."""
+    """Return the samples of a block without outliers. epoch_ns: stamp of time 0."""
     block = block._replace(reference=_of_moments(block.reference, parameters))
     own = _own(block)
     raw = block.reference.part(own)
@@ -89,10 +88,9 @@ def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
 
 
 def _dvl_columns(block: Block, p: Parameters, epoch_ns: int) -> tuple[DvlColumns, Array, Stamps, int]:
-    """A block's DVL samples that are no outliers (N), their mean covariance (3, 3), their stamps (N,), and how many
-    outliers it has."""
+    """Return DVL samples without outliers, mean covariance (3, 3), stamps (N,), and number of outliers."""
     stamps_ns, velocity, covariance = block.dvl
-    # one bends the curve that is read between samples for all references about it, and no gate would see that
+    # an outlier distorts interpolation for all references near it, which no gate would detect
     good = _good(stamps_ns, velocity)
     n_spikes = 0
     if not good.all():
@@ -115,9 +113,9 @@ def _imu(samples: ImuSamples, epoch_ns: int) -> ImuColumns:
 def _reference(
     block: Block, own: Index, raw: ReferenceSamples, p: Parameters, epoch_ns: int
 ) -> tuple[ReferenceColumns, Mask]:
-    """A block's references without outliers, and which of its own, as thinned, these are.
+    """Return references without outliers, and which (J,) of the thinned ones these are.
 
-    own: places of them in the block. raw: themselves.
+    own: indices of these in the block. raw: the thinned references.
     """
     around = block.reference
     velocity = around.values[:, :3]
@@ -142,7 +140,7 @@ def _reference(
 
 
 def _of_moments(around: ReferenceSamples, p: Parameters) -> ReferenceSamples:
-    """A block's references at the moments of their stamps."""
+    """Correct velocities from positions, which are means over a window, to the times of their stamps."""
     if not are_positions(p):
         return around
     velocity = of_moments(1e-9 * (around.stamps_ns - around.stamps_ns[:1]), around.values[:, :3], p.position_window)
@@ -150,14 +148,14 @@ def _of_moments(around: ReferenceSamples, p: Parameters) -> ReferenceSamples:
 
 
 def _own(block: Block) -> Index:
-    """Which of a block's references are its own and no margin's, thinned."""
+    """Return indices of the block's references without margins, thinned."""
     stamps_ns = block.reference.stamps_ns
     start, end = np.searchsorted(stamps_ns, (block.from_ns, block.end_ns)).tolist()
     return start + thinned(stamps_ns[start:end])
 
 
 def is_slow(times: Array) -> bool:
-    """Whether samples at times (N,) s are so far apart that a vehicle turns between them."""
+    """Return whether samples at times (N,) s are so sparse that a vehicle turns between them."""
     if len(times) < 2:
         return False
     apart = steps(times)
@@ -165,13 +163,13 @@ def is_slow(times: Array) -> bool:
 
 
 def _good(stamps_ns: Stamps, velocity: Array) -> Mask:
-    """Which samples of a stream are no spikes, (N,) of (N,) ns and (N, 3) m/s."""
+    """Return which samples (N,) of a stream are no spikes, from stamps (N,) ns and velocities (N, 3) m/s."""
     smallest = LEAST_SCATTER_SLOW_MPS if is_slow(1e-9 * stamps_ns) else LEAST_SCATTER_MPS
     return without_spikes(velocity, smallest=smallest, also_at_ends=True)
 
 
 def seconds(stamps_ns: Stamps, epoch_ns: int) -> Array:
-    """Times (N,) s since the epoch."""
+    """Return times (N,) s since the epoch."""
     since: Array = (stamps_ns - epoch_ns) * 1e-9
     return since
 
@@ -180,7 +178,7 @@ MARGIN_NS = round(MARGIN_S * 1e9)
 
 
 class DvlSamples(NamedTuple):
-    """stamps_ns (N,), velocity (N, 3) m/s and covariance (N, 3, 3) (m/s)², nan where not given; DVL frame."""
+    """DVL stamps (N,), velocities (N, 3) m/s and covariances (N, 3, 3) (m/s)², nan if not given; DVL frame."""
 
     stamps_ns: Stamps
     velocity: Array
@@ -188,7 +186,7 @@ class DvlSamples(NamedTuple):
 
 
 class ReferenceSamples(NamedTuple):
-    """stamps_ns (J,), values (J, 12), frames (J,) and unmeasured (J,), as in `Track`."""
+    """Reference stamps_ns (J,), values (J, 12), frames (J,) and unmeasured (J,), see `Track`."""
 
     stamps_ns: Stamps
     values: Array
@@ -196,22 +194,22 @@ class ReferenceSamples(NamedTuple):
     unmeasured: Codes
 
     def part(self, at: Index) -> ReferenceSamples:
-        """Some of them."""
+        """Return the rows of some indices."""
         return ReferenceSamples(self.stamps_ns[at], self.values[at], self.frames[at], self.unmeasured[at])
 
 
 class ImuSamples(NamedTuple):
-    """stamps_ns (M,) and values (M, 12), as in `Track`."""
+    """IMU stamps_ns (M,) and values (M, 12), see `Track`."""
 
     stamps_ns: Stamps
     values: Array
 
 
 class Block(NamedTuple):
-    """All streams from MARGIN_NS before from_ns until MARGIN_NS behind end_ns, copied.
+    """Copies of all streams from MARGIN_NS before from_ns to MARGIN_NS after end_ns.
 
-    new_days: how many days begin with it. silent: the DVL stops behind it for so long that tracks forget what was
-    before.
+    new_days: number of days that begin with it. silent: whether the DVL then pauses so long that tracks drop earlier
+    data.
     """
 
     from_ns: int

@@ -1,7 +1,7 @@
-"""Blocks of time, solved one after the other: outliers, the joint fit of `full`, and what comes of it.
+"""Solver of time blocks in order: outliers, the joint fit of `full`, and results.
 
-A block is a copy of what the aligner held, and nobody else touches what is in here meanwhile: so a block can be solved
-beside the thread that feeds the aligner (`block_estimator.FullEstimator` says when its outcome takes effect).
+Blocks are copies that no other code changes, so they can be solved in a thread. `block_estimator.FullEstimator` decides
+when a result takes effect.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from .full_fit import JointFit
 from .full_forward_model import LONGEST_DELAY_S, FitBlock, spline_slopes
 from .registration_schedule import KeptClocks, Looked, ToldSoFar
 
-# DVL and IMU are kept so far beyond a block for its fit, s: what the longest delay asks for, and a spline's end.
+# DVL and IMU are kept this far beyond a block, s: the longest delay, and the end of a spline.
 MARGIN_S = LONGEST_DELAY_S + 0.8
-# Fewer DVL samples make no curve.
+# DVL samples needed for a spline.
 FEWEST_DVL = 6
-# Attitude and angular velocity are kept no closer than this for the fit, s.
+# Shortest interval of attitude and angular velocity in the fit, s.
 IMU_EVERY_S = 0.1
 
 
 class Outcome(NamedTuple):
-    """What is known after a block.
+    """Results after a block.
 
-    days: states (20,) of `full` on each day; none where nothing was ever found. counts: samples used, spikes and those
-    far from all others, and their mean squared misfit. claims: references whose messages say how noisy they are, less
-    the others. has_rows: whether the block had any. looked: how the instruments stand, as of the newest look on the
-    way. suggestion: live, what configuration fits, by that look.
+    days: states (20,) of `full` on each day; empty without an estimate. counts: samples used, outliers (spikes and
+    rejected residuals), and mean squared residual. claims: references with their own noise, minus those without.
+    has_rows: whether any reference has been used. looked: latest registration. suggestion: live, the configuration that
+    fits by it.
     """
 
     days: tuple[GaussianState, ...]
@@ -54,10 +54,7 @@ class Outcome(NamedTuple):
 
 
 class BlockSolver:
-    """Takes blocks in order. restarted: how often what was found was not finite, and that of before is kept.
-
-    kept: what verification needs; None where nobody verifies, or live, where that is what clocks are looked at by.
-    """
+    """Solver of blocks in order. restarted: number of fits that diverged. kept: streams for verification, or None."""
 
     def __init__(
         self,
@@ -69,17 +66,17 @@ class BlockSolver:
         live: bool = False,
         registration: Registration | None = None,
     ) -> None:
-        """As `FullEstimator`, which sets `epoch_ns`, the stamp of time 0. live: look at the clocks on the way.
+        """Start from priors; `FullEstimator` sets `epoch_ns`, the stamp of time 0.
 
-        prior: x, P of the states. unknown: of another day's own states. registration: how the instruments stand, where
-        that is known.
+        prior: x, P of the states. unknown: prior of the per-day states on further days. live: repeat the registration
+        during the run. registration: registration of clocks and frames, if already computed.
         """
         self._parameters = parameters
         self.fit = JointFit(parameters, prior, unknown)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
         self._has_imu = False
-        self._seen_ahead = self._seen_upwards = False  # whether references measure along these axes of the body
+        self._seen_ahead = self._seen_upwards = False  # whether references measure these body axes
         self._dvl_stream = DvlStream()
         self._turned = False
         self._clocks = KeptClocks(parameters, live, registration)
@@ -91,31 +88,31 @@ class BlockSolver:
         self.restarted = 0
 
     def outcome(self, has_rows: bool = False) -> Outcome:
-        """What is known as of now."""
+        """Return the current results."""
         fit = self.fit
         counts = ModelCounts(fit.used, fit.gated + self._spikes, fit.mean_misfit, 3.0, self.restarted)
         return Outcome(tuple(fit.states), counts, self._claims, has_rows)
 
     def suggestion(self, *, fresh: bool = True) -> Reason | None:
-        """What configuration the data fit, where the one given is grossly wrong.
+        """Return the configuration that fits the data, if the given one is grossly wrong.
 
-        fresh: by all that is known, which takes a while; else as they were looked at on the way, live.
+        fresh: use all data, which takes time; else the latest live registration.
         """
         if own := self._dvl_stream.contradiction():
             return own
         looked = self._clocks.looked(self._so_far, fresh=fresh)
         contradiction, found = self._attitude_rates.contradiction(), looked.configuration
-        if contradiction:  # of what follows from it only what mends it is worth a word
+        if contradiction:  # a second contradiction is only reported if its correction also removes the first
             is_mended = found is not None and found.code in ("IMU_LOOKS_NED", "REFERENCE_OR_IMU_NED")
             return finding("TWO_CONTRADICTIONS", one=contradiction, other=found) if is_mended else contradiction
         return found or self._shared_noise.contradiction() or self._clocks.contradiction(looked)
 
     def registration(self) -> Registration | None:
-        """How the instruments stand; None where the data do not show it."""
+        """Return the registration of clocks and frames; None if the data do not determine it."""
         return self._clocks.looked(self._so_far).registration
 
     def rest(self) -> Rest | None:
-        """What the calibration leaves, live; None where that is not looked at."""
+        """Return the calibration's residuals, live only; else None."""
         return self._clocks.looked(self._so_far).rest
 
     @property
@@ -124,16 +121,16 @@ class BlockSolver:
 
     @property
     def is_level(self) -> bool:
-        """Whether references were turned into the body by a heading alone, without roll and pitch."""
+        """Return whether references are rotated into the body by a heading only, without roll and pitch."""
         return self._turned and self._attitude_rates.is_level
 
     @property
     def is_horizontal(self) -> bool:
-        """Whether no reference measures the vertical."""
+        """Return whether no reference measures the vertical."""
         return self._seen_ahead and not self._seen_upwards
 
     def solve(self, blocks: Sequence[Block]) -> list[Outcome]:
-        """Take blocks in order."""
+        """Solve blocks in order. Return the results after each."""
         outcomes = [self._solve(block) for block in blocks]
         if self._is_live:
             self._clocks.look_again(self._so_far)
@@ -142,6 +139,7 @@ class BlockSolver:
         return [outcome._replace(looked=looked, suggestion=suggestion) for outcome in outcomes]
 
     def _solve(self, block: Block) -> Outcome:
+        """Check a block's samples and add them to the fit."""
         for _ in range(block.new_days):
             self.fit.end_day()
             self._clocks.end_day()
@@ -159,12 +157,12 @@ class BlockSolver:
             return self.outcome()
         try:
             self.fit.add(self._fit_block(streams))
-        except np.linalg.LinAlgError:  # numbers that ran away
+        except np.linalg.LinAlgError:  # the fit diverged
             self.restarted += 1
         return self.outcome(self.fit.has_data)
 
     def _look_at(self, streams: Cleaned) -> None:
-        """Show a block's samples to who looks at instruments and clocks, and keep what verification needs."""
+        """Give a block's samples to the checks of instruments and clocks, and keep them for verification."""
         block, reference, dvl, p = streams.block, streams.reference, streams.dvl, self._parameters
         rotation, oriented = attitude_at(streams.imu, reference.times, p.imu_timeout)
         own = ImuColumns(*(column[streams.own_imu] for column in streams.imu))
@@ -182,7 +180,7 @@ class BlockSolver:
             self.kept.append(kept)
 
     def _fit_block(self, streams: Cleaned) -> FitBlock:
-        """What the fit keeps of a block."""
+        """Return the part of a block that the fit keeps."""
         block = streams.block
         from_s, end_s = seconds(np.array([block.from_ns, block.end_ns]), self.epoch_ns).tolist()
         times, velocity = streams.binned_dvl
@@ -195,7 +193,7 @@ class BlockSolver:
         return FitBlock(from_s, end_s, dvl, spline_slopes(*dvl), imu, slopes, streams.reference, measured, folds)
 
     def _compare_noise(self, streams: Cleaned, seen: InBody) -> None:
-        """Give a block's streams to `_shared_noise`. seen: its references."""
+        """Add a block's streams to `_shared_noise`. seen: its references in body axes."""
         variance = np.diagonal(seen.noise, axis1=1, axis2=2)
         known = seen.known[:, None] & (variance < MEASURED_BELOW)
         self._seen_ahead = bool(known[:, 0].any()) or self._seen_ahead
@@ -203,23 +201,23 @@ class BlockSolver:
         at = streams.own_dvl
         in_the_body = streams.dvl.velocity[at] @ self._parameters.rotation_dvl_from_body
         reference = np.where(known, seen.velocity, np.nan)
-        # by the stamps as they were: what a filter made comes after what it was made from
+        # at the original stamps, where filter output follows its input
         p = self._parameters
         times, reference_times = streams.dvl.times[at] + p.dvl_time_offset, streams.reference.times
         self._shared_noise.add(times, in_the_body, reference_times + p.reference_time_offset, reference)
 
 
 def _as_if_still(block: Block, epoch_ns: int) -> ImuColumns:
-    """What takes the place of an IMU that is not there, beside a reference in the body's own axes: no turning."""
+    """Return an IMU without rotation, in place of a missing one, for references in body axes."""
     from_s, end_s = seconds(np.array([block.from_ns, block.end_ns]), epoch_ns).tolist()
     times = np.arange(from_s - MARGIN_S, end_s + MARGIN_S, IMU_EVERY_S)
     return ImuColumns(times, np.full((len(times), 4), np.nan), np.zeros((len(times), 3)))
 
 
 def _thinned_imu(imu: ImuColumns, from_s: float, end_s: float) -> ImuColumns:
-    """Attitude and angular velocity (means about it) every IMU_EVERY_S, where both are known; nan where no attitude is.
+    """Return attitude and mean angular velocity every IMU_EVERY_S where known; attitude nan if there is none.
 
-    A quaternion has the sign that is nearer to the one before.
+    Quaternion signs are continuous.
     """
     first, last = np.searchsorted(imu.times, (from_s, end_s)).tolist()
     times, orientation, rates = (column[first:last] for column in imu)

@@ -1,7 +1,7 @@
-"""D1's estimator, its verification on held-out legs and its track.
+"""Estimator of D1 from displacements, its verification on held-out legs, and its track.
 
-All legs so far are solved at once. What is known at a stamp goes by rows and fixes before it alone, less by what a fix
-may be late, so a live run and a replay of its recording agree; the outcome takes effect a second later, in stamps.
+All legs so far are solved together at scheduled stamps. Each solution uses only earlier rows and fixes, minus the delay
+that a fix may have, and takes effect one second later in stamps. So a live run and a replay agree.
 """
 
 from __future__ import annotations
@@ -38,18 +38,17 @@ from .displacement_least_squares import (
 )
 from .estimator import NEVER, AtOnce, Estimator, EstimatorSetup, Solved
 
-# The first look, and then as often as the run has grown by a share; s.
+# Time of the first solution, s, and growth of the run between solutions.
 FIRST_LOOK_S, GROWN = 60.0, 1.2
-# From a look's stamp until its outcome takes effect, in stamps.
+# From a solution's stamp until it takes effect, in stamps, ns.
 SOLVED_WITHIN_NS = 1_000_000_000
-# Velocities made of positions are of no use beyond NOISY_MPS, and there are none of fixes further apart than so many
-# windows (positions.py).
+# Velocities from positions are too noisy beyond NOISY_MPS. They do not exist for fixes further apart than this number
+# of windows (position_velocities.py).
 LONGEST_WINDOWS = 3.0
 
 
 class _Look(NamedTuple):
-    """What a look at the legs so far found. fit: None where positions are good enough for velocities, or are too few.
-    noise_mps: of velocities made of the positions; inf where there are none."""
+    """Fit of the legs so far, None if not needed or too few, and noise of velocities from positions, or inf."""
 
     fit: DisplacementFit | None
     noise_mps: float
@@ -59,7 +58,7 @@ NO_LOOK = _Look(None, 0.0)
 
 
 class Displacements(Estimator):
-    """Keeps the way and the fixes, and has them solved."""
+    """Estimator of D1, which collects dead reckoning and fixes and has them solved."""
 
     def __init__(self, given: EstimatorSetup) -> None:
         """Start from the prior of D1's states."""
@@ -75,8 +74,8 @@ class Displacements(Estimator):
         self._coming: deque[tuple[int, Solved[_Look]]] = deque()
         self._told = NO_LOOK
         self._n_told = 0
-        self._newest: tuple[int, DisplacementFit | None] = (0, None)  # of all legs, by their number
-        self._folds: tuple[int, tuple[Legs, Index, list[GaussianState]]] | None = None  # by the number of fixes
+        self._newest: tuple[int, DisplacementFit | None] = (0, None)  # of all legs, with their number
+        self._folds: tuple[int, tuple[Legs, Index, list[GaussianState]]] | None = None  # with the number of fixes
         self._is_settled = False
         self._remembered: list[tuple[int, GaussianState, int]] = []
 
@@ -84,16 +83,16 @@ class Displacements(Estimator):
 
     @property
     def n_taken(self) -> int:
-        """As `Estimator`."""
+        """See `Estimator`."""
         return self._n_taken if self._is_asked else NEVER
 
     def take_fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
-        """As `Estimator`."""
+        """See `Estimator`."""
         stamp_ns -= round(self._parameters.reference_time_offset * 1e9)
         self._reckoning.add_fixes(Fixes(np.array([stamp_ns]), position[None], variance[None]))
 
     def take_rows(self) -> None:
-        """As `Estimator`."""
+        """See `Estimator`."""
         rows, end = self._aligner.rows, self._aligner.partners.n_oriented
         if not self._is_asked or end <= self._n_taken:
             return
@@ -107,7 +106,7 @@ class Displacements(Estimator):
             self._reckoning.add_rows(rows.stamps_ns[at], rows.velocity_dvl[at], rows.attitude[at, :4])
 
     def advance(self) -> None:
-        """As `Estimator`."""
+        """See `Estimator`."""
         self.take_rows()
         while self._first_ns is not None and self._next_ns <= self._oriented_ns:
             self._look(self._next_ns)
@@ -116,10 +115,10 @@ class Displacements(Estimator):
         self._let_take_effect(self._oriented_ns)
 
     def _look(self, at_ns: int) -> None:
-        """Have the legs looked at that are known at a stamp, whatever else has come by now."""
+        """Solve the legs that are complete at a stamp, whatever has arrived since."""
         assert self._first_ns is not None
         legs = self._reckoning.legs()
-        passed_s = 1e-9 * (at_ns - self._aligner.lag_ns - self._first_ns)  # later ones may still come
+        passed_s = 1e-9 * (at_ns - self._aligner.lag_ns - self._first_ns)  # later fixes may still arrive
         known = legs.part(slice(int(np.searchsorted(legs.seconds, passed_s))))
         parameters, start = self._parameters, self._start
 
@@ -138,14 +137,14 @@ class Displacements(Estimator):
                 self._on_look(from_ns)
 
     def finish(self) -> None:
-        """As `Estimator`."""
+        """See `Estimator`."""
         self.take_rows()
         if self._coming:
             self._let_take_effect(self._coming[-1][0])
 
     @contextmanager
     def settled(self) -> Iterator[None]:
-        """As `Estimator`: by all legs, not those alone that were looked at."""
+        """Use all legs inside this context, not only those of the latest solution."""
         self._is_settled = True
         try:
             yield
@@ -164,17 +163,17 @@ class Displacements(Estimator):
         return self._newest[1]
 
     def state(self) -> GaussianState:
-        """As `Estimator`."""
+        """See `Estimator`."""
         fit = self._fit()
         return self._start if fit is None else fit.errors
 
     def of_recording(self) -> GaussianState:
-        """As `Estimator`: σ is by noise that lasts already."""
+        """Return `state`, whose σ already includes correlated noise."""
         return self.state()
 
     @property
     def counts(self) -> ModelCounts:
-        """Fixes used, and outliers; what they leave is what their noise is said to be."""
+        """Fixes used and outliers; the mean squared residual is nominal, as the noise is estimated from it."""
         fit = self._fit()
         used = 0 if fit is None else int(np.count_nonzero(fit.used))
         gated = 0 if fit is None else len(fit.used) - used
@@ -182,23 +181,23 @@ class Displacements(Estimator):
 
     @property
     def n_told(self) -> int:
-        """As `Estimator`: looks."""
+        """Number of solutions in effect."""
         return self._n_told
 
     @property
     def evidence(self) -> Evidence:
-        """How noisy velocities made of the positions are, where that is why they are not used."""
+        """Evidence that positions are too noisy or too sparse for velocities, once D1 has a fit."""
         if self._told.fit is None:
             return NO_EVIDENCE
         noise = self._told.noise_mps
         return Evidence("POSITIONS_NOISY", {"noise": noise}) if noise < math.inf else Evidence("POSITIONS_SELDOM")
 
     def remember(self, from_ns: int) -> None:
-        """As `Estimator`."""
+        """See `Estimator`."""
         self._remembered.append((from_ns, self.state(), self.counts.used))
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
-        """As `Estimator`."""
+        """See `Estimator`."""
         at = np.searchsorted([row[0] for row in self._remembered], stamps_ns, side="right")
         known = [(self._start, 0), *((state, used) for _, state, used in self._remembered)]
         states, used = zip(*(known[place] for place in at.tolist()), strict=True)
@@ -212,7 +211,7 @@ class Displacements(Estimator):
     # ------------------------------------------------------------------ verification
 
     def _without_folds(self) -> tuple[Legs, Index, list[GaussianState]]:
-        """All fixes, the leg (N,) of each, and the errors had each fold not been seen, which is every fifth leg."""
+        """Return all fixes, the leg (N,) of each, and the errors estimated without each fold (every fifth leg)."""
         self.take_rows()
         legs = self._reckoning.legs()
         if self._folds is None or self._folds[0] != len(legs.seconds):
@@ -226,7 +225,7 @@ class Displacements(Estimator):
         return self._folds[1]
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
-        """As `Estimator`: of mean velocities over legs of a minute and more, by positions."""
+        """Return the held-out error of mean velocities over legs of positions; None without a fit."""
         fit = self._fit()
         if fit is None:
             return None
@@ -234,7 +233,7 @@ class Displacements(Estimator):
         return held_out(legs, numbers, states, fit, self._parameters)
 
     def navigation(self) -> Navigation | None:
-        """As `Estimator`: by positions."""
+        """Return the drift of dead reckoning by positions; None without a fit."""
         fit = self._fit()
         if fit is None or self._first_ns is None:
             return None
@@ -242,14 +241,14 @@ class Displacements(Estimator):
         return navigated(legs, numbers, states, fit, self._parameters, self._first_ns)
 
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
-        """As `Estimator`."""
+        """See `Estimator`."""
         terms = self._model.error_terms_from_state
         _, _, states = self._without_folds()
         return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * n_days for state in states]
 
 
 def _noise_of_velocities(legs: Legs, window_s: float) -> float:
-    """Of velocities that are made of the positions, m/s; inf where these come too seldom, 0 of too few to tell."""
+    """Return the noise of velocities from positions, m/s; inf if fixes are too sparse, 0 if too few."""
     if len(legs.seconds) < N_ERRORS:
         return 0.0
     interval = float(np.median(np.diff(legs.seconds)))
@@ -258,7 +257,7 @@ def _noise_of_velocities(legs: Legs, window_s: float) -> float:
     return math.sqrt(2.0) * white_noise(legs) / max(window_s, interval)
 
 
-# A velocity error is that over so long before a fix, s: of a moment, noise of positions is all there is.
+# Time before a fix over which a velocity error is averaged, s; over less, position noise dominates.
 OVER_S = 60.0
 
 
@@ -270,10 +269,10 @@ def navigated(
     parameters: Parameters,
     first_ns: int,
 ) -> Navigation | None:
-    """The track at all fixes that are no outliers; None with hardly any motion.
+    """Return the track at all fixes without outliers; None with hardly any motion.
 
-    numbers, states: as for `judge.held_out`. first_ns: stamp that the legs' seconds count from. Lever arm, clock and
-    heading are as found by all data, before and after: what is told apart is the mounting.
+    numbers, states: see `held_out`. first_ns: stamp of the legs' time 0. Lever arm, delay and heading deviation are
+    from all data in both tracks, so they differ by mounting and scale only.
     """
     at = np.flatnonzero(fit.used)
     if len(at) < 2:
@@ -326,21 +325,22 @@ def navigated(
 
 
 def _velocities(astray: Array, seconds: Array, rotation_enu_from_body: Array) -> Array:
-    """Mean velocity error (N, 3) m/s, body, over `OVER_S` before each of N fixes, by how far it led astray (N, 2) m."""
+    """Return mean velocity errors (N, 3) m/s, body axes, over `OVER_S` before each fix, from track errors (N, 2) m."""
     since = np.searchsorted(seconds, seconds - OVER_S)
     passed = np.maximum(seconds - seconds[since], 1.0)[:, None]
     enu = np.concatenate([(astray - astray[since]) / passed, np.zeros((len(seconds), 1))], axis=1)
     return np.asarray(np.einsum("nji,nj->ni", rotation_enu_from_body, enu))
 
 
-# Legs that are judged are so long, s: noise of positions is the less the longer they are, but there are to be so many.
+# Length of a held-out leg, s: at most LEG_S against position noise, and shorter to have LEGS of them; at least
+# SHORTEST_LEG_S, and no more than MOST_LEGS legs.
 LEG_S, SHORTEST_LEG_S, LEGS, MOST_LEGS = 60.0, 20.0, 30.0, 200.0
-# Fixes whose mean is one end of a leg are of so much of it.
+# Share of a leg at each end whose fixes are averaged.
 END_SHARE = 0.25
 
 
 def leg_length_s(legs: Legs) -> float:
-    """How long legs are that are judged."""
+    """Return the length of held-out legs, s."""
     span_s = float(np.ptp(legs.seconds)) if len(legs.seconds) else 0.0
     return max(SHORTEST_LEG_S, span_s / MOST_LEGS, min(LEG_S, span_s / LEGS))
 
@@ -348,17 +348,17 @@ def leg_length_s(legs: Legs) -> float:
 def held_out(
     legs: Legs, numbers: Index, states: Sequence[GaussianState], fit: DisplacementFit, parameters: Parameters
 ) -> HeldOutError | None:
-    """Error of mean velocity over legs, m/s: by the state of `states` that had not seen it.
+    """Return the error of mean velocities over legs, m/s, each by the state of `states` fitted without it.
 
-    numbers (N,): of the leg of each fix, which are dealt out to the states in turn. What is predicted is what noise
-    leaves with the estimate of all data, and the estimate's σ.
+    numbers: (N,) leg of each fix; legs are assigned to the states in turn. The predicted error holds the residual of
+    the fit of all data, and the estimate's covariance.
     """
     ends = _ends(legs, numbers, fit)
     if not len(ends):
         return None
     sums = np.zeros(5)
     rest = fit.state.x.copy()
-    rest[:N_ERRORS] = 0.0  # lever arm, clock and heading, by all data: what is judged is the mounting
+    rest[:N_ERRORS] = 0.0  # lever arm, delay and heading from all data; only mounting and scale are tested
     of_all = _velocity_errors(legs, ends, fit.state.x, parameters)
     before = _velocity_errors(legs, ends, rest, parameters)
     for fold, state in enumerate(states):
@@ -376,7 +376,7 @@ def held_out(
 
 
 def _ends(legs: Legs, numbers: Index, fit: DisplacementFit) -> list[tuple[Index, Index]]:
-    """Fixes at the beginning and at the end of each leg: of one stretch, no outliers."""
+    """Return the fixes at both ends of each leg, in one stretch and without outliers."""
     length = leg_length_s(legs)
     at = np.flatnonzero(fit.used)
     key = np.stack([legs.stretch[at], numbers[at]])
@@ -391,7 +391,7 @@ def _ends(legs: Legs, numbers: Index, fit: DisplacementFit) -> list[tuple[Index,
 
 
 def _between(values: Array, legs: Legs, ends: Sequence[tuple[Index, Index]]) -> Array:
-    """Change of values (N, ...) per second from the beginning of each leg to its end."""
+    """Return the change per second of values (N, ...) from start to end of each leg."""
     return np.array(
         [
             (values[last].mean(axis=0) - values[first].mean(axis=0))
@@ -407,6 +407,6 @@ def _velocity_errors(legs: Legs, ends: Sequence[tuple[Index, Index]], theta: Arr
 
 
 def _jacobian(legs: Legs, ends: Sequence[tuple[Index, Index]], theta: Array, parameters: Parameters) -> Array:
-    """(L, 2, 4) of velocities by the errors."""
+    """Return the derivative (L, 2, 4) of leg velocities by the errors."""
     columns = linear_about(legs, theta, parameters).columns[:, :2, :N_ERRORS]
     return _between(columns, legs, ends)

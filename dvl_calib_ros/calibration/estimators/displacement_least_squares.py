@@ -1,13 +1,10 @@
-"""Least squares over legs of dead reckoning between position fixes.
+"""Least squares over legs of dead reckoning between position fixes (docs/models.md, "D1").
 
-Fixes less dead reckoning are y = o + J θ + noise, with o a constant of each stretch. Means over blocks of time are
-fitted at once; the noise of these is white, beside it a Gauss-Markov process (multipath, a beacon's sound speed) and a
-random walk (dead reckoning's own), as large and as lasting as a grid of hypotheses says. What is told is the mixture of
-all, by their evidence, so σ holds that the noise is not known either. θ: misalignment (3) rad, scale, lever arm (3) m
-beyond the parameters', by what fixes are late s, and coefficients (5) of the heading's deviation.
-
-The way between two times is ∫ R M v dt, with R the attitude (ENU from body), v the DVL's velocity and M the matrix that
-corrects it. It is linear in M, whatever the angles are: so W = ∫ R ⊗ v dt is summed up once, and serves any M.
+Fixes minus dead reckoning are y = o + J θ + noise, with a constant o per stretch. θ: misalignment (3) rad, scale, lever
+arm (3) m beyond the parameters', delay of the fixes s, and heading deviation (5). Means over blocks of time are fitted
+together. Their noise is white, plus a Gauss-Markov process (multipath, sound speed of a beacon) and a random walk (dead
+reckoning). A grid of hypotheses has their sizes and memories, and the result is the mixture by evidence, so σ includes
+the unknown noise.
 """
 
 from __future__ import annotations
@@ -26,34 +23,35 @@ from ..numerics.samples import Index, Mask, Stamps
 
 N_ERRORS, N_THETA = 4, 13
 SCALE, ARM, LATE, DEVIATION, DRIFT = 3, slice(4, 7), 7, slice(8, 13), 12
-# Fewer fixes prove nothing.
+# Fixes needed for a fit.
 ENOUGH_FIXES = 12
-# Blocks of time, s: as many as can be solved at once, and no shorter.
+# Shortest block of time, s, and largest number of blocks, which are solved together.
 SHORTEST_BLOCK_S, MOST_BLOCKS = 10.0, 120
-# A fix is an outlier from so many σ beyond the median of so many neighbours to either side.
+# A fix is an outlier beyond this number of σ from the median of its neighbours to either side.
 OUTLYING, NEIGHBOURS = 4.5, 6
-# Outliers that last for minutes are so many σ from the median of all of a stretch: what drifts is spread evenly.
+# Limit for outliers that last for minutes, in σ from the median of a stretch; drift spreads evenly and stays below.
 FAR_OUT = 6.0
-# Huber's bound, σ, of a first fit.
+# Huber's bound, σ, in the first fit.
 HUBER = 1.5
-# Hypotheses of noise: variance that lasts, of a block's white one, and for how long, s; variance that a random walk
-# gathers in WALK_S; how much larger a heading deviates than the parameter says (as of `heading_states`).
+# Noise hypotheses. LASTING: variance of the Gauss-Markov process relative to a block's white variance; LASTING_S: its
+# memory, s. WALKED: variance of the random walk after WALK_S, relative to the same. DEVIATES: heading deviation
+# relative to its parameter.
 LASTING: tuple[float, ...] = (0.3, 1.5, 8.0, 40.0)
 LASTING_S: tuple[float, ...] = (20.0, 60.0, 180.0, 600.0)
 WALKED, WALK_S = (0.0, 0.03, 0.3, 3.0), 300.0
 DEVIATES: Array = np.array([0.3, 1.0, 3.0])
 _DEVIATES_LOG: Array = -0.5 * (np.log(DEVIATES) / np.log(4.0)) ** 2
 _SHARE: Array = np.array([1.0, 1.0, 0.7, 0.7, 1.0])
-# A stretch begins anywhere: its variance, of the largest other.
+# Variance of a stretch's constant, relative to the largest other variance.
 ANYWHERE = 1e5
-ROUNDS = 3
-# No fix is better beside dead reckoning, m: in turns, late ones are off by half the acceleration times their lateness².
+ROUNDS = 3  # iterations of linearisation and outlier rejection
+# Smallest noise of a fix against dead reckoning, m: in turns a delayed fix is wrong by half the acceleration times
+# delay².
 FINEST_M = 0.3
 
 
 class DisplacementFit(NamedTuple):
-    """What was found. state: θ (13,) and its covariance. noise_m: standard deviation of a fix, white, of one axis.
-    used (N,): which fixes are no outliers."""
+    """Fit of all legs: θ (13,) with covariance, white σ (m) of a fix per axis, and which fixes (N,) are used."""
 
     state: GaussianState
     noise_m: float
@@ -61,19 +59,22 @@ class DisplacementFit(NamedTuple):
 
     @property
     def errors(self) -> GaussianState:
-        """Misalignment and scale: D1's states."""
+        """Misalignment and scale, the states of D1."""
         return GaussianState(self.state.x[:N_ERRORS], self.state.p[:N_ERRORS, :N_ERRORS])
 
 
 class _Linear(NamedTuple):
-    """y (N, 3) m and its columns (N, 3, 13) for absolute θ."""
+    """y (N, 3) m and its columns (N, 3, 13), linear in absolute θ."""
 
     y: Array
     columns: Array
 
 
 class _Blocks(NamedTuple):
-    """Means over B blocks. seconds, stretch, weight (B,): fixes in each. y (A, B), columns (A, B, 13) of A axes."""
+    """Means over B blocks of time.
+
+    seconds, stretch, weight: (B,), the weight being the number of fixes. y: (A, B), columns: (A, B, 13), for A axes.
+    """
 
     seconds: Array
     stretch: Index
@@ -83,14 +84,14 @@ class _Blocks(NamedTuple):
 
 
 def white_noise(legs: Legs) -> float:
-    """Standard deviation of a fix beside its neighbours, m, of one axis, as the DVL is mounted."""
+    """Return the white σ (m) per axis of fixes against their neighbours, with the nominal mounting."""
     step = np.diff(legs.seconds)[:, None]
     moved = np.diff(legs.position, axis=0) - 0.5 * step * (legs.velocity[1:] + legs.velocity[:-1])
     return float(robust_std(moved[:, :2]).mean()) / math.sqrt(2.0)
 
 
 def _prior(errors: GaussianState, parameters: Parameters, span_s: float) -> GaussianState:
-    """θ before any data."""
+    """Return the prior of θ. errors: prior of misalignment and scale. span_s: duration of the run."""
     p = parameters
     deviation = p.heading_deviation_std * _SHARE / np.array([1.0, 1.0, 1.0, 1.0, max(span_s, 60.0)])
     rest = np.array([*[p.initial_std_lever_arm] * 3, p.initial_std_time_offset, *np.maximum(deviation, 1e-12)])
@@ -100,7 +101,7 @@ def _prior(errors: GaussianState, parameters: Parameters, span_s: float) -> Gaus
 
 
 def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
-    """As `solve`; None where there are too few. errors: misalignment and scale before them."""
+    """Return the fit, or None for too few fixes; see `solve`."""
     if len(legs.seconds) < ENOUGH_FIXES:
         return None
     prior = _prior(errors, parameters, float(np.ptp(legs.seconds)))
@@ -121,7 +122,7 @@ def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displa
         has_height = used & np.isfinite(legs.variance[:, 2]) & (np.abs(legs.position[:, 2]) < FARTHEST_M)
         if has_height.sum() >= ENOUGH_FIXES:
             state, _ = _fitted(_means(linear, legs, has_height, (2,)), state)
-    # nobody knows when a heading that drifts is right; and by a pitch ε that is not known the way is longer by ε²/2
+    # a heading drift with unknown zero makes yaw uncertain; an unknown pitch ε changes the scale by ε²/2
     span_s, (x, p) = float(np.ptp(legs.seconds)), state
     _, across, up = parameters.rotation_dvl_from_body.T
     p[SCALE, SCALE] += 0.75 * float(across @ p[:3, :3] @ across) ** 2
@@ -130,7 +131,7 @@ def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displa
 
 
 def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
-    """What all legs tell; None where they are too few, or numbers run away. errors: misalignment and scale before."""
+    """Fit all legs; None if they are too few or numbers diverge. errors: prior of misalignment and scale."""
     try:
         fit = _solved(legs, parameters, errors)
     except np.linalg.LinAlgError:
@@ -139,7 +140,7 @@ def solve(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displace
 
 
 def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
-    """Fixes less dead reckoning about θ, as linear in it."""
+    """Linearise fixes minus dead reckoning about θ (13,)."""
     t = parameters.rotation_dvl_from_body
 
     def matrix(errors: Array) -> Array:
@@ -151,13 +152,13 @@ def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
     columns = np.empty((len(legs.seconds), 3, N_THETA))
     for place, slope in enumerate(slopes):
         columns[:, :, place] = np.einsum("nabc,bc->na", legs.way, slope)
-    # of the way's horizontal a misalignment about the level axes is next to nothing, and nothing is to be claimed by it
+    # misalignment about level axes hardly changes horizontal displacements, so it must not gain information from them
     up = t[:, 2]
     columns[:, :2, :3] = (columns[:, :2, :3] @ up)[..., None] * up
     columns[:, :, ARM] = -legs.rotation
     columns[:, :, LATE] = -legs.velocity
     columns[:, :, DEVIATION] = -legs.drifted
-    # a drift has no mean over the run: yaw has that
+    # the drift is centred in time; its mean belongs to yaw
     east, north, _ = np.einsum("nabc,bc->na", legs.way, t.T).T
     columns[:, 0, DRIFT] -= north * legs.seconds.mean()
     columns[:, 1, DRIFT] += east * legs.seconds.mean()
@@ -167,7 +168,7 @@ def linear_about(legs: Legs, theta: Array, parameters: Parameters) -> _Linear:
 
 
 def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
-    """θ (13,) by least squares with Huber's weights, noise being white."""
+    """Fit θ (13,) by least squares with white noise and Huber weights."""
     _, stretch = np.unique(legs.stretch, return_inverse=True)
     rows = np.concatenate([linear.y[:, :2, None], linear.columns[:, :2]], axis=2)  # (N, 2, 14)
     weight, level = np.ones((len(rows), 2)), 1.0
@@ -184,7 +185,7 @@ def _first_fit(linear: _Linear, legs: Legs, std: Array) -> Array:
 
 
 def _of_stretches(rows: Array, weight: Array, stretch: Index) -> Array:
-    """Weighted means (S, 2, 14) of rows (N, 2, 14), weight (N, 2), by the stretch (N,) that each is of."""
+    """Return weighted means (S, 2, 14) of rows (N, 2, 14) per stretch. weight: (N, 2). stretch: (N,)."""
     sums, total = np.zeros((int(stretch[-1]) + 1, *rows.shape[1:])), np.zeros((int(stretch[-1]) + 1, 2))
     np.add.at(sums, stretch, rows * weight[..., None])
     np.add.at(total, stretch, weight)
@@ -192,7 +193,7 @@ def _of_stretches(rows: Array, weight: Array, stretch: Index) -> Array:
 
 
 def _no_outliers(left: Array, stretch: Index) -> Mask:
-    """Which of N fixes are none, by what is left of them (N, 2) m."""
+    """Return which of N fixes are no outliers, from their residuals (N, 2) m."""
     n = len(left)
     places = np.clip(np.arange(n)[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1), 0, n - 1)
     near = np.where((stretch[places] == stretch[:, None])[..., None], left[places], np.nan)
@@ -207,7 +208,7 @@ def _no_outliers(left: Array, stretch: Index) -> Mask:
 
 
 def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Blocks:
-    """Means over blocks of time, of fixes in use."""
+    """Average the fixes in use over blocks of time."""
     at = np.flatnonzero(use)
     seconds = legs.seconds[at]
     length = max(SHORTEST_BLOCK_S, float(seconds[-1] - seconds[0]) / MOST_BLOCKS)
@@ -221,7 +222,7 @@ def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Bl
 
     y, columns = mean(linear.y[at][:, axes]), mean(linear.columns[at][:, axes])
     stretch = legs.stretch[at][first]
-    # one block alone says nothing, as its stretch begins anywhere; of very many stretches the longest say enough
+    # a stretch of one block holds no information, as its constant is free; of very many stretches the longest suffice
     names, sizes = np.unique(stretch, return_counts=True)
     longest = np.argsort(-sizes, kind="stable")
     kept = longest[(sizes[longest] > 1) & (np.cumsum(sizes[longest]) <= max(2 * MOST_BLOCKS, int(sizes.max())))]
@@ -230,7 +231,7 @@ def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Bl
 
 
 def _hypotheses(blocks: _Blocks) -> Array:
-    """Covariances (G, B, B) of the noise, of a fix's white variance."""
+    """Return noise covariances (G, B, B) of the hypotheses, relative to the white variance of a fix."""
     t, white = blocks.seconds, 1.0 / blocks.weight
     usual = float(median(white))
     same = blocks.stretch[:, None] == blocks.stretch
@@ -244,7 +245,7 @@ def _hypotheses(blocks: _Blocks) -> Array:
 
 
 def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float]:
-    """Posterior by the mixture of all hypotheses, and white noise of one fix, m."""
+    """Return the posterior from the mixture of all hypotheses, and the white noise of a fix, m."""
     if not len(blocks.seconds):
         return prior, 0.0
     covariance = _hypotheses(blocks)
@@ -252,14 +253,14 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     root = np.linalg.cholesky(covariance)
     log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     rows = np.concatenate([blocks.y[:, :, None], blocks.columns], axis=2)
-    rows = rows - rows.mean(axis=1, keepdims=True)  # of a stretch that begins anywhere it is no matter
-    # axes beside one another, (B, A 14): each of the many large roots is taken apart once for all
+    rows = rows - rows.mean(axis=1, keepdims=True)  # a common constant has no effect, as each stretch has a free one
+    # axes side by side, (B, A 14), so that each of the large factors is used once
     whitened = np.linalg.solve(root, np.concatenate(list(rows), axis=1)[None])  # NumPy 1 takes (B, k) for vectors
     parts = np.split(whitened, axes, axis=2)
     square = np.asarray(sum(part.swapaxes(1, 2) @ part for part in parts))
     yy, by, told = square[:, 0, 0], square[:, 0, 1:], square[:, 1:, 1:]
     freedom = float(axes * (n - len(np.unique(blocks.stretch))))
-    # hypotheses of the deviation beside those of the noise: (G, F, ...)
+    # hypotheses of the heading deviation, combined with those of the noise: (G, F, ...)
     wider = np.ones((len(DEVIATES), N_THETA))
     wider[:, DEVIATION] = DEVIATES[:, None]
     known = np.linalg.inv(prior.p * wider[:, :, None] * wider[:, None, :])
@@ -287,27 +288,27 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     share /= share.sum()
     mean = np.einsum("gf,gfi->i", share, x)
     apart = x - mean
-    # the level is found by so few: Student's t
+    # Student's t, as few degrees of freedom determine the level
     few = np.maximum(freedom - spent, 3.0)
     p = p * (few / (few - 2.0))[..., None, None]
     total = np.einsum("gf,gfij->ij", share, p) + np.einsum("gf,gfi,gfj->ij", share, apart, apart)
     return GaussianState(mean, 0.5 * (total + total.T)), float(np.sqrt((share * level).sum()))
 
 
-# No vehicle is so far from where it began, m.
+# Largest distance of a vehicle from its start, m.
 FARTHEST_M = 1e6
-# Between DVL samples that are further apart, s, the way is not known.
+# Longest interval of DVL samples that is integrated, s.
 LONGEST_STEP_S = 3.0
-# So much later than the DVL's samples of its time, s, a fix may come at least.
+# Fixes are accepted with delays up to this at least, s, after the DVL's samples of their time.
 LATEST_FIX_S = 60.0
-# Fixes that come faster say no more: their errors are alike.
+# Shortest interval of fixes, ns; denser ones have the same errors.
 SHORTEST_FIX_NS = 950_000_000
 
 
 class Fixes(NamedTuple):
-    """N positions in order of stamps.
+    """N position fixes in order of stamps.
 
-    stamps_ns (N,). position (N, 3): east, north, up, m, from any origin. variance (N, 3) m², nan where not given.
+    stamps_ns: (N,). position: (N, 3) east, north, up, m, from any origin. variance: (N, 3) m², nan if not given.
     """
 
     stamps_ns: Stamps
@@ -316,27 +317,27 @@ class Fixes(NamedTuple):
 
     @staticmethod
     def none() -> Fixes:
-        """No fix."""
+        """Return no fixes."""
         return Fixes(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
     def part(self, at: slice | Index) -> Fixes:
-        """The rows of a slice or of indices."""
+        """Return the rows of a slice or of indices."""
         columns: list[Any] = [column[at] for column in self]
         return Fixes(*columns)
 
     def joined(self, others: Fixes) -> Fixes:
-        """These and then others."""
+        """Return these fixes followed by others."""
         columns: list[Any] = [np.concatenate(pair) for pair in zip(self, others, strict=True)]
         return Fixes(*columns)
 
 
 class Legs(NamedTuple):
-    """N fixes, and the way to each since its stretch began, in which the DVL had no gap.
+    """N fixes, each with the dead reckoning to it since its stretch began. A stretch has no DVL gap.
 
-    seconds (N,) since the first DVL sample. stretch (N,): number of it. way (N, 3, 3, 3): W, of axes of ENU, body and
-    DVL, m. drifted (N, 3, 5): by what the way turns with the coefficients of the heading's deviation as `HeadingStates`
-    has them, of time per second, m/rad. rotation (N, 3, 3): ENU from body. position, variance (N, 3): of the fixes.
-    velocity (N, 3) m/s in ENU, as mounted.
+    seconds: (N,) since the first DVL sample. stretch: (N,) number. way: (N, 3, 3, 3) m, W = ∫ R ⊗ v dt over axes of
+    ENU, body and DVL; the displacement for a correction matrix M is W : M. drifted: (N, 3, 5) m/rad, derivative of the
+    displacement by the heading deviation, the drift being per second. rotation: (N, 3, 3) ENU from body. velocity:
+    (N, 3) m/s ENU, nominal mounting. position, variance: (N, 3) of the fixes.
     """
 
     seconds: Array
@@ -349,20 +350,20 @@ class Legs(NamedTuple):
     variance: Array
 
     def part(self, at: slice | Index) -> Legs:
-        """The rows of a slice or of indices."""
+        """Return the rows of a slice or of indices."""
         columns: list[Any] = [column[at] for column in self]
         return Legs(*columns)
 
 
-# Columns of what is summed up: way, and what a deviation of the heading turns it by.
-# Coefficients of the heading's deviation: one and two cycles, and a drift.
+# Coefficients of the heading deviation: one and two cycles, and a drift. N_SUMS: integrated columns, the way and its
+# derivatives by these.
 N_HEADING = 5
 N_SUMS = 27 + 3 * N_HEADING
 _WAY, _DRIFTED = slice(0, 27), slice(27, N_SUMS)
 
 
 class _Passed(NamedTuple):
-    """DVL samples since the last fix that is done. sums: up to each; rates: of them, per second."""
+    """DVL samples since the last processed fix. sums: integrals up to each. rates: integrands, per second."""
 
     seconds: Array
     stretch: Index
@@ -377,10 +378,10 @@ _NO_ROWS = _Passed(
 
 
 class DeadReckoning:
-    """Sums up the way as DVL samples come, and says where fixes found it."""
+    """Integral of DVL samples as they arrive, interpolated at fixes."""
 
     def __init__(self, rotation_dvl_from_body: Array, latest_fix_s: float = 0.0) -> None:
-        """latest_fix_s: so much later than the DVL's samples of its time a fix may come."""
+        """Start without samples. latest_fix_s: largest delay of a fix after the DVL's samples of its time."""
         self._latest_s = max(LATEST_FIX_S, latest_fix_s)
         self._body_from_dvl = rotation_dvl_from_body.T
         self._epoch_ns: int | None = None
@@ -392,7 +393,7 @@ class DeadReckoning:
         self._newest_fix_ns = -(2**62)
 
     def add_fixes(self, fixes: Fixes) -> None:
-        """Take fixes; those out of order are left out, and of faster ones so many as say something."""
+        """Add fixes, without those out of order, too far away, or too dense."""
         kept = []
         sound = np.asarray((np.abs(fixes.position[:, :2]) < FARTHEST_M).all(axis=1))
         for row, stamp_ns in enumerate(fixes.stamps_ns.tolist()):
@@ -403,14 +404,14 @@ class DeadReckoning:
             self._waiting = self._waiting.joined(fixes.part(np.array(kept)))
 
     def add_rows(self, stamps_ns: Stamps, velocity_dvl: Array, quaternion: Array) -> None:
-        """Take DVL samples that follow those before: velocity (N, 3) m/s, its axes; quaternion (N, 4) ENU from body."""
+        """Add the next DVL samples: velocity (N, 3) m/s, DVL axes; quaternion (N, 4), ENU from body."""
         known = np.isfinite(velocity_dvl).all(axis=1) & np.isfinite(quaternion).all(axis=1)
         if not known.any():
             return
         self._new.append((stamps_ns[known], velocity_dvl[known], quaternion[known]))
 
     def _sum_up(self) -> None:
-        """Take what is new into the sums."""
+        """Integrate the new samples."""
         if not self._new:
             return
         stamps_ns, velocity_dvl, quaternion = (np.concatenate(column) for column in zip(*self._new, strict=True))
@@ -434,7 +435,7 @@ class DeadReckoning:
         self._rows = _Passed(*columns)
 
     def _rates(self, seconds: Array, velocity: Array, quaternion: Array) -> Array:
-        """What is summed up, per second (N, 42)."""
+        """Return the integrands (N, 42), per second."""
         rotation = rotation_from_quaternion(quaternion)
         n = len(seconds)
         way = rotation[:, :, :, None] * velocity[:, None, None, :]
@@ -447,11 +448,11 @@ class DeadReckoning:
         )
 
     def legs(self) -> Legs:
-        """Of all fixes so far that DVL samples have passed."""
+        """Return the legs to all fixes that DVL samples have passed."""
         self._sum_up()
         self._pass_fixes()
         newest_s = self._rows.seconds[-1] if len(self._rows.seconds) else 0.0
-        # a fix that is later than this is not waited for
+        # fixes with a longer delay are dropped
         kept = max(int(np.searchsorted(self._rows.seconds, newest_s - self._latest_s)) - 1, 0)
         columns: list[Any] = [column[kept:] for column in self._rows]
         self._rows = _Passed(*columns)
@@ -461,6 +462,7 @@ class DeadReckoning:
         return self._done[0] if self._done else _no_legs()
 
     def _pass_fixes(self) -> None:
+        """Interpolate the integrals at the fixes that DVL samples have passed."""
         seconds, stretch, sums, rates, quaternion = self._rows
         if len(seconds) < 2 or not len(self._waiting.stamps_ns):
             return

@@ -1,7 +1,7 @@
-"""The interface of an estimator, the linear filter behind it, and the worker that solves in a thread.
+"""Interface of an estimator, its implementation for linear filters, and workers.
 
-`Calibrator` has one for each model and asks all alike. One that is more than the linear filter is told of the aligned
-rows by `advance`, after whatever was fed, and may hold rows back until it has copied them.
+`Calibrator` has one estimator per model. A nonlinear estimator learns of new aligned rows by `advance`, and may make
+the aligner hold rows until it has copied them.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from ..results.results import Day
 from ..results.thinned_recording import Terms, ThinnedRecording
 from ..streams.aligner import Aligner
 
-NEVER = 2**63 - 1
+NEVER = 2**63 - 1  # number of a row that never comes
 
 
 @dataclass(frozen=True)
 class EstimatorSetup:
-    """What an estimator of a model is made with.
+    """Arguments for making an estimator.
 
-    initial: a state to start from, of the model. on_evidence: to be told, once something new takes effect, of the
-    stamp from which on DVL samples may go by it. verified: keep what hold-out needs. worker: does what would hold up
-    live messages; None: at once. together: how many blocks of time may be gathered before they are looked at, unless
-    somebody asks. registration: how the instruments stand, where that is known.
+    initial: initial state of the model. on_evidence: called when a result takes effect, with the stamp of the first DVL
+    sample that it may affect. verified: keep what hold-out verification needs. worker: runs slow work in a thread so
+    that live messages do not wait; None runs it immediately. together: number of blocks gathered before they are
+    solved, unless a result is requested. registration: registration of clocks and frames, if already computed.
     """
 
     model: Model
@@ -58,11 +58,11 @@ class EstimatorSetup:
 
 
 class Estimator(ABC):
-    """The states of one model; what is not abstract is for those that know more than the linear filter."""
+    """States of one model. The methods that are not abstract have defaults for the linear filter."""
 
     @property
     def claims(self) -> bool:
-        """Whether there are any data of its own."""
+        """Return whether it has used any data."""
         return True
 
     @property
@@ -77,206 +77,205 @@ class Estimator(ABC):
 
     @property
     def reference_claims(self) -> bool:
-        """Whether it is the reference's messages that say how noisy it is, and no parameter."""
+        """Return whether the reference's noise comes from its messages instead of a parameter."""
         return False
 
     @property
     def doubt(self) -> Reason | None:
-        """What is known against models that take for granted what this one finds."""
+        """Reason against models that assume what this one estimates."""
         return None
 
     @property
     def heading_deviation(self) -> GaussianState | None:
-        """Coefficients x (5,), P (5, 5) of how the heading deviates, as `Estimate.heading_deviation`; None."""
+        """Heading deviation x (5,), P (5, 5), see `Estimate.heading_deviation`; None if not estimated."""
         return None
 
     @property
     def suggestion(self) -> Reason | None:
-        """What configuration the data fit, where the one given is grossly wrong."""
+        """Configuration that fits the data, if the given one is grossly wrong."""
         return None
 
     @property
     def is_level(self) -> bool:
-        """Whether the attitude that turns references into the body is a heading alone, without roll and pitch."""
+        """Return whether the attitude is a heading only, without roll and pitch."""
         return False
 
     @property
     def is_horizontal(self) -> bool:
-        """Whether no reference measures the vertical."""
+        """Return whether no reference measures the vertical."""
         return False
 
     @property
     def left_open(self) -> Array:
-        """(n, n) of `of_recording`'s covariance, what the clock of the reference leaves open."""
+        """Part (n, n) of `of_recording`'s covariance due to the uncertain clock offset of the reference."""
         n = len(self.state().x)
         return np.zeros((n, n))
 
     @property
     def of_bias(self) -> BiasCovariance:
-        """What a bias of the DVL makes of `of_recording`."""
+        """Part of `of_recording`'s covariance due to a bias of the DVL."""
         return BiasCovariance.none(len(self.state().x))
 
     @property
     def registration(self) -> Registration | None:
-        """How the instruments stand, by their data alone; None for one that does not look."""
+        """Registration of clocks and frames from the data alone; None if not computed."""
         return None
 
     def rest(self, *, fresh: bool) -> Rest | None:
-        """What the calibration leaves, by a look at all there is or, not fresh, by one a little ago; None for none."""
+        """Return the calibration's residuals, evaluated now if `fresh`, else the latest; None if not available."""
         return None
 
     @property
     def registration_so_far(self) -> Registration | None:
-        """`registration` as it was seen a little ago, which nobody has to wait for."""
+        """`registration` by the latest evaluation, without waiting."""
         return None
 
     @property
     def n_told(self) -> int:
-        """What grows when it may have more to say, beside a state that changes with each sample."""
+        """Counter that grows when there may be new results besides the state."""
         return self.counts.used
 
     @property
     def suggestion_so_far(self) -> Reason | None:
-        """`suggestion` as it was seen a little ago, which nobody has to wait for."""
+        """`suggestion` by the latest evaluation, without waiting."""
         return self.suggestion
 
     @property
     def evidence(self) -> Evidence:
-        """What it has to say to the selection."""
+        """Evidence for the model selection."""
         return NO_EVIDENCE
 
     @property
     def told_until_ns(self) -> int | None:
-        """Stamp of the first DVL sample that may go by something that is only gathered; None."""
+        """Stamp of the first DVL sample that gathered blocks may still affect; None without any."""
         return None
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:
-        """What it kept of all streams for verification, and the stamp (ns) of its time 0; None for nothing."""
+        """Streams kept for verification, and the stamp (ns) of their time 0; None if nothing was kept."""
         return None
 
     @abstractmethod
     def state(self) -> GaussianState:
-        """x (n,) and P (n, n) by all rows so far."""
+        """Return x (n,) and P (n, n) from all rows so far."""
 
     @property
     @abstractmethod
     def counts(self) -> ModelCounts:
-        """What it did with the samples given to it."""
+        """Counts of samples used and rejected."""
 
     @abstractmethod
     def of_recording(self) -> GaussianState:
-        """As `state`, with σ as blocks of time show it."""
+        """Return `state` with σ from the scatter of time blocks."""
 
     @property
     def filter_covariance(self) -> Array:
-        """P (n, n) as the filter alone claims it: of an estimator whose `state` is no more than that."""
+        """P (n, n) that the filter alone claims; by default of `state`."""
         return self.state().p
 
     @abstractmethod
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
-        """After E rows of a trace, with their stamps (E,): x (E, n), P (E, n, n), samples used (E,), and the sum of
-        νᵀS⁻¹ν over them (E,)."""
+        """Return x (E, n), P (E, n, n), samples used and sums of νᵀS⁻¹ν (E,) after E rows of a trace."""
 
     @abstractmethod
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
-        """Velocity error on every fold by the state that has not seen it; None if there is too little to judge by."""
+        """Return the velocity error on every fold, each by the state without it; None for too few samples."""
 
     def navigation(self) -> Navigation | None:
-        """What it is worth to dead reckoning, of one that judges that itself; None: by velocities, as of all others."""
+        """Return the drift of dead reckoning if the estimator judges it itself; None to judge it by velocities."""
         return None
 
     @abstractmethod
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
-        """For every fold what it corrects on every day, had it not seen that fold."""
+        """Return, per fold and day, the corrections estimated without that fold."""
 
     def advance(self) -> None:
-        """Rows may have been added, or decided."""
+        """Take note that rows may have been added or decided."""
         return None
 
     def take_rows(self) -> None:
-        """Copy the rows that are judged, before they are forgotten."""
+        """Copy the judged rows before they are forgotten."""
         return None
 
     def take_fix(self, stamp_ns: int, position: Array, variance: Array) -> None:
-        """Take a position of the reference point (3,) m, ENU, and its variances (3,) m², nan where not known."""
+        """Take a position (3,) m of the reference point, ENU, and variances (3,) m², nan if unknown."""
         return None
 
     def settle(self) -> None:
-        """Let take effect what is only gathered."""
+        """Solve what is gathered, and let it take effect."""
         return None
 
     @contextmanager
     def settled(self) -> Iterator[None]:
-        """All that is complete has taken effect, in here."""
+        """Let all complete blocks take effect inside this context."""
         yield
 
     def finish(self) -> None:
-        """No samples come any more."""
+        """Process what is gathered after the last sample."""
         return None
 
     def remember(self, from_ns: int) -> None:
-        """Keep the state as of now, for `states_at`."""
+        """Keep the current state for `states_at`."""
         return None
 
     def day_of(self, stamps_ns: Stamps) -> Index:
-        """Which day (N,) stamps are of, from 0."""
+        """Return the day (N,), from 0, of each stamp."""
         return np.zeros(len(stamps_ns), dtype=np.intp)
 
     def days_from(self, first_ns: Sequence[int]) -> tuple[Day, ...]:
-        """What belongs to each of several days, by the stamps that they begin with; none where there is one."""
+        """Return per-day values, by the days' first stamps; empty with one day."""
         return ()
 
 
 class LinearEstimator(Estimator):
-    """A model of a group of linear filters."""
+    """A model in a group of linear filters."""
 
     def __init__(self, model: Model, group: Group, update: Callable[[Group], None]) -> None:
-        """update: gives the group the rows that it has not had."""
+        """Wrap a model of a group. update: gives the group the rows that it has not had."""
         self._model, self._group, self._update = model, group, update
 
     def state(self) -> GaussianState:
-        """As `Estimator`."""
+        """See `Estimator`."""
         self._update(self._group)
         return self._group.state(self._model.name)
 
     @property
     def counts(self) -> ModelCounts:
-        """As `Estimator`."""
+        """See `Estimator`."""
         return self._group.counts(self._model.name)
 
     def of_recording(self) -> GaussianState:
-        """As `Estimator`."""
+        """See `Estimator`."""
         self._update(self._group)
         return self._group.of_recording(self._model.name)
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
-        """As `Estimator`."""
+        """See `Estimator`."""
         standing = trace.standing(self._group, numbers)
         name = self._model.name
         used, nis_sum = self._group.counts_at(name, standing)
         return self._group.states_at(name, standing), used, nis_sum
 
     def held_out_error(self, judge: Moments, rotation_dvl_from_body: Array) -> HeldOutError | None:
-        """As `Estimator`."""
+        """See `Estimator`."""
         states = self._group.states_without_folds(self._model.name)
         return held_out_error(self._model, states, judge, rotation_dvl_from_body)
 
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:
-        """As `Estimator`."""
+        """See `Estimator`."""
         terms = self._model.error_terms_from_state
         states = self._group.states_without_folds(self._model.name)
         return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * n_days for state in states]
 
 
 def kind_of(model: Model) -> Callable[[EstimatorSetup], Estimator]:
-    """What makes the estimator that a model names; what another package does wrong is raised when one is made."""
+    """Return the maker of the estimator that a model names; a faulty plugin raises ParameterError when called."""
     name = model.estimator
     try:
         kind = load(name)
         if not (isinstance(kind, type) and issubclass(kind, Estimator)):
             raise TypeError(f"{name} is no subclass of Estimator")
-    except Exception as error:  # whatever a foreign package does wrong
+    except Exception as error:  # a plugin may raise anything
         says = f"model {model.name}: its estimator {name} cannot be used ({type(error).__name__}: {error}); mend or "
 
         def refuse(_: EstimatorSetup) -> Estimator:
@@ -292,42 +291,45 @@ Given = TypeVar("Given", covariant=True)
 
 
 class Solved(Protocol[Given]):
-    """What a worker was given to do, as `concurrent.futures.Future`."""
+    """Result of work given to a worker, with the interface of `concurrent.futures.Future`."""
 
     def result(self) -> Given:
-        """What was found, waited for; raises what the solving raised."""
+        """Wait for the result and return it; raise what the work raised."""
 
 
 class Worker(Protocol):
-    """Does one thing after the other, as a `concurrent.futures.ThreadPoolExecutor` with one thread."""
+    """Executor of work in order, like a `concurrent.futures.ThreadPoolExecutor` with one thread."""
 
     def submit(self, work: Callable[[], Found], /) -> Solved[Found]:
-        """Do this after all that was submitted before."""
+        """Run this after all work submitted before."""
 
 
 class _Now(Generic[Found]):
-    """What was done at once."""
+    """Result of work that is done."""
 
     def __init__(self, found: Found) -> None:
         self._found = found
 
     def result(self) -> Found:
-        """What was found."""
+        """Return the result."""
         return self._found
 
 
 class AtOnce:
-    """A worker that has done what it is given before anything else goes on."""
+    """Worker that runs work immediately in the calling thread."""
 
     def submit(self, work: Callable[[], Found], /) -> Solved[Found]:
-        """Do it."""
+        """Run the work now."""
         return _Now(work())
 
 
 class Rest(NamedTuple):
-    """What a calibration leaves on data held out: the velocity error; with all data, without outliers (m/s rms; None
-    for none); what was judged, as of `calibration_error`; the drift of dead reckoning with what is left and how the
-    heading deviates; and whether the reference is in the earth's frame."""
+    """Residuals of a calibration.
+
+    held_out: velocity error on held-out data. typical: m/s rms with the state from all data, without outliers; None
+    without any. judged: samples and velocity products, see `calibration_error`. navigation: held-out drift of dead
+    reckoning, with heading deviation. in_earth: whether the reference is in an earth frame.
+    """
 
     held_out: HeldOutError | None
     typical: float | None

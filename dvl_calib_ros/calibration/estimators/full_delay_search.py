@@ -1,4 +1,4 @@
-"""Where the DVL's delay begins, before all else is known: a free linear fit at every delay of a grid."""
+"""Initial DVL delay for `full`, by a linear fit at each delay of a grid."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from ..models.parameters import Parameters
 from ..numerics.frames import Array, product
 from .full_forward_model import FitBlock, attitude_of, dvl_at
 
-# Delays that are tried where blocks are few enough, s. One is taken if it is so much better, in chi-square, of so many
-# rows that hold as much as one, and of no fewer rows.
+# Grid of delays, s, for up to SEARCHED_BLOCKS blocks. A delay is taken if its chi-square is smaller by CLEARLY, where
+# ALIKE_ROWS correlated rows count as one independent row. FEWEST_ROWS rows are needed.
 STEP_S = 0.2
 DELAYS_S: Array = STEP_S * np.arange(-16, 17)
 SEARCHED_BLOCKS, CLEARLY, ALIKE_ROWS, FEWEST_ROWS = 64, 30.0, 5.0, 40
 
 
 def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameters) -> float:
-    """Return the DVL's delay (s) that fits clearly better than this one, or this one."""
+    """Return the DVL delay (s) that fits significantly better than the current one, or the current one."""
     if len(blocks) > SEARCHED_BLOCKS:
         return delay
     rows = [own for block in blocks if (own := _beside(block, parameters)) is not None]
@@ -35,7 +35,7 @@ def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameter
 
 
 class _Beside(NamedTuple):
-    """References beside the DVL at every delay: body (J, 3) m/s, velocity (K, J, 3) m/s, rates (J, 3) rad/s."""
+    """References and the DVL at every delay: body (J, 3) m/s, velocity (K, J, 3) m/s, rates (J, 3) rad/s."""
 
     body: Array
     velocity: Array
@@ -43,7 +43,7 @@ class _Beside(NamedTuple):
 
 
 def _beside(block: FitBlock, parameters: Parameters) -> _Beside | None:
-    """What a search for the DVL's delay compares of a block; None for nothing."""
+    """Return a block's references with the DVL at every delay; None without a comparable reference."""
     times = block.reference.times
     if not len(times) or len(block.dvl.times) < 4 or len(block.imu.times) < 2:
         return None
@@ -60,9 +60,9 @@ def _beside(block: FitBlock, parameters: Parameters) -> _Beside | None:
 
 
 def _left_by_delay(each: Sequence[_Beside]) -> Array | None:
-    """Squares (K,) that a linear fit of ahead and to port leaves of references at every delay; None for too few.
+    """Return the squared residuals (K,) of a linear fit of forward and port velocity; None for too few rows.
 
-    Velocity and rates of three axes, freely: what turns, scales and displaces the DVL is in it.
+    Velocity and rates of three axes have free coefficients, which include mounting, scale and lever arm.
     """
     body = np.concatenate([own.body for own in each])[:, :2]
     if len(body) < FEWEST_ROWS:

@@ -1,9 +1,9 @@
-"""The joint least-squares fit of `full`: blocks of time in, states with their covariance out.
+"""Joint least-squares fit of `full`: takes blocks of time, returns states with covariance.
 
-Blocks are multiplied out about a point of linearisation and added to a chain (slow_errors.py), so that one more block
-costs one more step. The point is renewed at block counts that grow by RENEWED_AT, and where the estimate has moved away
-from it: both follow from the blocks alone, so a live run and a replay agree. Levels and memory of the slow errors are
-integrated over points of their prior, weighted by the evidence; the estimate is mean and covariance of that mixture.
+The method is in docs/models.md, "full: all unknowns in one fit". Blocks are linearised about one point and added to a
+chain (slow_errors.py), so each further block costs one step. The point is renewed when a day's number of blocks reaches
+a power of two, or when the estimate has moved away from it. Both depend on the blocks only, so a live run and a replay
+agree.
 """
 
 from __future__ import annotations
@@ -30,48 +30,49 @@ from .slow_errors import Bins, Chain, Eliminated, LogNormal, SlowErrors, binned_
 
 DEG = math.pi / 180.0
 OF_DAY = FULL.of_day
-LINEARISED = np.r_[PHI, SCALE, LEVER_ARM, DELAY, REFERENCE_DELAY]
+LINEARISED = np.r_[PHI, SCALE, LEVER_ARM, DELAY, REFERENCE_DELAY]  # states that are not linear
 OF_VEHICLE = np.delete(np.arange(N_STATE), OF_DAY)
-# Sections between knots of the slow errors, and bins of rows, s; a bin holds at least so many intervals of the DVL.
+# Interval between knots of the slow errors, and length of bins of rows, s. A bin holds at least BIN_INTERVALS DVL
+# intervals.
 SECTION_S, BIN_S, BIN_INTERVALS = 10.0, 0.5, 2.0
-DENSER = 0.7
-# Squared misfit of three axes, in variances, that 1 % of good rows exceed: beyond it a row weighs gate / misfit.
+DENSER = 0.7  # references are denser than the DVL below this ratio of intervals
+# Squared residual of three axes, in variances, that 1 % of good rows exceed. Beyond it a row has weight gate / misfit.
 GATE = 11.3
-# The point of linearisation is renewed when a day has twice as many blocks, or when an angle, a scale, an arm or a
-# delay is so many σ away from it.
+# The point of linearisation is renewed when an angle, scale, lever arm or delay has moved by this number of σ.
 FAR = 1.0
-# Gauss-Newton steps when the point is renewed: at most, and until a step is smaller than this share of σ.
+# Gauss-Newton steps at a renewal: at most STEPS, or until a step is below LAST_STEP σ.
 STEPS, LAST_STEP = 8, 0.1
-# Streams are kept of so many blocks (40 minutes); what older ones told stays as it is.
+# Blocks whose streams are kept (40 minutes); the contribution of older ones stays fixed.
 KEPT_BLOCKS = 240
-# Points of the prior of slow errors that are integrated over.
+# Points of the slow errors' prior for the numerical integration.
 POINTS = 16
-# Where the data move them so far from the middle, in σ of the prior, they are drawn anew, so often at most.
+# The points are re-centred when the data move them by OFF_CENTRE σ of the prior, at most RECENTRED times.
 OFF_CENTRE, RECENTRED = 0.7, 4
-# A lever arm that is given is measured with a tape, m: so it is told again, but for this share of vehicles.
+# A configured lever arm is a tape measurement with this σ, m, and wrong with probability WRONG_TAPE.
 TAPE_STD_M, WRONG_TAPE = 0.05, 0.1
-# White noise of no velocity is smaller, m/s. Fewer degrees of freedom do not show that of bins.
+# Smallest white noise of a velocity, m/s. Degrees of freedom needed to estimate the noise of bins.
 LEAST_NOISE_MPS, FEWEST = 1e-4, 6
-# Mean of the smaller 90 % of squares of a standard normal number.
+# Mean of the smaller 90 % of squares of a standard normal variable.
 TRIMMED_SQUARE = 0.623
-# A row that is further off than this, in variances of three axes, is an outlier.
+# Squared residual of three axes, in variances, beyond which a row is an outlier.
 GATED = 4.0 * GATE
-# A sample of a slow DVL is left out if by that the misfit of the references beside it falls by so much (chi-square) and
-# to this share.
+# A sample of a slow DVL is rejected if the references near it then fit better: by LEAST_GAIN (chi-square), and to this
+# share.
 LEAST_GAIN, SHARE_LEFT = 50.0, 0.5
-# A section of which the median is so many σ of these from the others', and so far (m/s), is no reference's slow error.
+# A section is rejected if its median differs from the others' by GROSS of their σ and by GROSS_MPS (m/s): no slow error
+# is so large.
 GROSS, GROSS_MPS = 10.0, 0.5
-# Median of the absolute value of a standard normal number.
+# Median of the absolute value of a standard normal variable.
 MEDIAN_ABSOLUTE = 0.6745
 _UNIT_POINTS: Array = normal_points(5, POINTS)
 
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of slow errors before any data, as navigators state it of their instruments.
+    """Priors of the slow errors, from instrument specifications.
 
-    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s. heading, tilt: of an AHRS, rad.
-    memory: 10 to 300 s (90 %). deviation: share of `heading_deviation_std` that the cycles of the heading have.
+    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s. heading, tilt: AHRS, rad.
+    memory: 10 to 300 s (90 %). deviation: heading deviation as a share of `heading_deviation_std`.
     """
 
     horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
@@ -83,7 +84,7 @@ class Priors:
 
 
 class _Section(NamedTuple):
-    """Between two knots. seconds: its length. gram: of its rows, None without. fold: that it is held out with."""
+    """Interval between two knots. seconds: length. gram: of its rows, None without rows. fold: hold-out fold."""
 
     seconds: float
     gram: Array | None
@@ -92,11 +93,12 @@ class _Section(NamedTuple):
 
 @dataclass
 class _Day:
-    """One recording, or one day of several: its blocks, and what they told about the point of linearisation.
+    """Blocks of one recording or day, and their normal equations about the point of linearisation.
 
-    count: how many blocks it has had. sections: of those whose streams are kept. before: chains of what came before
-    these, by all sections, and without each fold. chain: of all. white: (3,) variance of a bin of weight one; single:
-    of a row about the median of its section. level, level_std: (3,) m/s of the medians of sections.
+    count: number of blocks so far. sections: of the blocks whose streams are kept. before: chains of older blocks, with
+    all sections and without each fold. chain: of all blocks. white: (3,) variance of a bin of weight one. single: (3,)
+    variance of a row about its section's median. level, level_std: (3,) m/s, median and scatter of the sections'
+    medians.
     """
 
     blocks: list[FitBlock] = field(default_factory=list)
@@ -113,27 +115,27 @@ class _Day:
 
 
 class JointEstimate(NamedTuple):
-    """What all blocks tell. state: x, P of [vehicle, each day]. weights: (C,) of the points of slow errors."""
+    """Estimate from all blocks. state: x, P of [vehicle, each day]. weights: (C,) of the slow errors' prior points."""
 
     state: GaussianState
     weights: Array
 
 
 class JointFit:
-    """Blocks in order, days one after the other.
-
-    used: references so far.
-    """
+    """Joint fit of blocks in order of time, one day after the other. used: number of references used."""
 
     def __init__(
         self, parameters: Parameters, prior: GaussianState, unknown: GaussianState, priors: Priors | None = None
     ) -> None:
-        """prior: x (20,), P (20, 20) of the states on the first day. unknown: of another day's own states."""
+        """Start from priors.
+
+        prior: x (20,), P (20, 20) of the states on the first day. unknown: prior of the per-day states on further days.
+        """
         self._parameters, self._prior, self._unknown = parameters, prior, unknown
         self._priors = priors or Priors()
         self._arm_is_given = any(parameters.lever_arm)
         self._days = [_Day()]
-        self._x = prior.x.copy()  # of vehicle and days
+        self._x = prior.x.copy()  # vehicle and days
         self._linear = self._x.copy()  # the point of linearisation
         self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
         self._slow, self._deviation, self._log_prior = self._points()
@@ -142,8 +144,7 @@ class JointFit:
         self._fitted: JointEstimate | None = None
 
     def _points(self) -> tuple[SlowErrors, Array, Array]:
-        """Slow errors (C, 6), by how much the heading deviates more than its prior (C,), and the logarithm (C,) of how
-        much more likely each point is by the prior than by how points are drawn: about what the data have shown."""
+        """Return slow errors (C, 6), scales of heading deviation (C,) and log importance weights (C,) of the points."""
         p = self._priors
         levels = p.horizontal, p.vertical, p.heading, p.memory, p.deviation
         median, factor = np.array(levels).T
@@ -155,7 +156,7 @@ class JointFit:
         return slow, deviation, 0.5 * ((_UNIT_POINTS**2).sum(axis=1) - (at**2).sum(axis=1))
 
     def _recentre(self) -> None:
-        """Move the points to where the data say that the slow errors are; then what blocks told is added up anew."""
+        """Move the prior points to the data's estimate of the slow errors, and add up all sections again."""
         assert self._fitted is not None
         if any(day.before is not None for day in self._days):
             return
@@ -175,7 +176,7 @@ class JointFit:
     # ------------------------------------------------------------------ blocks
 
     def add(self, block: FitBlock) -> None:
-        """Take a block, after all others. Raises numpy.linalg.LinAlgError, and is as before, where numbers run away."""
+        """Take the next block. Raise numpy.linalg.LinAlgError and keep the earlier fit if numbers diverge."""
         day = self._days[-1]
         state = self._x.copy(), self._fitted, self.used, self._gated, self._misfit
         kept = [(each, replace(each, blocks=[*each.blocks], sections=[*each.sections])) for each in self._days]
@@ -190,6 +191,7 @@ class JointFit:
             raise
 
     def _add(self, day: _Day, block: FitBlock) -> None:
+        """Add a block to its day, and renew the point of linearisation if due."""
         day.blocks.append(block)
         day.count += 1
         if day.count & (day.count - 1) == 0:
@@ -203,7 +205,7 @@ class JointFit:
             self._renew()
 
     def end_day(self) -> None:
-        """Blocks from here on are of another day: what is of the day is to be found anew."""
+        """Begin a new day with its own per-day states."""
         self._days.append(_Day())
         prior = self._unknown.x[OF_DAY]
         self._x, self._linear = np.append(self._x, prior), np.append(self._linear, prior)
@@ -216,22 +218,22 @@ class JointFit:
 
     @property
     def gated(self) -> int:
-        """References, and samples of a slow DVL, that are so far from the others that they hardly count."""
+        """Number of rejected references and slow DVL samples."""
         return self._gated + self._left_out
 
     @property
     def mean_misfit(self) -> float:
-        """Mean squared misfit of the references used, in variances of three axes; nan without any."""
+        """Mean squared residual of the references used, in variances of three axes; nan without any."""
         return self._misfit / self.used if self.used else math.nan
 
     @property
     def has_data(self) -> bool:
-        """Whether any reference was compared."""
+        """Return whether any reference was used."""
         return self._fitted is not None and self.used > 0
 
     @property
     def states(self) -> list[GaussianState]:
-        """The states (20,) of every day, by all blocks; none before the first."""
+        """States (20,) of every day from all blocks; empty before the first block."""
         if self._fitted is None or not self.has_data:
             return []
         return self._by_day(self._fitted.state)
@@ -241,7 +243,7 @@ class JointFit:
         return [_with_bias_in_mounting(state.x[at], state.p[np.ix_(at, at)]) for at in each]
 
     def _of_day(self, number: int) -> Index:
-        """Places of the states (20,) of one day among all."""
+        """Return the indices of one day's states (20,) among all states."""
         at = np.arange(N_STATE)
         at[OF_DAY] = len(OF_VEHICLE) + len(OF_DAY) * number + np.arange(len(OF_DAY))
         return at
@@ -254,7 +256,7 @@ class JointFit:
     # ------------------------------------------------------------------ linearisation
 
     def _renew(self) -> None:
-        """Gauss-Newton about the newest estimate, over all blocks whose streams are kept."""
+        """Run Gauss-Newton from the newest estimate over all blocks whose streams are kept."""
         self._forget()
         self._search_delay(self._days[-1])
         for _ in range(STEPS):
@@ -268,7 +270,7 @@ class JointFit:
                 break
 
     def _forget(self) -> None:
-        """Leave what the oldest blocks told as it is, and give up their streams."""
+        """Fix the contribution of the oldest blocks, and drop their streams."""
         n = sum(len(day.blocks) for day in self._days)
         for day in self._days:
             while n > KEPT_BLOCKS and day.blocks:
@@ -286,12 +288,12 @@ class JointFit:
                 day.before = before
 
     def _search_delay(self, day: _Day) -> None:
-        """Begin from the DVL's delay that fits clearly better than the one so far, if there is one."""
+        """Start from another DVL delay if it fits significantly better than the current one."""
         place = self._of_day(len(self._days) - 1)[DELAY]
         self._x[place] = better_delay(day.blocks, float(self._x[place]), self._parameters)
 
     def _linearise(self) -> None:
-        """Multiply all blocks out about the newest estimate."""
+        """Linearise all blocks about the newest estimate."""
         self._linear = self._x.copy()
         self.used = self._gated = 0
         self._misfit = 0.0
@@ -304,7 +306,7 @@ class JointFit:
             self._add_parts(day, parts, x)
 
     def _are_contradicted(self) -> bool:
-        """Leave out what `_without_contradicted` does, of all blocks; whether any."""
+        """Apply `_without_contradicted` to all blocks. Return whether any sample was rejected."""
         found = False
         for number, day in enumerate(self._days):
             x = self._x[self._of_day(number)]
@@ -314,9 +316,9 @@ class JointFit:
         return found
 
     def _without_contradicted(self, day: _Day, block: FitBlock, x: Array) -> FitBlock:
-        """Without samples of a slow DVL that stand out, and without which the references beside fit much better.
+        """Reject suspicious samples of a slow DVL without which the references near them fit much better.
 
-        Between its samples a vehicle can turn, so that neighbours alone do not tell an outlier. x: (20,).
+        Neighbours alone do not prove an outlier, because the vehicle may turn between samples. x: (20,).
         """
         suspicious = block.suspicious.tolist() if np.isfinite(day.single).all() else []
         for at in reversed(suspicious):
@@ -331,7 +333,7 @@ class JointFit:
         return block
 
     def _misfits(self, day: _Day, block: FitBlock, x: Array) -> tuple[Array, Array]:
-        """Times (J,) s and misfits (J,) of a block's references about a state (20,)."""
+        """Return times (J,) s and squared residuals (J,) of a block's references about a state (20,)."""
         parts = [part for part in self._parts(block, x) if part.rows is not None]
         if not parts:
             return np.zeros(0), np.zeros(0)
@@ -339,7 +341,7 @@ class JointFit:
         return times, np.concatenate([part.misfit(day.single) for part in parts])
 
     def _parts(self, block: FitBlock, x: Array) -> list[_SectionRows]:
-        """Sections of a block about a state (20,) of its day."""
+        """Return the sections of a block about a state (20,) of its day."""
         rows = predicted(block, x, self._parameters)
         starts = _starts(block)
         if rows is None:
@@ -349,7 +351,7 @@ class JointFit:
         return [_SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
 
     def _measure_noise(self, day: _Day, parts: Sequence[_SectionRows]) -> None:
-        """White noise of single rows and of bins, by their scatter within sections."""
+        """Estimate the white noise of single rows and of bins from their scatter within sections."""
         left = [part.left for part in parts if part.rows is not None]
         if not left:
             return
@@ -363,7 +365,7 @@ class JointFit:
         day.white = np.where(freedom < FEWEST, day.single, white)
 
     def _add_parts(self, day: _Day, parts: Sequence[_SectionRows], x: Array) -> None:
-        """Add sections to the chain of their day. x: (20,) that they are about."""
+        """Add sections to their day's chain. x: (20,) point of linearisation."""
         for part in parts:
             if day.chain is None:
                 day.chain = Chain.begun(self._slow)
@@ -398,7 +400,7 @@ class JointFit:
         self._x = self._fitted.state.x.copy()
 
     def without_folds(self) -> list[list[GaussianState]]:
-        """For every fold the states (20,) of every day by all sections that are not of it."""
+        """Return, per fold, the states (20,) of every day from all other folds."""
         assert self._fitted is not None
         likeliest = int(np.argmax(self._fitted.weights))
         points = slice(likeliest, likeliest + 1)
@@ -418,10 +420,10 @@ class JointFit:
         return found
 
     def held_out_error(self) -> HeldOutError | None:
-        """Velocity error of references predicted by the states that have not seen their fold; None for too few.
+        """Return the velocity error on references, each by states fitted without its fold; None if too few.
 
-        Corrected as velocities are: mounting, scale, lever arm and delays, and not what errs in the instruments. That,
-        white and slow noise as the data show them, and what is not known of all states is predicted.
+        The correction holds mounting, scale, lever arm and delays, but no errors of the instruments. The predicted
+        error holds those, white and slow noise as estimated, and the covariance of the states.
         """
         if not self.has_data:
             return None
@@ -448,7 +450,7 @@ class JointFit:
         return sums.error(seconds, memory_s)
 
     def _mixture(self, ended: Sequence[Eliminated | None], points: slice) -> JointEstimate:
-        """Mean and covariance over some points of the slow errors, with the lever arm as given and as wrong."""
+        """Return mean and covariance over points of the slow errors, with a right and a wrong configured lever arm."""
         likely = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
         priors = [self._by_prior(points, std) for std in likely]
         information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
@@ -474,9 +476,9 @@ class JointFit:
         return JointEstimate(GaussianState(mean, 0.5 * (p + p.T)), weights.sum(axis=0))
 
     def _by_prior(self, points: slice, tape_std: float) -> tuple[Array, Array, Array]:
-        """Information (C, n, n), its product with the state (C, n), minus its log determinant (C,), by the prior.
+        """Return the prior's information (C, n, n), its product with the state (C, n) and -log determinant (C,).
 
-        tape_std: of a lever arm that is given, m, where nothing better is known of it.
+        tape_std: σ (m) of a configured lever arm; inf for `initial_std_lever_arm`.
         """
         deviation = self._deviation[points]
         n = len(OF_VEHICLE) + len(OF_DAY) * len(self._days)
@@ -497,10 +499,10 @@ class JointFit:
 
 
 def _with_bias_in_mounting(x: Array, p: Array) -> GaussianState:
-    """The states x (20,), P (20, 20) of one day as for no bias of the DVL, and with what there is of it in P.
+    """Return the states x (20,), P (20, 20) of one day at zero DVL bias, with the bias's uncertainty in P.
 
-    Nobody takes a bias off velocities, so the mounting that is best at the speeds driven has it in it (Schmidt's
-    consider filter).
+    Published velocities are not corrected for bias, so the mounting absorbs it (docs/models.md, "full: all unknowns in
+    one fit").
     """
     gain = p[:, BIAS] @ np.linalg.inv(p[BIAS, BIAS])
     moved = gain @ x[BIAS]
@@ -508,10 +510,7 @@ def _with_bias_in_mounting(x: Array, p: Array) -> GaussianState:
 
 
 class _SectionRows:
-    """Rows of a section, which begins at a time.
-
-    level: (3,) m/s, their median. left: (J, 3) m/s about it, nan along axes not measured.
-    """
+    """Rows of one section. level: (3,) m/s, median. left: (J, 3) m/s about the median, nan along unmeasured axes."""
 
     def __init__(self, from_s: float, rows: PredictedRows | None, block: FitBlock) -> None:
         self.from_s, self.rows, self._bin_s = from_s, rows, _bin_s(block)
@@ -523,12 +522,12 @@ class _SectionRows:
             self.left = residual - self.level
 
     def misfit(self, single: Array) -> Array:
-        """How far rows (J,) are from the others, in variances (3,) of single ones."""
+        """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
         found: Array = (np.nan_to_num(self.left) ** 2 / single).sum(axis=1)
         return found
 
     def bins(self, single: Array) -> Bins:
-        """Means of its rows over time, those weighing less that are far from the others. single: as of `misfit`."""
+        """Average the rows over bins, with robust weights. single: see `misfit`."""
         assert self.rows is not None
         if self._bins is None:
             weight = np.minimum(1.0, GATE / np.maximum(self.misfit(single), 1e-9))
@@ -537,7 +536,7 @@ class _SectionRows:
 
 
 def _usual_square(values: Array) -> Array:
-    """Variance (3,) of (J, 3), nan aside, by the smaller 90 % of the squares, which outliers do not reach."""
+    """Return the variance (3,) of (J, 3) without nan, by the smaller 90 % of the squares, against outliers."""
     found = np.zeros(3)
     for axis, column in enumerate(values.T):
         squares = np.sort(column[np.isfinite(column)] ** 2)
@@ -547,7 +546,7 @@ def _usual_square(values: Array) -> Array:
 
 
 def _masked_median(values: Array) -> Array:
-    """Median (3,) over the first axis of (J, 3) without nan; zero where there is none."""
+    """Return the median (3,) of (J, 3) without nan; 0 for an axis without values."""
     finite = np.isfinite(values)
     if finite.all():
         return np.sort(values, axis=0)[len(values) // 2]
@@ -556,7 +555,7 @@ def _masked_median(values: Array) -> Array:
 
 
 def _bin_s(block: FitBlock) -> float:
-    """References closer together than the DVL's samples share these, and go into one bin."""
+    """Return the bin length, s: longer where references are denser than DVL samples, because they then share these."""
     times = block.reference.times
     if len(times) < 2 or len(block.dvl.times) < 2:
         return BIN_S

@@ -1,13 +1,7 @@
-"""What `full` predicts of a reference velocity, and how that changes with its states.
+"""Forward model of `full`: predicted reference velocities and their derivatives by the states.
 
-The reference velocity at stamp s is, in east-north-up and with t = s - r,
-
-    z(s) = Z(h) A(t) [ Tᵀ (I + [φ×])⁻¹ diag(1 + δk)⁻¹ (v(t + d) - b) - ω(t) × l ] + c
-
-with the attitude A, the heading deviation h (one and two cycles of the heading), the delays r of the reference and d of
-the DVL, the nominal mounting T, misalignment φ and scale errors δk as of `error_model`, the DVL's bias b, the lever arm
-l and a constant error c. A reference in the body's axes is the bracket itself. Between its samples the DVL's velocity
-is a cubic spline: a straight line would take 2 per cent from waves sampled at 4 Hz.
+The model is in docs/models.md, "full: all unknowns in one fit"; a reference in body axes is compared with the bracket
+alone. The DVL's velocity is interpolated by a cubic spline: a straight line loses 2 % of waves sampled at 4 Hz.
 """
 
 from __future__ import annotations
@@ -39,32 +33,32 @@ from ..numerics.samples import Index, Mask
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 from ..streams.outliers import deviation_from_neighbours, neighbours
 
-# Slow errors: of the reference, east, north, up (m/s); of the attitude, about east, north, up (rad).
+# Slow errors: reference velocity east, north, up (m/s); attitude about east, north, up (rad).
 SLOW = 6
-# No DVL says anything of a delay longer than this, s.
+# Longest delay of the DVL that is searched, s.
 LONGEST_DELAY_S = 3.2
-# Angular acceleration is read over so much to either side, s.
+# Half-width of the difference for angular acceleration, s.
 TURNING_S = 0.1
-# Samples closer together than this need no spline, s.
+# At sample intervals below this, s, slopes come from parabolas instead of a spline.
 DENSE_S = 0.15
-# Fewer DVL samples are not looked at for outliers. Those of one slower than this (s) are suspicious from so many σ on,
-# which is no less than this (m/s).
+# Outlier search needs this number of DVL samples. In a stream with longer intervals than SLOW_S (s), a sample is
+# suspicious beyond this number of σ, where σ is at least LEAST_SCATTER_MPS.
 FEWEST_DVL, SLOW_S, SUSPICIOUS, LEAST_SCATTER_MPS = 8, 0.45, 6.0, 0.03
-# The DVL's acceleration is read over so much to either side (s), and so many of its intervals.
+# Half-width of the difference for the DVL's acceleration: s, and intervals of the DVL.
 SLOPE_REACH_S, SLOPE_INTERVALS = 0.5, 2.0
 # Median of chi-square with one degree of freedom.
 MEDIAN_SQUARE = 0.4549
-# Between DVL samples further apart than this many of their usual intervals, and than this (s), nothing is known.
+# Longest gap of the DVL that is interpolated: the larger of this number of its usual intervals and this time, s.
 GAP_INTERVALS, GAP_S = 3.0, 1.2
 
 
 @dataclass(frozen=True)
 class FitBlock:
-    """All streams of a block of time, those of DVL and IMU with what a delay of LONGEST_DELAY_S may ask for.
+    """All streams of a block of time; DVL and IMU extend beyond it for delays up to LONGEST_DELAY_S.
 
-    from_s, end_s: of the block. slope: (N, 3) m/s² of the DVL's spline at its samples; imu_slope: (M, 7) per s, of the
-    IMU's quaternion, whose sign does not change from one to the next, and angular velocity. measured: (J, 3) which axes
-    of its own frame a reference measures. fold: (J,) that each reference belongs to.
+    from_s, end_s: the block's limits. slope: (N, 3) m/s², of the DVL's spline at its samples. imu_slope: (M, 7) per s,
+    of the IMU's quaternion (of continuous sign) and angular velocity. measured: (J, 3) whether a reference measures
+    each axis of its own frame. fold: (J,) hold-out fold of each reference.
     """
 
     from_s: float
@@ -79,7 +73,7 @@ class FitBlock:
 
     @cached_property
     def suspicious(self) -> Index:
-        """Places of samples of a slow DVL that are further from what neighbours tell than most, and than these."""
+        """Indices of samples of a slow DVL that deviate from interpolation, more than their neighbours do."""
         if self.interval_s < SLOW_S or len(self.dvl.times) < FEWEST_DVL:
             return np.zeros(0, dtype=np.intp)
         off = deviation_from_neighbours(self.dvl.velocity)
@@ -87,38 +81,41 @@ class FitBlock:
         return np.flatnonzero((far > SUSPICIOUS) & (far >= neighbours(far)))
 
     def without(self, places: Index) -> FitBlock:
-        """Return it without some of the DVL's samples."""
+        """Return the block without some DVL samples."""
         dvl = DvlColumns(*(np.delete(column, places, axis=0) for column in self.dvl))
         return replace(self, dvl=dvl, slope=spline_slopes(*dvl))
 
     @cached_property
     def imu_values(self) -> Array:
-        """(M, 7) of the IMU, quaternion and angular velocity, as `imu_slope` has their slopes."""
+        """(M, 7) quaternion and angular velocity of the IMU, as in `imu_slope`."""
         return np.hstack([self.imu.orientation, self.imu.angular_velocity])
 
     @cached_property
     def slope_reach_s(self) -> float:
-        """How far to either side the DVL's acceleration is read: one of less is its noise."""
+        """Half-width (s) of the difference for the DVL's acceleration; over less, its noise dominates."""
         return max(SLOPE_REACH_S, SLOPE_INTERVALS * self.interval_s)
 
     @cached_property
     def slope_variance(self) -> float:
-        """(m/s²)² per axis, of the acceleration that is read, by noise of the DVL alone."""
+        """Variance ((m/s²)², per axis) of the differenced acceleration due to DVL noise alone."""
         if len(self.dvl.times) < 6:
             return 0.0
-        fourth = np.diff(self.dvl.velocity, 4, axis=0) ** 2 / 70.0  # of white noise, its variance
+        fourth = np.diff(self.dvl.velocity, 4, axis=0) ** 2 / 70.0  # the variance, for white noise
         noise = float(np.sort(fourth, axis=0)[len(fourth) // 2].mean()) / MEDIAN_SQUARE
         return noise / (2.0 * self.slope_reach_s**2)
 
     @cached_property
     def interval_s(self) -> float:
-        """Usual time between DVL samples."""
+        """Usual DVL sample interval, s."""
         return float(np.sort(np.diff(self.dvl.times))[len(self.dvl.times) // 2 - 1])
 
 
 class PredictedRows(NamedTuple):
-    """J references: times (J,) s, residual (J, 3) m/s about the state, derivatives of the prediction by the state
-    (J, 3, 20) and by slow errors (J, 3, 6), weight of each axis (J, 3), fold (J,)."""
+    """Residuals and derivatives of J references about a state.
+
+    times: (J,) s. residual: (J, 3) m/s. columns: (J, 3, 20) derivatives of the prediction by the states. slow:
+    (J, 3, 6) by the slow errors. weight: (J, 3) per axis. fold: (J,).
+    """
 
     times: Array
     residual: Array
@@ -128,15 +125,15 @@ class PredictedRows(NamedTuple):
     fold: NDArray[np.int64]
 
     def part(self, at: slice) -> PredictedRows:
-        """Those of some references."""
+        """Return the rows of a slice."""
         t, r, c, s, w, f = self
         return PredictedRows(t[at], r[at], c[at], s[at], w[at], f[at])
 
 
 def spline_slopes(times: Array, values: Array) -> Array:
-    """Slopes (N, k) per s at the samples (N,), (N, k) of the cubic spline through them; parabolas at both ends.
+    """Return the slopes (N, k) per s of a cubic spline through samples (N,) s, (N, k), with parabolas at both ends.
 
-    Of samples denser than DENSE_S those of parabolas through three, which are then as good.
+    For samples denser than DENSE_S, return slopes of parabolas through three samples.
     """
     n = len(times)
     step = np.diff(times)
@@ -159,16 +156,16 @@ def spline_slopes(times: Array, values: Array) -> Array:
 
 
 class AtTimes(NamedTuple):
-    """Values (J, k), and whether they are known (J,)."""
+    """Interpolated values (J, k), and whether they are known (J,)."""
 
     value: Array
     known: Mask
 
 
 def spline_at(stamps: Array, values: Array, slope: Array, times: Array, gap_s: float) -> AtTimes:
-    """What the cubic spline through samples is at times (J,) s; not known beyond them and across a gap.
+    """Interpolate a cubic spline at times (J,) s; unknown outside the samples and across gaps longer than gap_s.
 
-    stamps (N,) s; values, slope (N, k), see `spline_slopes`.
+    stamps: (N,) s. values, slope: (N, k), see `spline_slopes`.
     """
     after = np.minimum(np.maximum(stamps.searchsorted(times), 1), len(stamps) - 1)
     before = after - 1
@@ -185,12 +182,15 @@ def spline_at(stamps: Array, values: Array, slope: Array, times: Array, gap_s: f
 
 
 def dvl_at(block: FitBlock, times: Array) -> AtTimes:
-    """The DVL's velocity (J, 3) m/s at times (J,) s."""
+    """Interpolate the DVL's velocity (J, 3) m/s at times (J,) s."""
     return spline_at(*block.dvl, block.slope, times, max(GAP_INTERVALS * block.interval_s, GAP_S))
 
 
 class Attitude(NamedTuple):
-    """``rotation_enu_from_body`` (J, 3, 3), whether it is known, and angular velocity (J, 3) rad/s, known (J,)."""
+    """Attitude and angular velocity at J times.
+
+    rotation: (J, 3, 3) ``rotation_enu_from_body``, known where oriented (J,). rates: (J, 3) rad/s, known (J,).
+    """
 
     rotation: Array
     oriented: Mask
@@ -199,12 +199,12 @@ class Attitude(NamedTuple):
 
 
 def attitude_of(block: FitBlock, times: Array, gap_s: float) -> Attitude:
-    """Attitude and angular velocity at times (J,) s.
+    """Interpolate attitude and angular velocity at times (J,) s.
 
-    By a spline as well: at 1 Hz the shortest turn between two attitudes is off by a degree where a turn begins.
+    A spline, because at 1 Hz linear interpolation of attitude is wrong by a degree at the start of a turn.
     """
     imu, n = block.imu, len(times)
-    if np.isnan(imu.orientation).any():  # no attitude, of which a body's own reference needs none
+    if np.isnan(imu.orientation).any():  # no attitude; references in body axes need none
         rates = spline_at(imu.times, imu.angular_velocity, block.imu_slope[:, 4:], times, gap_s)
         return Attitude(np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros(n, dtype=bool), *rates)
     both, known = spline_at(imu.times, block.imu_values, block.imu_slope, times, gap_s)
@@ -213,7 +213,7 @@ def attitude_of(block: FitBlock, times: Array, gap_s: float) -> Attitude:
 
 
 def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRows | None:
-    """Rows of a block about a state x (20,); None where nothing can be compared."""
+    """Return the rows of a block about a state x (20,); None without a comparable reference."""
     reference = block.reference
     at = reference.times - x[REFERENCE_DELAY]
     if len(block.dvl.times) < 4 or len(block.imu.times) < 2 or not len(at):
@@ -270,7 +270,7 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
 
 
 def _about_up(angle: Array) -> Array:
-    """Rotations (J, 3, 3) by angles (J,) about the third axis."""
+    """Return rotations (J, 3, 3) by angles (J,) rad about the third axis."""
     turned = np.zeros((len(angle), 3, 3))
     turned[:, 0, 0] = turned[:, 1, 1] = np.cos(angle)
     turned[:, 1, 0] = np.sin(angle)
@@ -280,7 +280,7 @@ def _about_up(angle: Array) -> Array:
 
 
 def deviation_of(state: GaussianState) -> GaussianState:
-    """How the heading deviates by a state x (20,), P (20, 20), as `Estimate.heading_deviation`: what it is off by."""
+    """Return the heading deviation of a state x (20,), P (20, 20), see `Estimate.heading_deviation`."""
     p = np.zeros((5, 5))
     p[:4, :4] = state.p[HEADING, HEADING]
     p[4, 4] = 1e-12

@@ -1,4 +1,4 @@
-"""The velocity error of `full` on references that its states have not seen, and what is predicted of it."""
+"""Velocity error of `full` on held-out references, and its prediction."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from .full_forward_model import FitBlock, PredictedRows
 
-# What errs in the instruments, and no corrected velocity is without.
+# States that are instrument errors, which velocity corrections leave in.
 NOT_TAKEN_OFF = np.r_[BIAS, HEADING, REFERENCE_ERROR]
 
 
 class HeldOutSums:
-    """Squares (m/s)² over held-out references: before and after, of white and slow noise, and of what is not known."""
+    """Sums of squares (m/s)² over held-out references: errors, white and slow noise, state uncertainty."""
 
     def __init__(self) -> None:
         self._n = 0
@@ -28,7 +28,7 @@ class HeldOutSums:
     def add(
         self, before: PredictedRows, after: PredictedRows, fold: int, state: GaussianState, white: Array, slow: Array
     ) -> None:
-        """Take a block's rows of a fold, as mounted and corrected. white: (3,), slow: (6,) variances."""
+        """Add a block's rows of one fold, uncorrected and corrected. white: (3,), slow: (6,) variances."""
         mine = after.fold == fold
         times = after.times[mine]
         also = np.isin(times, before.times, assume_unique=True)
@@ -44,13 +44,13 @@ class HeldOutSums:
         self._known += float((weight * (h[:, :, NOT_TAKEN_OFF] @ state.x[NOT_TAKEN_OFF]) ** 2).sum())
 
     def claims(self, block: FitBlock) -> None:
-        """Take what a block's references claim of their noise."""
+        """Add the noise that a block's references claim."""
         variance = np.diagonal(block.reference.noise, axis1=1, axis2=2)
         self._references += len(variance)
         self._claimed += float((block.measured * variance).sum())
 
     def error(self, seconds: float, memory_s: float) -> HeldOutError | None:
-        """Of all; seconds that they last, and memory (s) of the slow noise."""
+        """Return the error over all rows. seconds: their duration. memory_s: of the slow noise, s."""
         noise = self._white + self._slow
         found = held_out_from_sums(
             self._n, [self._before, self._after, noise + self._unknown + self._known, self._unknown, 0.0]

@@ -1,7 +1,7 @@
-"""Which clock is late: the DVL's, the reference's, or the IMU's. `full` takes the DVL's, and is told otherwise.
+"""Registration of clocks and frames from the streams that `full` keeps, per day.
 
-Where the reference is stamped late, attitude and angular velocity of the wrong time turn its velocity by ω ρ, which a
-lever arm of ρ u explains almost as well: so what `full` has kept of each day is registered.
+A reference delay pairs velocities with attitudes of another time, which looks almost like a lever arm (docs/models.md,
+"Registration: which clock is late").
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ from .estimator import Rest
 from .full_fit import JointFit
 from .full_forward_model import deviation_of
 
-# Live, what was found stands until so much more is there.
+# Live, registration is repeated once the number of blocks has grown by this factor.
 AGAIN_FROM = 1.5
-# Fewer blocks tell nothing, and live there is no look before a minute. Of more, which are 40 minutes, the oldest are
-# forgotten: no more rows are looked at than a third of these have, and a node's memory is to be flat.
+# Blocks needed for a registration, blocks before the first live one (a minute), and blocks kept (40 minutes):
+# registration uses at most the rows of a third of them, and a node's memory must not grow.
 ENOUGH, FIRST_LOOK, MOST = 2, 6, 240
-# Rows that a block of 10 s has of each stream.
+# Rows of each stream in a 10 s block.
 MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
 
 
 class _DvlVelocities(RowTable):
-    """times s and velocities m/s of the DVL, and the trace of its noise, (m/s)²."""
+    """DVL times s, velocities m/s, and trace of the noise covariance, (m/s)²."""
 
     IS_REUSED = True  # a motion has copies
     LAYOUT: ClassVar = {"times": (np.float64, ()), "velocity": (np.float64, (3,)), "noise": (np.float64, ())}
@@ -54,7 +54,7 @@ class _DvlVelocities(RowTable):
 
 
 class _Reference(RowTable):
-    """The same of references, with the variance (m/s)² of each axis, as of `ReferenceColumns`."""
+    """Reference times s, velocities m/s, variances (m/s)² of each axis, see `ReferenceColumns`."""
 
     IS_REUSED = True  # a motion has copies
     LAYOUT: ClassVar = {
@@ -72,7 +72,7 @@ class _Reference(RowTable):
 
 
 class _Imu(RowTable):
-    """times s, attitudes and rates of the IMU, as of `ImuColumns`."""
+    """IMU times s, attitudes and rates, see `ImuColumns`."""
 
     IS_REUSED = True  # a motion has copies
     LAYOUT: ClassVar = {
@@ -86,22 +86,22 @@ class _Imu(RowTable):
 
 
 class _Registered:
-    """What is looked at of the newest blocks, without what is of no use here, such as covariances between axes."""
+    """Streams of the newest blocks as registration needs them, without covariances between axes."""
 
     def __init__(self) -> None:
         self._streams = _DvlVelocities(), _Reference(), _Imu()
-        self._blocks: deque[tuple[int, ...]] = deque()  # rows of each in the streams
+        self._blocks: deque[tuple[int, ...]] = deque()  # rows per stream
 
     def __len__(self) -> int:
         return len(self._blocks)
 
     def take_room(self) -> None:
-        """Take all room that will be needed at once, so that memory does not grow for 40 minutes."""
+        """Reserve the final size now, so that memory does not grow for 40 minutes."""
         for stream in self._streams:
             stream.reserve((MOST + 1) * MOST_OF_A_BLOCK)
 
     def add(self, kept: ThinnedBlock) -> None:
-        """Take a block; of more than `MOST` the oldest is forgotten."""
+        """Add a block, and drop the oldest beyond `MOST`."""
         r = kept.reference
         variance = np.diagonal(r.noise, axis1=1, axis2=2)
         own_noise = np.full(len(kept.dvl.times), np.trace(kept.noise_dvl))
@@ -122,13 +122,13 @@ class _Registered:
             stream.clear()
 
     def recording(self) -> ThinnedRecording:
-        """All that is there, as for verification."""
+        """Return all blocks as a recording for verification."""
         (dvl_times, dvl, own_noise), (times, velocity, variance, in_body, claimed), imu = self._columns()
         reference = ReferenceColumns(times, velocity, variance[:, :, None] * np.eye(3), in_body, claimed)
         return ThinnedRecording(DvlColumns(dvl_times, dvl), own_noise, reference, ImuColumns(*imu))
 
     def motion(self) -> MotionStreams | None:
-        """All that is there, without references that are not like most; None where that is too little."""
+        """Return all blocks with the references of the commoner frame; None for too little data."""
         dvl, (times, velocity, variance, in_body, _), imu = self._columns()
         is_measured = variance < MEASURED_BELOW
         alike = in_body == (2 * np.count_nonzero(in_body) > len(in_body))
@@ -148,15 +148,14 @@ class _Registered:
 
 
 class ToldSoFar(NamedTuple):
-    """What blocks have told so far: the fit, and the stamp (ns) of its time 0."""
+    """The fit of all blocks so far, and the stamp (ns) of its time 0."""
 
     fit: JointFit
     epoch_ns: int
 
 
 class Looked(NamedTuple):
-    """After so many blocks: how the instruments stand, what configuration fits where the one given does not, and,
-    live, what is left."""
+    """Registration after a number of blocks, the fitting configuration if not the given one, and live residuals."""
 
     blocks: int = 0
     registration: Registration | None = None
@@ -165,42 +164,41 @@ class Looked(NamedTuple):
 
 
 class KeptClocks:
-    """What registration says of clocks and frames, of the days that are over and of this one."""
+    """Registration results of earlier days and of the current one."""
 
     def __init__(self, parameters: Parameters, live: bool, known: Registration | None = None) -> None:
-        """live: they go on for hours. known: what registration says, where nobody has to ask."""
+        """Start without blocks. live: the run may last hours. known: registration already computed, not repeated."""
         self._parameters, self._is_live, self._known = parameters, live, known
         self._seen = _Registered()
         if live:
             self._seen.take_room()
         self._blocks = 0  # of this day
         self._declared = np.zeros(len(FRAMES), dtype=np.int64)  # references said to be in each frame
-        self._over: Looked | None = None  # of a day that is over, where something was off
+        self._over: Looked | None = None  # of an earlier day with a contradiction
         self._latest = Looked()
 
     def add(self, kept: ThinnedBlock, frames: Codes, from_ns: int) -> None:
-        """Take a block's streams, which begins at a stamp. frames: (J,) codes of those that its references are said to
-        be in."""
+        """Add a block's streams. frames: (J,) declared frame codes of its references. from_ns: the block's start."""
         self._seen.add(kept)
         self._declared += np.bincount(frames, minlength=len(FRAMES))
         self._blocks += 1
 
     def end_day(self) -> None:
-        """The blocks from here on are of another day, whose clocks may be others."""
+        """Begin a new day, whose clock offsets may differ."""
         found = self.looked()
         self._over = found if found.configuration or self.contradiction(found) else None
         self._seen.clear()
         self._blocks, self._latest = 0, Looked()
 
     def look_again(self, told: ToldSoFar | None) -> None:
-        """Look if there is so much more to see than the last time. told: by the blocks; None for nothing."""
+        """Repeat the registration if there is enough new data. told: the fit so far; None without data."""
         if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest.blocks, FIRST_LOOK):
             self._latest = self._look(told)
 
     def looked(self, told: ToldSoFar | None = None, *, fresh: bool = True) -> Looked:
-        """What the blocks so far show, or a day that is over, where something was off.
+        """Return the registration of the blocks so far, or of an earlier day with a contradiction.
 
-        fresh: all of them, else those there were when `look_again` looked.
+        fresh: use all blocks, else those of the latest `look_again`.
         """
         if self._over is not None:
             return self._over
@@ -209,10 +207,11 @@ class KeptClocks:
         return self._latest
 
     def contradiction(self, looked: Looked) -> Reason | None:
-        """What clocks fit what was seen, where one is off."""
+        """Return the clock settings that fit the registration, if the configured ones do not."""
         return None if looked.registration is None else looked.registration.contradiction(self._parameters)
 
     def _look(self, told: ToldSoFar | None) -> Looked:
+        """Register the kept blocks, unless registration is known."""
         motion = self._seen.motion() if self._known is None and len(self._seen) >= ENOUGH else None
         if motion is None:
             return Looked(self._blocks, self._known)
@@ -225,11 +224,11 @@ class KeptClocks:
             )
             rest = self._rest(told) if self._is_live and told is not None else None
             return Looked(self._blocks, found, configuration, rest)
-        except np.linalg.LinAlgError:  # numbers that ran away
+        except np.linalg.LinAlgError:  # the fit diverged
             return Looked(self._blocks)
 
     def _rest(self, told: ToldSoFar) -> Rest:
-        """Of all that is kept, corrected by what the blocks have told without each fold."""
+        """Return the residuals of all kept blocks, each corrected by the fit without its fold."""
         recording, p = self._seen.recording(), self._parameters
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + told.epoch_ns
         without = [[states[-1]] for states in told.fit.without_folds()]
