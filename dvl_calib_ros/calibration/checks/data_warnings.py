@@ -1,4 +1,4 @@
-"""What a calibration's counts say that a user must not overlook: findings, for the replay and for /diagnostics."""
+"""Warnings from a calibration's counts and estimates, for the replay and for /diagnostics."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from ..results.results import ARM, OFFSETS, Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
-# Fewer samples say nothing yet.
+# Samples needed for a warning.
 ENOUGH_SAMPLES = 20
-# Share of DVL velocities that repeat the one before exactly above which its driver hangs.
+# Share of exactly repeated DVL velocities above which the driver repeats stale data.
 SUSPICIOUS_REPEATED = 0.05
-# References are off by so many times `reference_offset_std` without being broken.
+# Largest error of an intact reference, in `reference_offset_std`.
 OFTEN_OFF = 4.0
-# A constant error of the reference is said if it is larger than this, m/s, and than so many σ.
+# Constant reference error that is reported, m/s, and its significance, σ.
 OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
-# It is not told apart from the mounting where yaw takes this share of it.
+# Share of the reference error that yaw absorbs, above which the two are not separable.
 NOT_SHOWN = 0.6
-# Of a lever arm (m) and a delay (s) that a clock leaves open, what is worth a word.
+# Uncertainty due to a clock offset that is reported: lever arm (m), delay (s), yaw (°).
 SAID_FROM_M, SAID_FROM_S, SAID_FROM_DEG = 0.05, 0.05, 0.1
-# So many losses of GNSS are flapping.
+# GNSS losses from which reception is unstable.
 FLAPPING = 3
 
 STREAMS = {"dvl": "DVL", "reference": "GNSS", "imu": "IMU"}
@@ -41,7 +41,7 @@ _MESSAGE_FAULTS = {
 
 
 def message_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
-    """What is wrong with messages of each stream that were not used; from `Calibrator.counts`."""
+    """Return warnings on rejected messages of each stream, from `Calibrator.counts`."""
     return [
         finding(code, count=counts[stream][fault], stream=name)
         for stream, name in STREAMS.items()
@@ -51,7 +51,7 @@ def message_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
 
 
 def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
-    """What is wrong with the data that came; from `Calibrator.counts`."""
+    """Return warnings on the data received, from `Calibrator.counts`."""
     dvl, pairing = counts["dvl"], counts["pairing"]
     found = []
     if dvl["received"] >= ENOUGH_SAMPLES and not dvl["accepted"]:
@@ -82,7 +82,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
 
 
 def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
-    """Whether valid DVL and reference samples come, and enough of them have gone by without a single pair."""
+    """Return whether enough valid DVL and reference samples arrived, but none could be paired."""
     reference, pairing = counts["reference"], counts["pairing"]
     usable = 2 * reference["received"] - sum(reference.values())
     if pairing["paired"] or pairing["without_attitude"]:
@@ -91,7 +91,7 @@ def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
 
 
 def gate_warnings(estimate: Estimate) -> list[Reason]:
-    """Whether a model's gate throws away so much that the configuration must be wrong."""
+    """Return a warning if a model's gate rejects so many samples that the configuration must be wrong."""
     given = estimate.used + estimate.gated
     if given < ENOUGH_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
         return []
@@ -99,17 +99,14 @@ def gate_warnings(estimate: Estimate) -> list[Reason]:
 
 
 def consistency_warnings(estimate: Estimate) -> list[Reason]:
-    """Whether a model's innovations are larger than it believes; smaller ones only make σ too large."""
+    """Return a warning if a model's innovations exceed their predicted covariance; smaller ones only enlarge σ."""
     if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
         return []
     return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]
 
 
 def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: float) -> list[Reason]:
-    """Whether nothing but what is assumed of it tells a constant error of reference or DVL from yaw and scale.
-
-    speed: m/s, usual.
-    """
+    """Return a warning if only priors separate a constant velocity error from yaw and scale. speed: usual, m/s."""
     own, assumed = estimate.state_names, parameters.reference_offset_std
     if OFFSETS[0] not in own or not estimate.used or speed <= 0.0:
         return []
@@ -124,9 +121,9 @@ def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: floa
 
 
 def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reason]:
-    """Whether its clock leaves lever arm or yaw open, and whether it is wrong by a constant, on each of several days.
+    """Return warnings on a clock offset that leaves lever arm or yaw uncertain, and on constant reference errors.
 
-    days: that the model found something of, if there are several.
+    days: per-day values of the model, if there are several days.
     """
     std = estimate.std_of(*OFFSETS)
     if std is None:
@@ -140,7 +137,7 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
         seconds = by_name.get("time_offset", 0.0)
         if metres >= SAID_FROM_M or seconds >= SAID_FROM_S:
             said.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
-        elif turn >= SAID_FROM_DEG:  # the arm was told
+        elif turn >= SAID_FROM_DEG:  # the lever arm is configured
             said.append(finding("CLOCK_ON_TURN", degrees=turn))
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))

@@ -1,8 +1,7 @@
-"""Whether a DVL's messages are what one DVL measures, by themselves: no other sensor is asked.
+"""Test of whether DVL messages are one DVL's measurements, without other sensors.
 
-A measured velocity has noise along each axis, finer than a mounting is wanted, and each sample is nearest to the one
-before. Two instruments on one topic, velocities rounded to a decimetre per second and axes that a driver fills with
-zeros give residuals that look like noise, and a mounting that is that of none.
+Measured velocities have noise on each axis, and each is nearest to the one before. Two DVLs on one topic, coarse
+rounding, or axes that a driver fills with zeros leave residuals like noise, and a wrong mounting.
 """
 
 from __future__ import annotations
@@ -15,30 +14,31 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median, steps
 
-# Blocks of so many samples are looked at; so many of them tell anything.
+# Samples per block, and blocks needed.
 FEWEST, ENOUGH = 12, 6
-# Two streams are one if a sample is so many times further from the one before than from the one before that (squares),
-# by more than a vehicle moves meanwhile, (m/s)², in so large a share of the blocks.
+# Two streams share a topic if squared changes over one sample exceed FURTHER times those over two, plus FURTHER_MPS2,
+# (m/s)², for motion. MOST: share of the blocks in which they must.
 FURTHER, FURTHER_MPS2, MOST = 6.0, 0.02**2, 0.6
-# Rounding to this share of the speed turns a mounting by half a degree, unless noise moves most to another step.
+# Rounding step, as a share of the speed, that changes the mounting by half a degree. Share of repeated values that
+# shows it: noise does not average it out.
 ROUNDED_FROM, REPEATED_FROM = 0.03, 0.4
-# An axis without any velocity, where another one has noise of so much, m/s.
+# Noise (m/s) of another axis from which an axis of zeros is dead.
 NOISE_MPS = 1e-3
 _AXES = "xyz"
 
 
 class DvlStream:
-    """Sums over blocks of a DVL's velocities; constant memory."""
+    """Sums over blocks of DVL velocities; constant memory."""
 
     def __init__(self) -> None:
         self._blocks = self._alternating = self._n = 0
-        self._step = np.full(3, math.inf)  # the smallest that is no repetition, m/s
+        self._step = np.full(3, math.inf)  # smallest nonzero change, m/s
         self._repeated: Array = np.zeros(3)
         self._is_dead = np.ones(3, dtype=bool)
         self._square = self._noise = 0.0
 
     def add(self, velocity: Array) -> None:
-        """Take a block of a DVL's velocities (N, 3) m/s, in order, none left out."""
+        """Add a block of consecutive DVL velocities (N, 3) m/s."""
         if len(velocity) < FEWEST:
             return
         one, two = steps(velocity), velocity[2:] - velocity[:-2]
@@ -54,7 +54,7 @@ class DvlStream:
         self._noise = max(self._noise, math.sqrt(float(median(steps(steps(one)) ** 2).max()) / 20.0))
 
     def contradiction(self) -> Reason | None:
-        """What the data fit, where they are not what one DVL measures."""
+        """Return the reason if the data are not one DVL's measurements."""
         if self._blocks < ENOUGH:
             return None
         if self._alternating > MOST * self._blocks:

@@ -18,23 +18,23 @@ from ..numerics.kalman import GaussianState
 from ..numerics.tests import chi2_isf
 from ..results.results import Estimate
 
-# Its rms (rad) is worth a word from here on, where as much is found by chance so seldom where there is none.
+# Reported from this rms (rad), at this false-alarm rate.
 SAID_FROM, CHANCE = math.radians(0.3), 1e-3
-# From here on (rad), and so many times its σ, the compass is to be calibrated first (QRev's rule).
+# Rms (rad), and multiple of its σ, from which the compass must be calibrated first (QRev's rule).
 FIRST, SURELY = math.radians(3.0), 3.0
-# ... and, of at least so much (rad), where more than this share of the samples was gated: those that it turns most, so
-# it may be larger.
+# The same from GATED_FIRST (rad) if more than this share of samples is gated: the deviation affects these most, so it
+# may be larger.
 GATED_FIRST, GATED_FROM = math.radians(1.0), 0.1
-# A drift of so much (rad, rms; 1.2° from first to last) is no yaw to accept, whatever its σ holds: nobody knows when a
-# heading that drifts was right.
+# Drift (rad, rms; 1.2° from first to last) from which yaw is not accepted: it is unknown when a drifting heading was
+# right.
 DRIFTS_FROM = math.radians(0.35)
 
 
 class HeadingDeviation(NamedTuple):
-    """What the heading is off by on the headings driven.
+    """Heading deviation on the headings driven.
 
     rms, std: rad, of the deviation about its mean, and of its estimate. most, least: rad, at headings most_at, least_at
-    (rad, from north, clockwise). by_time: whether time says more than the heading.
+    (rad, from north, clockwise). by_time: whether drift exceeds the deviation with heading.
     """
 
     rms: float
@@ -47,14 +47,13 @@ class HeadingDeviation(NamedTuple):
 
 
 def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> HeadingDeviation | None:
-    """None where it does not show.
+    """Return the heading deviation; None if not significant.
 
     Parameters
     ----------
     time: (N,) s.
-    yaw: (N,) rad, from east, to the left.
-    coefficients: x (5,), P (5, 5), as `Estimate.heading_deviation`.
-
+    yaw: (N,) rad, from east, counterclockwise.
+    coefficients: x (5,), P (5, 5), see `Estimate.heading_deviation`.
     """
     if not len(yaw):
         return None
@@ -76,7 +75,7 @@ def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> H
 
 
 def severity_of(found: HeadingDeviation, estimate: Estimate) -> Severity:
-    """To a verdict: reject where the compass is to be calibrated before an estimate is worth anything."""
+    """Return the effect on the verdict: reject if the compass must be calibrated before the mounting."""
     is_cut = estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
     if (is_cut and found.rms > GATED_FIRST) or found.rms > max(FIRST, SURELY * found.std):
         return Severity.REJECT
@@ -85,7 +84,7 @@ def severity_of(found: HeadingDeviation, estimate: Estimate) -> Severity:
 
 
 def heading_warnings(found: HeadingDeviation) -> Reason:
-    """What to say of it."""
+    """Word the deviation as a warning."""
     degrees = math.degrees
     course = "with time" if found.by_time else "with the heading"
     first = "calibrate the compass first: " if found.rms > max(FIRST, SURELY * found.std) else ""

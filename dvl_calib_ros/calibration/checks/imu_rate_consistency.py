@@ -1,9 +1,9 @@
-"""Whether an IMU's angular velocity is how its own attitude turns.
+"""Test of whether an IMU's angular velocity agrees with the rotation of its attitude.
 
-Both come from one instrument, and the calibration uses both: the attitude turns the reference into the body, the
-angular velocity moves the DVL about the reference point. Where a driver mixes conventions (rates negated, in degrees,
-in the earth's axes, a compass heading as ENU yaw), a lever arm of the wrong sign or size explains the data nearly as
-well, and no residual shows it. So the attitude is differentiated and held against the rates, with no other sensor.
+The calibration uses both: the attitude rotates the reference into the body, the angular velocity moves the DVL about
+the reference point. A driver may mix conventions: negated rates, degrees, earth axes, compass heading as ENU yaw. A
+wrong lever arm then fits the data nearly as well, and no residual shows it. This test compares the differentiated
+attitude with the rates.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from ..numerics.frames import ENU_FROM_NED, Array, product, rotation_from_quater
 from ..numerics.samples import Index
 from ..streams.imu_frame import quaternion_product
 
-# The attitude is differentiated over so long, s: 0.05° of its noise are then 0.1 °/s. Longer gaps are passed over.
+# Interval of differentiation, s: 0.05° of attitude noise become 0.1 °/s. Longer gaps are skipped.
 SPAN_S, LONGEST_S = 0.5, 1.6
-# A vehicle with a DVL turns no faster than this, rad/s: such a difference is an outlier of the attitude.
+# Largest turn rate of a vehicle with a DVL, rad/s; larger differences are outliers of the attitude.
 FASTEST = 1.5
-# So many differences, and a turning of so much (rms, rad/s), tell anything.
+# Differences, and turn rate (rms, rad/s), needed for the test.
 ENOUGH, LEAST_TURNING = 60, 0.005
-# What is left of the attitude's turning, as a share of its square: of another convention, and beside that as given.
+# Residual share of the squared turn rate: at most with another convention, at most relative to the given one, and at
+# least with the given one for a contradiction.
 LEFT_AT_MOST, BETTER_BY, WRONG_FROM = 0.25, 0.25, 0.02
-# Explanations within so much of the best one are named with it; a rotation or a scale this near 1 is none.
+# Conventions within this factor of the best are reported too. Smallest rotation (°) and scale (log) that count as such.
 AS_GOOD, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
-# A rotation whose rows have an element this near 1 only exchanges axes, which has been looked at.
+# A rotation with row elements this near 1 only exchanges axes, which is tested separately.
 EXCHANGED_FROM = 0.95
-# An attitude that is nowhere tilted by so much (sine of the angle) is a heading alone.
+# Sine of the tilt below which an attitude is a heading only.
 LEVEL_BELOW = 1e-6
 _BODY, _ENU, _NED = range(3)
 _AXES = "xyz"
@@ -45,9 +46,9 @@ _KNOWN = {
 
 
 def _conventions() -> Iterator[tuple[Reason, Array]]:
-    """All axes that may be exchanged or negated, and as B (3, 3), turning = B rates; the likely ones first.
+    """Yield all exchanged or negated axes as B (3, 3), turn rate = B angular velocity; likely ones first.
 
-    On a level vehicle that only turns about z many fit alike.
+    On a level vehicle that only turns about z, many fit equally.
     """
     known_ones = [(finding(code), np.diag(signs).astype(float)) for signs, code in _KNOWN.items()]
     yield from known_ones
@@ -63,22 +64,22 @@ CONVENTIONS = tuple(_conventions())
 
 
 class AttitudeRates:
-    """Sums over the turning of an attitude and the angular velocity meanwhile; constant memory."""
+    """Sums over rotations of the attitude and angular velocities; constant memory."""
 
     def __init__(self) -> None:
         self._n = 0
         self._tilted = False
-        self._turning = np.zeros((3, 3))  # Σ a aᵀ, a: turning of the attitude, rad/s
-        # with the angular velocity w taken to be in the body, ENU and NED: Σ a wᵀ and Σ w wᵀ
+        self._turning = np.zeros((3, 3))  # Σ a aᵀ, a: turn rate of the attitude, rad/s
+        # Σ a wᵀ and Σ w wᵀ, with the angular velocity w assumed in body, ENU and NED axes
         self._both = np.zeros((3, 3, 3))
         self._rates = np.zeros((3, 3, 3))
 
     def add(self, times: Array, orientation: Array, angular_velocity: Array, begins: Sequence[int] = (0,)) -> None:
-        """Take samples in order of time that follow those before.
+        """Add the next samples in order of time.
 
         times: (M,) s. orientation: (M, 4) unit quaternions (x, y, z, w), ``enu from body``. angular_velocity: (M, 3)
-        rad/s, body. Both nan where not known. begins: numbers of the samples with which stretches begin of which none
-        is looked at together with the next one.
+        rad/s, body. Both nan if not known. begins: indices of the first samples of stretches that are differentiated
+        separately.
         """
         known = ~(np.isnan(orientation[:, 0]) | np.isnan(angular_velocity).any(axis=1))
         bounds = [*begins, len(times)]
@@ -109,12 +110,12 @@ class AttitudeRates:
 
     @property
     def is_level(self) -> bool:
-        """Whether the attitude is a heading alone, without roll and pitch."""
+        """Return whether the attitude is a heading only, without roll and pitch."""
         return self._n >= ENOUGH and not self._tilted
 
     def contradiction(self) -> Reason | None:
-        """What the data fit, where attitude and angular velocity do not agree."""
-        shown = slice(None) if self._tilted else slice(2, None)  # of a heading alone, what is about the vertical
+        """Return the reason, and the convention that fits, if attitude and angular velocity disagree."""
+        shown = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
         total = float(np.trace(self._turning[shown, shown]))
         if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
             return None
@@ -133,14 +134,14 @@ class AttitudeRates:
         return finding("IMU_CONTRADICTS", found=found)
 
     def _left(self, frame: int, matrix: Array, shown: slice) -> float:
-        """Σ|a - B w|² over the axes that are shown, for one B (3, 3) and a frame of w."""
+        """Return Σ|a - B w|² over the observable axes, for B (3, 3) and a frame of w."""
         matrix = matrix[shown]
         crossed = float((matrix * self._both[frame][shown]).sum())
         turning = float(np.trace(self._turning[shown, shown]))
         return turning - 2.0 * crossed + float(np.trace(matrix @ self._rates[frame] @ matrix.T))
 
     def _explanations(self) -> Iterator[tuple[int, Array, Reason]]:
-        """Frames of the angular velocity, and B (3, 3), that may be what was recorded, and what each is."""
+        """Yield possible conventions: frame of the angular velocity, B (3, 3), and wording."""
         yield from ((_BODY, matrix, convention) for convention, matrix in CONVENTIONS)
         both, rates = self._both[_BODY], self._rates[_BODY]
         scale = float(np.trace(both) / np.trace(rates))
@@ -159,8 +160,8 @@ class AttitudeRates:
 
 
 def _spans(times: Array) -> Index:
-    """Numbers of the first and the last sample (2, S) of spans of about SPAN_S, of times (M > 1,) s."""
-    # those that are the first after a multiple of SPAN_S, in the arithmetic of np.arange, without its room for pauses
+    """Return indices of the first and last samples (2, S) of spans of about SPAN_S, from times (M > 1,) s."""
+    # first samples after multiples of SPAN_S, with the arithmetic of np.arange, but without its memory for pauses
     start, step = times[0], (times[0] + SPAN_S) - times[0]
     number = np.floor((times - start) / step)
     number += start + (number + 1.0) * step <= times

@@ -1,8 +1,8 @@
-"""A lever arm that was told (by a transform, a URDF, a parameter) against the one that the data show.
+"""Consistency of the configured lever arm with the estimated one.
 
-Both are the DVL's place from the reference point, and a tape measure is good to centimetres. Where they differ by far
-more than both explain, something is wrong, and the arm is the symptom: a heading that counts from north, velocities of
-a DVL in the earth's frame, turn rates of the wrong sign or unit, a late IMU, an antenna elsewhere.
+A configured lever arm (URDF, /tf_static or parameter) is a tape measurement. A significant difference means that
+another input is wrong. Examples: a compass heading from north, earth-frame DVL velocities, wrong sign or unit of turn
+rates, a delayed IMU, an antenna elsewhere.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 
 def lever_arm_warnings(estimates: Iterable[Estimate], parameters: Parameters) -> list[Reason]:
-    """Whether the lever arm that was told is another than the one that the first estimate shows that finds it."""
+    """Return a reason if the data contradict the configured lever arm, by the first estimate that includes it."""
     estimate = next((each for each in estimates if each.used and estimates_lever_arm(MODELS[each.model])), None)
     if estimate is None:
         return []
-    # a late clock, which at one speed explains as much, is one of the causes
+    # without the clock's uncertainty: a delay, which looks the same at constant speed, is one of the causes
     state = GaussianState(estimate.state, estimate.covariance - estimate.left_open)
     off = contradicts_configured_arm(MODELS[estimate.model], state, parameters)
     if not off.any():

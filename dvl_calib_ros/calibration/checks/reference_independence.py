@@ -1,15 +1,13 @@
-"""Whether a reference holds the DVL's own noise: then a filter made it from this DVL, and it cannot judge it.
+"""Test of whether the reference contains the DVL's noise: it is then a filter's output that cannot judge this DVL.
 
-What a vehicle does is smooth from one sample to the next, noise is not. A filter that has taken the DVL in passes its
-noise on, in whole or in part, whatever is added on top, and however large it claims its own to be; two instruments
-share none. So fourth differences of both are multiplied. A vehicle's own motion is in both as well: at worst it is
-pushed anew with every sample, and goes like a random walk. Of white noise of variance N and such steps of variance Q
-the differences of the DVL are
+Motion is smooth between samples, noise is not. A filter passes part of the DVL's noise on; independent instruments
+share none. The test multiplies fourth differences of both. The vehicle's motion, which is also in both, is at worst a
+random walk. For white noise of variance N and steps of variance Q the DVL's differences have
 
     v₂ = 6 N + 2 Q,    v₄ = 70 N + 20 Q,    and with a share κ of its noise in the reference    c₄ = 70 κ N + 20 Q,
 
-of which κ follows. Smoother motion only makes κ look smaller. A reference that is too slow for differences is held
-against the DVL's sample beside it: the DVL's fourth difference times r - d is -6 N (1 - κ), whatever the motion is.
+which gives κ. Smoother motion only lowers κ. A reference too slow for differences is compared with the DVL's sample
+nearest in time: the DVL's fourth difference times r - d is -6 N (1 - κ) for any motion.
 """
 
 from __future__ import annotations
@@ -23,30 +21,31 @@ from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..numerics.samples import Mask
 
-# Streams slower than this, s, show what waves do in their differences; a reference may be this slow beside a fast DVL.
+# Longest sample intervals, s: of both streams, because slower differences hold waves; and of a reference next to a fast
+# DVL.
 SLOWEST_S, SLOWEST_REFERENCE_S = 0.3, 1.2
-# Shifts of the reference against the DVL that are tried, s, a filter and its transport being late by some.
+# Time shifts of the reference against the DVL, s, for the delay of a filter and its transport.
 SHIFTS_S: Array = 0.1 * np.arange(-2, 11)
-# A difference's samples are as far apart as usual, within this share, and those of both streams no further than this.
+# Tolerances as shares of the interval: of the intervals in a difference, and of the time between the streams' samples.
 EVEN, NEAR = 0.25, 0.6
-# Differences of a smaller noise (m/s) are those of rounding.
+# Noise below this, m/s, is rounding.
 LEAST_NOISE_MPS = 1e-4
-# So many stretches, of so many differences each (three axes), tell anything; of a slow reference, so many samples.
+# Stretches needed, differences per stretch (three axes), and samples per stretch of a slow reference.
 ENOUGH, FEWEST, FEWEST_SLOW = 12, 30, 12
-# Share of the noise from which it is said, and by how many standard deviations, of the stretches' scatter, it is more.
+# Share of the noise that is reported, and its significance in σ of the stretches' scatter.
 SHARED_FROM, SURE_FROM = 0.1, 4.0
-# ... and the same where the vehicle's own steps are taken to be as found, and not as large as they may be.
+# The same with the vehicle's steps as estimated instead of at their upper limit.
 PASSED_FROM, PASSED_SURE_FROM = 0.06, 4.5
-# Noise is so much of the differences at least, or they are the vehicle's own.
+# Smallest share of noise in the differences; with less they are motion.
 LEAST_SHARE = 0.3
-# Differences that have no sample in common correlate by less: those of a vehicle that shakes do not.
+# Largest correlation of differences without a common sample; vibration has more.
 UNCORRELATED_BELOW = 0.15
 ORDER = 4
 _LATER = range(ORDER + 1, 2 * ORDER + 1)
 
 
 class SharedNoise:
-    """Sums over stretches of the DVL and of the reference at each of `SHIFTS_S`; constant memory."""
+    """Sums over stretches of DVL and reference at each of `SHIFTS_S`; constant memory."""
 
     def __init__(self) -> None:
         n = len(SHIFTS_S)
@@ -57,10 +56,10 @@ class SharedNoise:
         self._square = 0.0
 
     def add(self, times: Array, velocity: Array, reference_times: Array, reference: Array) -> None:
-        """Take a stretch of both, in the same frame.
+        """Add a stretch of both streams, in the same frame.
 
         times: (N,) s and velocity (N, 3) m/s of the DVL. reference_times: (J,) s and reference (J, 3) m/s, nan along
-        axes that are not measured.
+        unmeasured axes.
         """
         if min(len(times), len(reference_times)) <= 2 * ORDER:
             return
@@ -71,12 +70,12 @@ class SharedNoise:
         differences = fourth[_windows(_even(times, step), ORDER)]
         self._later += [(differences[lag:] * differences[:-lag]).sum() for lag in _LATER]
         self._square += float((differences**2).sum())
-        # at the slower stream's times, of the faster one the samples next to them
+        # at the slower stream's times, with the nearest samples of the faster one
         if reference_step > SLOWEST_S:
             beside = np.column_stack([velocity, np.diff(velocity, 2, axis=0, prepend=np.nan, append=np.nan)])[2:-2]
             seen = np.column_stack([beside, np.where(_evenly(times, step), fourth, np.nan)])
             dvl, dvl_2, dvl_4 = np.split(_beside(reference_times, step, times[2:-2], seen, -SHIFTS_S), 3, axis=2)
-            # as if it were a difference with 70 κ N of the noise: v₄ + 70 / 6 Δ⁴d (r - d)
+            # equivalent to a difference with 70 κ N of the noise: v₄ + 70 / 6 Δ⁴d (r - d)
             other_4 = dvl_4 + 70.0 / 6.0 * _about_mean(reference - dvl)
         elif reference_step < step:
             even = _evenly(times, step)
@@ -100,7 +99,7 @@ class SharedNoise:
         self._squares += found**2
 
     def share(self) -> float:
-        """How much of the DVL's noise the reference holds, 0 to about 1; 0 where that is not sure."""
+        """Return the share of the DVL's noise in the reference, 0 to about 1; 0 if not significant."""
         if self._stretches.max() < ENOUGH or np.abs(self._later).max() > UNCORRELATED_BELOW * self._square:
             return 0.0
         n = np.maximum(self._stretches, 2.0)[:, None]
@@ -110,7 +109,7 @@ class SharedNoise:
         c_4, v_4, steps = mean[best].tolist()
         passed, own = c_4 - max(steps, 0.0), v_4 - max(steps, 0.0)
         if own > LEAST_SHARE * v_4 and passed > max(PASSED_FROM * own, PASSED_SURE_FROM * float(std[best, 0])):
-            return passed / own  # a filter that smooths passes little on, and adds little: it is the surer for that
+            return passed / own  # a smoothing filter passes little noise on and adds little, so this test is sensitive
         steps = max(steps, 0.0) + 2.0 * float(std[best, 2])
         noise = v_4 - steps
         if noise < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
@@ -119,20 +118,20 @@ class SharedNoise:
         return (c_4 - steps) / noise if sure else 0.0
 
     def contradiction(self) -> Reason | None:
-        """What the data fit, where the reference holds the DVL's noise."""
+        """Return the reason if the reference contains the DVL's noise."""
         share = self.share()
         return finding("REFERENCE_HOLDS_DVL", percent=100.0 * min(share, 1.0)) if share else None
 
 
 def _about_mean(values: Array) -> Array:
-    """Values (S, N, k), nan among them, about their means over N; each as large as without the mean, on average."""
+    """Subtract means over N of values (S, N, k) with nan, and restore their expected size."""
     known = np.isfinite(values)
     n = np.maximum(np.count_nonzero(known, axis=1, keepdims=True), 2)
     return (values - np.where(known, values, 0.0).sum(axis=1, keepdims=True) / n) * (n / (n - 1.0))
 
 
 def _beside(times: Array, step: float, other_times: Array, other: Array, shifts: Array) -> Array:
-    """Of another stream the samples (S, N, k) beside times (N,), later by each shift (S,); nan where there are none."""
+    """Return another stream's nearest samples (S, N, k) at times (N,) plus each shift (S,); nan if none is near."""
     wanted = times + shifts[:, None]
     after = np.searchsorted(other_times, wanted).clip(1, len(other_times) - 1)
     near = np.where(wanted - other_times[after - 1] < other_times[after] - wanted, after - 1, after)
@@ -140,7 +139,7 @@ def _beside(times: Array, step: float, other_times: Array, other: Array, shifts:
 
 
 def _evenly(times: Array, step: float) -> Mask:
-    """Whether all samples of a difference (N - ORDER, 1) are evenly apart, the one before the first as well."""
+    """Return whether all samples of a difference (N - ORDER, 1), and the one before, are evenly spaced."""
     return _windows(np.append(True, _even(times, step)), ORDER + 1)[:, None]
 
 
@@ -149,7 +148,7 @@ def _even(times: Array, step: float) -> Mask:
 
 
 def _windows(even: Mask, order: int) -> Mask:
-    """Which differences (N - order,) are over steps (N - 1,) that are all even."""
+    """Return which differences (N - order,) have only even steps (N - 1,)."""
     whole: Mask = even[: len(even) - order + 1].copy()
     for at in range(1, order):
         whole &= even[at : len(even) - order + 1 + at]

@@ -1,16 +1,14 @@
-"""What is left of the velocity after the calibration: whether it follows something that no mounting makes.
+"""Tests whether the residual velocity follows a signal that no mounting makes.
 
-Held against the corrected DVL's velocity, a reference leaves noise. Where that follows the vehicle's tilt, the DVL's
-velocity does not turn with the vehicle as the IMU's orientation says (a driver that has levelled it, an orientation of
-the wrong sign); where it is the same at every speed, the DVL has a bias; where it follows how the velocity bends, one
-of the two is smoothed. All three turn angles by what σ does not hold, so they are looked for, by least squares beside
-all that the calibration has found already.
+The residual is the reference minus the corrected DVL. Least squares tests it against three signals, together with all
+errors that a calibration may leave. If it follows tilt, the DVL's velocity does not rotate with the IMU's attitude (a
+driver that levels it, a wrong sign). If it is constant at every speed, the DVL has a bias. If it follows the second
+derivative of the velocity, one of the two is smoothed. All three bias the angles beyond their σ.
 
-And where it follows what the DVL's noise was before, the reference is a filter's that took the DVL in. With d = s + n
-of the DVL and r = s + m of an instrument of its own, r - d = m - n, and noise n that is new with each sample is not
-foretold by any d before it. A filter that keeps h of the noise makes r - d = m - n + h ∗ n, which is. The noise that
-was is what past d did not foretell of d (an autoregression). A smoothed reference lags the motion, and gives the other
-sign.
+If it follows the DVL's earlier noise, the reference is a filter's output with that DVL as input. With d = s + n of the
+DVL and r = s + m of an independent instrument, r - d = m - n, and no earlier d predicts white noise n. A filter that
+keeps a response h of the noise has r - d = m - n + h ∗ n, which is predictable. Earlier noise is the residual of an
+autoregression of d. A smoothed reference lags the motion, which has the opposite sign.
 """
 
 from __future__ import annotations
@@ -32,79 +30,78 @@ from ..numerics.samples import Index
 from ..results.results import ARM, OFFSETS, Estimate
 from .imu_rate_consistency import LEVEL_BELOW
 
-# Tilt that changes between so many seconds, s, is the vehicle's; slower, it may be the IMU's own error.
+# Time constants, s, between which a change of tilt is the vehicle's; slower ones may be the IMU's error.
 TILT_S = 1.0, 15.0
-# The velocity bends by what its means of so long, s, do.
+# Averaging time, s, of the velocity whose second derivative is tested.
 BEND_S = 1.0
-# Stretches, s, by whose scatter σ is found; fewer say nothing.
+# Stretches, s, whose scatter gives σ, and the number of them needed.
 STRETCH_S, ENOUGH = 15.0, 12
-# Stretches taken together for that: slow errors of references and attitudes last for a minute or two.
+# Numbers of stretches combined for σ: slow errors of references and attitudes last a minute or two.
 QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
-# So many σ are no chance; of smoothing, whose σ knows how few turns show it, fewer (of 197 surveys without any none
-# had more than 3.3); of a bias, whose σ holds all else that is likely, fewer (of 300 combinations without one none
-# had more than 3.6), and from fewer still it is named.
+# Limits in σ. Those of smoothing and bias are lower, because their σ includes the small number of turns, and all other
+# likely errors. A bias is reported from NAMED_FROM, and rejects from SURELY_BIASED.
 SURELY, SURELY_SMOOTHED, SURELY_BIASED, NAMED_FROM = 6.0, 5.0, 4.2, 3.7
-# Likely, beside the calibration: turn (rad), scale, lever arm (m), delay (s), errors of the reference (m/s), and of the
-# heading (rad), which turns about the vertical of the earth: not as a yaw does where the vehicle leans; and errors of
-# the heading that change with it, once and twice around (rad), which look like a bias, but not like what is quick.
+# Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
+# about the earth's vertical (rad), which differs from yaw when the vehicle tilts. BY_HEADING: heading errors with one
+# and two cycles of the heading (rad), similar to a bias but not to fast signals.
 KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3 + [0.1])
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2)
-# ... and of what is looked for: shares of tilt, and bend (s²); a bias (m/s), looked for in means of so long, s.
+# Prior σ of the tested signals: shares of tilt, and second derivative (s²); DVL bias (m/s), tested on means over MEAN_S
+# (s).
 QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
-# Tilt (rad, rms) from which on a velocity has something to follow, and the share of it that it has to leave; the first
-# of how it bends, m/s².
+# Smallest tilt (rad, rms) and second derivative (m/s²) for a test, and share of tilt that the residual must follow.
 LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
-# Prior σ (m/s) of a bed's velocity: sediment in a flood, or a layer of water. From `MOVES_FROM_MPS` on the reference is
-# not the cause: an inertial navigation at sea (recording T09) was off by 0.054.
+# Prior σ of the bed's velocity, m/s: sediment in a flood, or a water layer. Below MOVES_FROM_MPS the reference may be
+# the cause: an inertial navigation at sea (recording T09) had an error of 0.054.
 BED_STD_MPS, MOVES_FROM_MPS = 1.0, 0.08
-# Rows of the reference's error, east and north, in `KNOWN`.
+# Columns of the reference error, east and north, in `KNOWN`.
 OVER_GROUND = slice(9, 11)
-# Share of the whole bend that means of `MEAN_S` have to leave, for smoothing to be told by them.
+# Share of the second derivative that means over `MEAN_S` must keep for the smoothing test.
 LEAST_OF_BEND = 0.3
-# Known to no better than this (σ), it may as well be all of it.
+# σ of the missing share of tilt above which it may be the whole tilt.
 TILT_SHOWN = 0.2
-# A bias of the DVL (m/s) that has been seen, which the motion shows to no better than this (σ, of ahead or across).
+# Bias of the DVL that occurs (m/s), and its σ (forward or port) from which the motion does not show it.
 SEEN_BIAS, BIAS_OPEN = 0.02, 0.008
-# A share from here on is no levelled velocity, but a sign.
+# Share of tilt from which a sign is wrong, instead of a levelled velocity.
 WRONG_SIGN_FROM = 1.6
-# An error of a mounting (rad) that is worth a word, and one that no answer is given beside unless so many σ of the
-# answer, which has been told of a bias, hold the least that it is likely to be.
+# Mounting error (rad) from which it is reported, and from which the calibration is rejected. It is not rejected if
+# WITHIN σ of the calibration cover the error.
 SAID_FROM, WRONG_FROM, WITHIN = math.radians(0.2), math.radians(0.5), 2.0
-# Smoothing (s, time constant) that is worth a word, and one beside which no answer is given.
+# Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
-# A velocity so many times further off than usual is an outlier.
+# Residual, relative to the median, beyond which it is an outlier; number of iterations.
 OUTLYING, ROUNDS = 4.0, 3
-# What is left is noise of so much at least, m/s.
+# Smallest noise of the residual, m/s.
 QUIETEST_MPS = 1e-3
-# A filter forgets the DVL over one of these, s. Of slower streams (s) what is new in a sample is the motion's.
+# Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion.
 FORGOTTEN_S, SLOWEST_S = (0.5, 1.0, 3.0), 0.3
-# Samples that foretell the next; more than so many σ of it is no noise but an outlier.
+# Samples to either side that predict one; innovations beyond NEW_AT_MOST σ are outliers.
 FORETOLD_BY, NEW_AT_MOST = 12, 4.0
-# So many σ of the noise being followed are no chance, of three that are looked at and one sign; and the share (σ) that
-# what waves leave of themselves may look like (waves of 0.2 m/s at 8 Hz: up to 0.05).
+# Significance, in σ, of the DVL's noise in the reference, for three memories and one sign. OF_WAVES: σ of the share due
+# to waves (0.2 m/s at 8 Hz: up to 0.05).
 FOLLOWED_SURELY, OF_WAVES = 4.5, 0.015
-# ... where that the reference is a filter's shows by how it smooths, in so many σ: both are rare by chance, not one.
+# Significance, in σ, needed if smoothing by FILTER_SHOWN σ also indicates a filter: both are rarely false alarms.
 FOLLOWED_BY_FILTER, FILTER_SHOWN = 2.4, 2.4
-# A filter lags by what it smooths over, within this factor; by less than this (s) so does anything. That it lags so
-# shows it as well, so less of the smoothing has to, in σ.
+# Limit of the smoothing, in σ, if the reference also has the delay that such a filter makes. The delay agrees within
+# this factor of the time constant, and is significant from LEAST_LAG_S.
 FILTER_SHOWN_LAGGING = 1.8
 LAGS_WITHIN, LEAST_LAG_S = 2.0, 0.2
-# With less to correct than this (an angle in rad, a share of scale, an arm in m), or than so many σ, nothing is found.
+# Corrections (rad, scale, m) below these, or below BY_CHANCE σ, count as none.
 NO_ANGLE, NO_SCALE, NO_ARM_M, BY_CHANCE = math.radians(0.35), 0.005, 0.2, 3.0
-# ... and of it where a reference is positions: their window holds the motion on both sides of its middle, which looks a
-# little like it.
+# Smallest share of DVL noise for references from positions, whose windows hold motion on both sides, which looks
+# similar.
 FOLLOWED_BY_POSITIONS = 0.1
 
 
 class ResidualTrend(NamedTuple):
-    """What the velocity that is left follows.
+    """Signals that the residual velocity follows.
 
-    tilt, tilt_std: (2,) share of roll and of pitch that the DVL's velocity leaves out, 0 of a right one, 1 of a
-    levelled one, 2 or -2 where a sign is wrong. bias, bias_std: (3,) m/s of the DVL, body. smoothed, smoothed_std: s²,
-    half the square of the reference's time constant; below 0 the DVL's. lean: (2,) mean roll and pitch, rad. speed:
-    m/s, rms. circular, circular_std: share of the DVL's noise that is still there with the next sample, and circular_s
-    what it is forgotten over, s: the surest of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s that the reference
-    is faster than the DVL, east and north, on every heading; 0 where the residual itself holds less than half of it.
+    tilt, tilt_std: (2,) share of roll and pitch missing in the DVL's velocity: 0 if correct, 1 if levelled, ±2 for a
+    wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
+    of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
+    circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: memory, s, the most
+    significant of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
+    heading; 0 if the residual holds less than half of it.
     """
 
     tilt: Array
@@ -123,8 +120,10 @@ class ResidualTrend(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """x (n,), and σ by the scatter of stretches; P (n, n) of the noise alone, weights (N,), what is left (N, 3), and
-    where stretches start."""
+    """Fit of the residual: x (n,) with σ from the scatter of stretches, and P (n, n) of the noise alone.
+
+    weight: (N,). rest: (N, 3) residual. starts: of the stretches.
+    """
 
     x: Array
     std: Array
@@ -134,32 +133,31 @@ class _Fit(NamedTuple):
     starts: Index
 
     def seen_of(self, columns: Array, values: Array) -> float:
-        """How much of the last one of the columns (N, 3, n) fits values (N, 3), beside all others."""
+        """Return the coefficient of the last column of (N, 3, n) in values (N, 3), adjusted for the others."""
         return float(self.p[-1] @ np.einsum("n,nij,ni->j", self.weight, columns, values))
 
 
 def residual_trend(
     time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
 ) -> ResidualTrend | None:
-    """None where there is too little to look at.
+    """Fit the residual velocity; None for too little data.
 
     Parameters
     ----------
     time: (N,) s.
     rotation_enu_from_body: (N, 3, 3).
-    velocity, error: (N, 3) m/s of the reference, and reference less corrected DVL, body.
+    velocity, error: (N, 3) m/s, of the reference, and reference minus corrected DVL, body.
     rates: (N, 3) rad/s, body.
-    interval_s: between samples of the reference, which is read along straight lines between them.
-
+    interval_s: sample interval of the reference, which is interpolated linearly, s.
     """
     if len(time) < 3 or time[-1] - time[0] < ENOUGH * STRETCH_S:
         return None
-    up = np.sign(rotation_enu_from_body[:, 2, 2].mean())  # of a body that is z down -1
+    up = np.sign(rotation_enu_from_body[:, 2, 2].mean())  # -1 for a z-down body
     roll = np.arctan2(up * rotation_enu_from_body[:, 2, 1], up * rotation_enu_from_body[:, 2, 2])
     pitch = -np.arcsin(np.clip(rotation_enu_from_body[:, 2, 0], -1.0, 1.0))
     changing = [_mean(time, tilt, TILT_S[0]) - _mean(time, tilt, TILT_S[1]) for tilt in (roll, pitch)]
     body_from_enu = rotation_enu_from_body.swapaxes(1, 2)
-    # by the DVL's own velocity, for noise of the reference is what is explained; smoothed, for so is its own
+    # the DVL's smoothed velocity, because noise of either velocity would correlate with the residual
     earth = _mean(time, _turned(rotation_enu_from_body, velocity - error), BEND_S)
     before, after = _at(time, earth, -BEND_S), _at(time, earth, BEND_S)
     moving, slope = _turned(body_from_enu, earth), _turned(body_from_enu, (after - before) / (2.0 * BEND_S))
@@ -171,20 +169,20 @@ def residual_trend(
         about = np.zeros((n, 3))
         about[:, axis] = -changing[axis]
         quick[:, :, axis] = cross(about, moving)
-    # as the vehicle's turning bends it: noise of the DVL is in all of a mean alike
+    # second derivative of means, so that DVL noise is common to all samples of a mean
     turning = _mean(time, _turned(rotation_enu_from_body, _mean(time, velocity - error, MEAN_S)), BEND_S)
     bend, whole_bend = (
         (_at(time, each, BEND_S) - 2.0 * each + _at(time, each, -BEND_S)) / BEND_S**2 for each in (turning, earth)
     )
     quick[:, :, 2] = _turned(body_from_enu, bend)
     bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
-    # a straight line between two samples is short of the bend by so much in the mean
+    # linear interpolation loses this part of the second derivative on average
     bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
     both = np.concatenate([_known(moving, rates, slope, body_from_enu), quick], axis=2)
     fast = _fitted(time, both, bent, np.concatenate([KNOWN, QUICK]))
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
-    # of a mean its own noise is what the reference is further on: that alone would be a scale, and a bias against it
+    # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
     beside = _known(_beside(time, moving, starts), rates, slope, body_from_enu)
     by_heading = beside[:, :, -1, None] * around[:, None]
     columns = np.concatenate([_means(each, starts) for each in (beside, by_heading, constant)], axis=2)
@@ -196,7 +194,7 @@ def residual_trend(
     if fast is None or slow is None or over_bed is None:
         return None
     over_ground = over_bed.x[OVER_GROUND]
-    # with few headings a yaw and a bias can make up for any such velocity, and the residual is small
+    # on few headings yaw and bias can compensate any bed velocity, with a small residual
     if float(over_ground @ median(_turned(rotation_enu_from_body, error)[:, :2])) < 0.5 * float(
         over_ground @ over_ground
     ):
@@ -205,9 +203,9 @@ def residual_trend(
     std[[each.std() < LEAST_TILT for each in changing]] = math.inf
     lean = np.array([roll.mean(), pitch.mean()])
     speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
-    # without tilt, what waves do to it looks like turning
+    # without tilt data, wave motion looks like turning
     shows = bends > LEAST_BEND and max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
-    # a mean leaves little of waves, whose whole bend a smoothed reference lacks: so it is of that
+    # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
     bends_by = fast.seen_of(both, _turned(body_from_enu, whole_bend))
     shows = shows and bends_by > LEAST_OF_BEND
     smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
@@ -218,7 +216,7 @@ def residual_trend(
 
 
 def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
-    """Columns (N, 3, 13) of what a calibration may have left, by velocity, turn rate, acceleration (N, 3), body."""
+    """Return nuisance columns (N, 3, 13) from velocity, turn rate and acceleration (N, 3), body axes."""
     known = np.zeros((len(moving), 3, len(KNOWN)))
     known[:, :, :3] = skew(moving)
     known[:, 0, 3], known[:, 1, 4] = moving[:, 0], moving[:, 1]
@@ -230,7 +228,7 @@ def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> A
 
 
 def _beside(time: Array, values: Array, starts: Index) -> Array:
-    """Means of the stretches before and after that of each value (N, 3), as far as these are near."""
+    """Return for each value (N, 3) the mean of the neighbouring stretches, or of its own if these are far in time."""
     at, of_each = _means(time, starts), _means(values, starts)
     near = (np.diff(at) < 2.0 * MEAN_S).astype(float)[:, None]
     before, after = np.vstack([[[0.0]], near]), np.vstack([near, [[0.0]]])
@@ -241,15 +239,16 @@ def _beside(time: Array, values: Array, starts: Index) -> Array:
 
 
 def reference_lag_s(estimate: Estimate, parameters: Parameters) -> float:
-    """By what (s) the reference lags behind the DVL, as it was found."""
+    """Return the estimated delay of the reference relative to the DVL, s."""
     own = dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
     return parameters.reference_time_offset - parameters.dvl_time_offset - own.get("time_offset", 0.0)
 
 
 def is_insignificant(estimate: Estimate) -> bool:
-    """Whether a calibration finds nothing to correct but a lag.
+    """Return whether a calibration finds nothing to correct except a delay.
 
-    One that knows no two angles has found nothing either way, and a filter of the DVL shows no lever arm of its own.
+    False if fewer than two angles are known, because nothing was then tested. A filter of the DVL shows no lever arm of
+    its own.
     """
     terms = MODELS[estimate.model].error_terms_from_state
     found = np.abs(terms @ estimate.state)
@@ -261,7 +260,7 @@ def is_insignificant(estimate: Estimate) -> bool:
 
 
 def std_along(estimate: Estimate, parameters: Parameters) -> Array:
-    """σ (3,) of what a bias along each axis of the body looks like: scale ahead, and turns (rad) in pitch and yaw."""
+    """Return σ (3,) of the errors that a bias along body x, y and z imitates: scale, yaw (rad), pitch (rad)."""
     terms, dvl_from_body = MODELS[estimate.model].error_terms_from_state, parameters.rotation_dvl_from_body
     p = terms @ estimate.recording_covariance @ terms.T
     ahead = dvl_from_body[:, 0] ** 2
@@ -270,9 +269,9 @@ def std_along(estimate: Estimate, parameters: Parameters) -> Array:
 
 
 def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None:
-    """Return the reason against a calibration over a bed that moves; None where it is not seen to.
+    """Return the reason against a calibration over a moving bed; None if not significant.
 
-    A calibration whose own constant error of the reference holds most of that velocity is only marginal.
+    It is only marginal if the calibration's constant reference error holds most of that velocity.
     """
     if found is None:
         return None
@@ -293,10 +292,10 @@ def residual_warnings(
     is_nil: bool = False,
     along: Sequence[float] | Array = (0.0, 0.0, 0.0),
 ) -> list[Reason]:
-    """What to say of it, as bad as it is to the verdict.
+    """Return the reasons from the residual, weighed by their effect on the verdict.
 
-    of_positions: the reference's velocities are differences of positions, which smooths them by their interval.
-    lag_s, is_nil, along: as of `reference_lag_s`, `is_insignificant` and `std_along`.
+    of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, is_nil, along:
+    see `reference_lag_s`, `is_insignificant` and `std_along`.
     """
     if found is None:
         return []
@@ -314,7 +313,7 @@ def residual_warnings(
     is_smoothed = abs(found.smoothed) > SURELY_SMOOTHED * found.smoothed_std
     if is_smoothed and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
         word = Severity.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Severity.MARGINAL
-        # what else it follows then comes of that
+        # smoothing causes any other signal
         return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(word)]
     said = []
     for axis, name in enumerate(("roll", "pitch")):
@@ -352,7 +351,7 @@ def _smoothed_one(found: ResidualTrend) -> str:
 def _fitted(
     time: Array, columns: Array, error: Array, likely: Array, together: Sequence[int] = QUICK_STRETCHES
 ) -> _Fit | None:
-    """Of error (N, 3) = columns (N, 3, n) x; None for too few stretches of time."""
+    """Fit error (N, 3) = columns (N, 3, n) x; None for too few stretches."""
     stretch = np.floor((time - time[0]) / STRETCH_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(stretch, prepend=-1))
     if len(starts) < ENOUGH:
@@ -370,28 +369,27 @@ def _fitted(
         x = p @ (weighted.reshape(-1, n).T @ z)
         rest = error - columns @ x
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
-    # an axis at a time: of hours of data all of it at once is a tenth of a gigabyte
+    # one axis at a time to save memory: hours of data would need a tenth of a gigabyte
     each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
     told = np.sum(each_axis, axis=0)
-    # what is not looked for may be there as far as it is likely, and the data do not say that it is not
+    # nuisance errors of their prior size add to σ, as far as the data do not exclude them
     beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
     std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T, together)
     return _Fit(x, np.sqrt(std**2 + (beside**2).sum(axis=1)), p, weight, rest, starts)
 
 
 def _std(scatter: Array, together: Sequence[int]) -> Array:
-    """σ (n,) by what each of M stretches, or so many together, say (n, M): the largest, for noise lasts."""
+    """Return the largest σ (n,) from scatter (n, M) of stretches and of their groups, as noise is correlated."""
     n, m = scatter.shape
     sums = [scatter[:, : m // k * k].reshape(n, -1, k).sum(axis=2) for k in together if m >= 2 * k]
     return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
 def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
-    """Share of the DVL's noise (velocity (N, 3), body) that the reference still holds, its σ, and over how long, s.
+    """Return the share of the DVL's noise that the reference keeps, its σ, and the memory, s. dvl: (N, 3) m/s, body.
 
-    What the samples around do not foretell of a velocity holds some of their noise. The error is taken against its own
-    samples around by the same shares: the DVL's noise is then the same in both, as far as waves leave it so. What else
-    is in it goes with that; the columns hold the DVL's noise themselves, so they are not taken off.
+    The innovation of a velocity, given its neighbours, holds its noise. The same filter is applied to the residual, so
+    both hold the same noise. Nuisance columns hold DVL noise themselves, so the residual is not corrected by them.
     """
     step = float(median(np.diff(time)))
     if step > SLOWEST_S or len(time) < 4 * FORETOLD_BY:
@@ -402,7 +400,7 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
         for filtered, each in ((new, values), (rest, error[:, axis])):
             filtered[FORETOLD_BY:-FORETOLD_BY, axis] = np.correlate(each, shares, "valid")
     most = NEW_AT_MOST * robust_std(new)
-    # nor is a sample foretold by those that are not at its own distances
+    # gaps break the prediction
     is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
     new[np.convolve(is_gap, np.ones(2 * FORETOLD_BY), "same") > 0.5] = 0.0
     noise = np.clip(new, -most, most)
@@ -420,7 +418,7 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
 
     rest, found = without_now(rest), []
     for seconds in FORGOTTEN_S:
-        for late in (0.0, seconds):  # that lag is taken for a late clock, and off
+        for late in (0.0, seconds):  # the lag may have been corrected as a delay
             past = without_now(without_columns(_followed(noise, step, seconds, late)))
             square = float(np.einsum("n,ni,ni->", weight, past, past))
             if square <= 0.0:
@@ -432,7 +430,7 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
 
 
 def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
-    """What a filter that forgets over so many seconds makes of noise (N, 3) before, or, late, until then, but now."""
+    """Return a filter's output from earlier noise (N, 3). seconds: memory. late: lag that is corrected, s."""
     kernel = np.exp(-np.arange(math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
     ahead = int(late / step + 1e-6)
     kernel[ahead] = 0.0
@@ -441,16 +439,16 @@ def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
 
 
 def _not_foretold(values: Array) -> Array:
-    """Shares (2 `FORETOLD_BY` + 1,) by which the samples around one of (N,), and it, make what is new in it."""
+    """Return coefficients (2 `FORETOLD_BY` + 1,) of a sample's prediction error by its neighbours, from values (N,)."""
     around = np.lib.stride_tricks.sliding_window_view(values, 2 * FORETOLD_BY + 1)
     own, others = around[:, FORETOLD_BY], np.delete(around, FORETOLD_BY, axis=1)
     square = others.T @ others
-    level = 1e-9 * float(np.trace(square)) / FORETOLD_BY + 1e-18  # a simulator's may be foretold exactly
+    level = 1e-9 * float(np.trace(square)) / FORETOLD_BY + 1e-18  # simulated values may be exactly predictable
     return np.insert(-np.linalg.solve(square + level * np.eye(2 * FORETOLD_BY), others.T @ own), FORETOLD_BY, 1.0)
 
 
 def _mean(time: Array, values: Array, seconds: float) -> Array:
-    """Means over so many seconds about each time (N,) of values (N, ...)."""
+    """Return means of values (N, ...) over a window (s) about each time (N,)."""
     first = np.searchsorted(time, time - 0.5 * seconds)
     end = np.searchsorted(time, time + 0.5 * seconds, side="right")
     sums = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0)])
@@ -459,16 +457,16 @@ def _mean(time: Array, values: Array, seconds: float) -> Array:
 
 
 def _at(time: Array, values: Array, later: float) -> Array:
-    """Values (N, 3) so many seconds later than each time (N,)."""
+    """Interpolate values (N, 3) at times (N,) shifted by `later` (s)."""
     return np.column_stack([np.interp(time + later, time, column) for column in values.T])
 
 
 def _means(values: Array, starts: Index) -> Array:
-    """Means of values (N, ...) from each start to the next."""
+    """Return means of values (N, ...) from each start to the next."""
     number = np.diff(starts, append=len(values)).reshape(-1, *[1] * (values.ndim - 1))
     return np.asarray(np.add.reduceat(values, starts, axis=0) / number)
 
 
 def _turned(rotation: Array, vectors: Array) -> Array:
-    """(N, 3) vectors by rotations (N, 3, 3)."""
+    """Rotate vectors (N, 3) by rotations (N, 3, 3)."""
     return np.asarray(np.matmul(rotation, vectors[..., None])[..., 0])

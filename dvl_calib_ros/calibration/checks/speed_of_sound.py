@@ -1,8 +1,8 @@
-"""The speed of sound that the water had against the one that the DVL used: what a scale may be, said in its cause.
+"""Speed of sound in the water against the DVL's setting, as a cause of the scale error.
 
-A DVL that counts with a speed of sound `used` in water of another, c, reads too fast by used / c - 1, except along the
-face of a phased array. Medwin's equation (J. Acoust. Soc. Am. 58, 1975, p. 1318) holds for 0 to 35 °C, 0 to 45 PSU and
-1000 m of depth; what it adds to the uncertainty is small beside a thermometer's.
+A DVL set to a speed of sound `used` in water of speed c reads too fast by used / c - 1, except along the face of a
+phased array. Medwin's equation (J. Acoust. Soc. Am. 58, 1975, p. 1318) holds for 0 to 35 °C, 0 to 45 PSU and 1000 m of
+depth; its error is small compared with a thermometer's.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from ..models.parameters import Parameters
 from ..numerics.kalman import GaussianState
 from ..results.results import scale_and_delay
 
-# Where the equation holds: °C, with the sea's coldest water; m.
+# Validity of the equation: °C, including the sea's coldest water; m.
 TEMPERATURES, DEEPEST = (-2.0, 35.0), 1000.0
-# The salinity of water that nobody measured, PSU: fresh to the saltiest sea.
+# Range of unmeasured salinity, PSU: fresh water to the saltiest sea.
 SALINITIES = (0.0, 40.0)
-# What is believed of a thermometer and of a measured salinity (2 σ), and of the equation (m/s).
+# Uncertainties: thermometer (°C) and measured salinity (PSU), 2 σ; the equation (m/s).
 THERMOMETER, SALINOMETER, EQUATION = 0.5, 1.0, 0.5
 
 
 def speed_of_sound(temperature: float, salinity: float, depth: float = 0.0) -> float:
-    """Speed of sound, m/s, of water of a temperature (°C) and salinity (PSU) at a depth (m), by Medwin (1975)."""
+    """Return the speed of sound, m/s, by Medwin (1975), at a temperature (°C), salinity (PSU) and depth (m)."""
     return _of_salinity_35(temperature, depth) + _by_salinity(temperature) * (salinity - 35.0)
 
 
@@ -37,27 +37,27 @@ def _of_salinity_35(temperature: float, depth: float) -> float:
 
 
 def _by_salinity(temperature: float) -> float:
-    """m/s for each PSU."""
+    """Return the change per PSU, m/s."""
     return 1.34 - 0.010 * temperature
 
 
 class Between(NamedTuple):
-    """What a quantity is at least and at most."""
+    """Range of a quantity."""
 
     least: float
     most: float
 
     def meets(self, other: Between) -> bool:
-        """Whether the two have a value in common."""
+        """Return whether the ranges overlap."""
         return self.least <= other.most and other.least <= self.most
 
 
 @dataclass(frozen=True)
 class Water:
-    """What a recording says of its water, nan where it says nothing.
+    """Water properties from a recording, nan if not recorded.
 
-    temperature: °C; temperature_error: half of its range, °C. salinity: PSU, measured. depth: m. used: speed of sound
-    that the DVL counted with, m/s. source: the topic of the temperature.
+    temperature: °C. temperature_error: half of its range, °C. salinity: PSU, measured. depth: m. used: speed of sound
+    set in the DVL, m/s. source: topic of the temperature.
     """
 
     temperature: float = math.nan
@@ -69,7 +69,7 @@ class Water:
 
     @property
     def speed(self) -> Between | None:
-        """The water's speed of sound, m/s; None without a temperature that the equation holds for."""
+        """Range of the water's speed of sound, m/s; None without a temperature and depth valid for the equation."""
         if not (TEMPERATURES[0] <= self.temperature <= TEMPERATURES[1] and 0.0 <= self.depth <= DEEPEST):
             return None
         salinities = SALINITIES
@@ -83,14 +83,14 @@ class Water:
 
     @property
     def scale(self) -> Between | None:
-        """The scale-factor error that this makes; None where the water's speed or the DVL's is not known."""
+        """Range of the scale error that results; None if the speed of the water or of the DVL is unknown."""
         speed = self.speed
         if speed is None or math.isnan(self.used):
             return None
         return Between(self.used / speed.most - 1.0, self.used / speed.least - 1.0)
 
     def salinities(self, speed: Between) -> Between:
-        """The salinities, of those that water has, at which sound has such a speed at this temperature."""
+        """Return the range of natural salinities that give this speed of sound at this temperature."""
         least, most = (
             35.0 + (each - _of_salinity_35(at, self.depth)) / _by_salinity(at)
             for each, at in (
@@ -101,12 +101,12 @@ class Water:
         return Between(max(least, SALINITIES[0]), min(most, SALINITIES[1]))
 
 
-# As data, beside the water's own
+# Keys that differ from the names of `Water`.
 _KEYS = {"used": "dvl_speed_of_sound"}
 
 
 def water_document(water: Water) -> dict[str, Any]:
-    """Plain data, with None where nothing is known; ranges are least and most."""
+    """Return plain data, with None if unknown; ranges are [least, most]."""
     ranges = {"speed_of_sound": water.speed, "scale_explained": water.scale}
     return {
         **{_KEYS.get(name, name): None if each != each else each for name, each in asdict(water).items()},
@@ -115,17 +115,17 @@ def water_document(water: Water) -> dict[str, Any]:
 
 
 def water_of_document(document: Mapping[str, Any]) -> Water:
-    """What `water_document` gave. Raises LookupError, TypeError or ValueError for what is none."""
+    """Read the output of `water_document`. Raise LookupError, TypeError or ValueError if it is invalid."""
     told = {each.name: document[_KEYS.get(each.name, each.name)] for each in fields(Water)}
     source = str(told.pop("source"))
     return Water(**{name: math.nan if each is None else float(each) for name, each in told.items()}, source=source)
 
 
 class CauseOfScale(NamedTuple):
-    """What a scale-factor error may come from.
+    """Cause of a scale error.
 
-    sentence: in full. brief: behind the words "speed of sound", in a line of a terminal. setting: the speed of sound to
-    set, m/s, nan where there is none to say.
+    sentence: in full. brief: one terminal line after the words "speed of sound". setting: speed of sound to set, m/s;
+    nan without a recommendation.
     """
 
     sentence: str
@@ -136,9 +136,9 @@ class CauseOfScale(NamedTuple):
 def cause_of_scale(
     model: Model, state: GaussianState, parameters: Parameters, water: Water | None
 ) -> CauseOfScale | None:
-    """What a calibration's scale comes from; None where the recording tells nothing.
+    """Return the cause of a calibration's scale error; None if the recording holds no information.
 
-    state: of a model, x (n,), P (n, n) of the recording alone, without what differs from day to day.
+    state: of a model, x (n,), P (n, n) of this recording, without day-to-day variation.
     """
     found = scale_and_delay(model, state, parameters)
     is_shown = all(each.observed for each in observability(model, state.p, parameters) if each.axis == "scale")
@@ -148,7 +148,7 @@ def cause_of_scale(
 
 
 def cause_of_setting(water: Water | None) -> CauseOfScale | None:
-    """What the speed of sound that a DVL used makes of a scale that no motion has shown."""
+    """Return the effect of the DVL's speed of sound on a scale that the motion does not show."""
     if water is None or water.speed is None or water.scale is None:
         return None
     said = f"{_used(water)}; {_of_water(water, water.speed)}"
@@ -163,7 +163,7 @@ def cause_of_setting(water: Water | None) -> CauseOfScale | None:
 
 
 def cause(water: Water | None, scale: float, std: float) -> CauseOfScale | None:
-    """What a scale-factor error with this σ comes from, and what to set; None where the recording tells nothing."""
+    """Return the cause of a scale error with its σ, and the setting; None if the recording holds no information."""
     if water is None or (water.speed is None and math.isnan(water.used)):
         return None
     speed, explained = water.speed, water.scale
