@@ -1,7 +1,7 @@
 """Dead reckoning with and without the calibration, and reasons against a calibration.
 
-Velocity errors add up to an error of position. Each sample is corrected by an estimate that has not seen its stretch,
-with the lever arm and delay that it holds, so the drift is that of data to come; the reference's own noise is in it.
+Integrated velocity errors give the position error. Each sample is corrected by an estimate that has not seen its
+stretch, including lever arm and delay, so the drift predicts later data. It includes the reference's noise.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from ..results.results import Estimate
 from ..results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
 from ..streams.position_velocities import are_positions
 
-# Lengths that drift is told over, m: the longest of which there are ENOUGH, else all there is as one.
+# Stretch lengths for the drift, m: the longest with ENOUGH stretches, else the whole track.
 STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
 ENOUGH = 3
-# What is shorter is no track.
+# Shortest track, m.
 SHORTEST_M = 20.0
-# Where samples are further apart than this many of their usual intervals, and than this, s, nothing is known between.
+# Longest interval that is integrated: the larger of this multiple of the usual interval and this time, s.
 GAP_INTERVALS, GAP_S = 5.0, 2.0
-# By chance the drift over few stretches is not so many times larger with a calibration than without.
+# Ratio of drift with and without calibration that few stretches rarely exceed by noise.
 WORSE = 1.5
-# Velocities fit clearly better where squares of their errors are so many times smaller, in the median.
+# Ratio of median squared velocity errors below which velocities fit significantly better.
 FITS_BETTER = 0.5
-# Samples that are compared in one go.
+# Samples compared together, which limits memory.
 COMPARED_AT_ONCE = 2048
 # Points of a track that are kept for a map.
 POINTS = 1500
@@ -58,48 +58,45 @@ MEDIAN_SQUARE = 0.4549
 
 @dataclass(frozen=True)
 class Drift:
-    """How far dead reckoning goes astray.
-
-    per_km: m per km, rms over stretches. end: m, at the end of the whole track.
-    """
+    """Drift of dead reckoning. per_km: m per km, rms over stretches. end: m, at the end of the track."""
 
     per_km: float
     end: float
 
     @property
     def percent(self) -> float:
-        """Of the distance."""
+        """Drift in per cent of the distance."""
         return 0.1 * self.per_km
 
 
 @dataclass(frozen=True)
 class Navigation:
-    """Dead reckoning beside the reference.
+    """Dead reckoning compared with the reference.
 
     Parameters
     ----------
     distance_m, seconds
         Of the track, without gaps.
     stretch_m
-        Length of the stretches that drift is told over; the whole distance if it is too short for several.
+        Length of the stretches for the drift; the whole distance of a short track.
     stretches
-        How many there are.
+        Number of stretches.
     before, after
-        Drift as the DVL was mounted, and corrected by estimates that had not seen the data.
+        Drift with the nominal mounting, and corrected by estimates that had not seen the data.
     noise_per_km
-        Part of the drift that noise of reference and DVL, as the data show it, may be, m per km.
+        Drift that noise of reference and DVL may cause, m per km, estimated from the data.
     on_a_map
-        Whether headings are known, so that a track can be drawn: then east and north, else ahead and to port.
+        Whether headings are known: then positions are east and north, else forward and to port.
     stamps_ns, distances
-        (P,) time, and m along the track, of the points kept.
+        (P,) stamps, and m along the track, of the points kept.
     reference, track_before, track_after
         (P, 2) m from the start.
     error_before, error_after
-        (P, 3) m/s, body axes: reference less the DVL's velocity; corrected by all that was found, arm and delay too.
+        (P, 3) m/s, body axes: reference minus DVL velocity; after with all corrections, lever arm and delay included.
     deviation
-        By what the heading is off as it changes; None where that does not show.
+        Heading deviation; None if not significant.
     followed
-        What the velocity that is left follows; None without attitude, or where there is too little.
+        Signals that the residual velocity follows; None without attitude, or for too little data.
     """
 
     distance_m: float
@@ -122,13 +119,12 @@ class Navigation:
 
     @property
     def speed(self) -> float:
-        """m/s, mean over the track."""
+        """Mean speed, m/s."""
         return self.distance_m / max(self.seconds, 1e-9)
 
     @property
     def fits_better(self) -> bool:
-        """Whether velocities do, clearly and not by outliers: then the way went back on itself, which a wrong mounting
-        cancels over, and noise that lasts does not."""
+        """Return whether median velocity errors are significantly smaller; on a returning track their drift cancels."""
         if not len(self.error_before):
             return False
         before, after = (median((each**2).sum(axis=1)) for each in (self.error_before, self.error_after))
@@ -143,10 +139,10 @@ def dead_reckoned(
     epoch_ns: int = 0,
     heading: GaussianState | None = None,
 ) -> Navigation | None:
-    """The track by the DVL as mounted, and corrected.
+    """Compare the track of the DVL, uncorrected and corrected, with the reference; None without reference or motion.
 
-    folds: (N,) of each DVL sample, which of `terms` corrects it. epoch_ns: what the recording's times count from.
-    heading: as `Estimate.heading_deviation`. None without reference, or with hardly any motion.
+    folds: (N,) index into `terms` of each DVL sample's correction. epoch_ns: stamp of the recording's time 0. heading:
+    see `Estimate.heading_deviation`.
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
@@ -193,9 +189,12 @@ def dead_reckoned(
 
 
 class _Level(NamedTuple):
-    """Of N samples (N, 4) m/s ahead and to port, and east and north where that is known: reference velocity, and error
-    of the DVL's; whether that is known (N,), and yaw (N,) rad. in_body: error (N, 3) m/s. whole, where that is
-    wanted: rotation_enu_from_body (N, 3, 3), velocity and error (N, 3) m/s, rates (N, 3) rad/s, body."""
+    """Reference velocity and DVL error of N samples.
+
+    velocity, error: (N, 4) m/s, forward, port, east, north, the latter two where oriented (N,). yaw: (N,) rad. in_body:
+    (N, 3) m/s, error. whole: if requested, rotation_enu_from_body (N, 3, 3), velocity and error (N, 3) m/s, rates
+    (N, 3) rad/s, body axes.
+    """
 
     velocity: Array
     error: Array
@@ -206,14 +205,14 @@ class _Level(NamedTuple):
 
     @staticmethod
     def of(n: int, *, whole: bool = False) -> _Level:
-        """To be filled."""
+        """Return an empty table of n samples."""
         error = np.empty((n, 3))
         kept = (np.empty((n, 3, 3)), np.empty((n, 3)), error, np.empty((n, 3))) if whole else ()
         return _Level(np.empty((n, 4)), np.empty((n, 4)), np.empty(n, dtype=bool), np.empty(n), error, kept)
 
     def fill(self, recording: ThinnedRecording, at: Index, terms: Terms, parameters: Parameters) -> None:
-        """Write those of some samples, corrected by these terms."""
-        # on the way to them is twenty times as much
+        """Fill in some samples, corrected by these terms."""
+        # intermediate arrays take twenty times the memory
         for start in range(0, len(at), COMPARED_AT_ONCE):
             some = at[start : start + COMPARED_AT_ONCE]
             seen = recording.compared(some, terms, parameters)
@@ -229,14 +228,14 @@ class _Level(NamedTuple):
 
 
 def _followed(recording: ThinnedRecording, after: _Level, use: Index) -> ResidualTrend | None:
-    """As of `residual_trend`, of the samples that are used."""
+    """Return `residual_trend` of the samples in use."""
     rotation, velocity, error, rates = (each[use] for each in after.whole)
     interval_s = float(median(np.diff(recording.reference.times)))
     return residual_trend(recording.dvl.times[use], rotation, velocity, error, rates, interval_s)
 
 
 def _steps(times: Array) -> Array:
-    """Time (N,) s that each sample stands for: since the one before, 0 after a gap."""
+    """Return the time (N,) s since the previous sample, 0 after a gap."""
     interval = np.diff(times, prepend=times[:1])
     if len(interval) < 2:
         return np.zeros(len(times))
@@ -245,7 +244,7 @@ def _steps(times: Array) -> Array:
 
 
 def ends_of_stretches(along: Array) -> Index:
-    """Where stretches end (S + 1,), beginning with 0: of the longest length that there are enough of."""
+    """Return indices (S + 1,) of the limits of stretches, for the longest length with enough stretches."""
     for length in STRETCHES_M:
         n = int(along[-1] // length)
         if n >= ENOUGH:
@@ -254,16 +253,16 @@ def ends_of_stretches(along: Array) -> Index:
 
 
 def drift_over(astray: Array, along: Array, ends: Index) -> Drift:
-    """Of a track that leads astray (N, 2) m, at N distances along it (m), over the stretches between ends (S + 1,)."""
+    """Return the drift from track errors (N, 2) m at distances (N,) m, over the stretches between ends (S + 1,)."""
     off = np.linalg.norm(np.diff(astray[ends], axis=0), axis=1)
     share = off / np.maximum(np.diff(along[ends]), 1e-9)
     return Drift(1000.0 * math.sqrt(float(np.mean(share**2))), float(np.linalg.norm(astray[-1])))
 
 
 def _noise(errors: Array, step_s: Array, along: Array, ends: Index) -> float:
-    """What white noise of these errors (K, 2) makes of drift, m per km, rms over stretches.
+    """Return the drift that white noise of these errors (K, 2) causes, m per km, rms over stretches.
 
-    Its size is that of differences of neighbours, which nothing slow is in.
+    Differences of neighbours give the noise without slow errors.
     """
     if len(errors) < 3:
         return 0.0
@@ -274,7 +273,7 @@ def _noise(errors: Array, step_s: Array, along: Array, ends: Index) -> float:
 
 
 def navigation_document(navigation: Navigation | None) -> dict[str, Any] | None:
-    """Figures for `--json`."""
+    """Return plain data for `--json`."""
     if navigation is None:
         return None
     return {
@@ -289,9 +288,9 @@ def navigation_document(navigation: Navigation | None) -> dict[str, Any] | None:
 
 
 def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Reason]:
-    """What the drift says against a calibration: velocities may fit better and the track worse.
+    """Return the reasons against a calibration by its drift, which may grow although velocities fit better.
 
-    known_to: m per km (σ) that the estimate leaves open; what is worse by no more contradicts nothing.
+    known_to: predicted drift, m per km (σ); an increase within it is only marginal.
     """
     if navigation is None or navigation.stretches < ENOUGH:
         return []
@@ -306,7 +305,7 @@ def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Rea
 
 
 def in_words(navigation: Navigation) -> list[str]:
-    """What there is to say of it, a sentence each."""
+    """Return sentences that describe the drift."""
     n, before, after = navigation, navigation.before, navigation.after
     over = f"over stretches of {n.stretch_m:.0f} m" if n.stretches > 1 else f"over {n.distance_m:.0f} m"
     said = [
@@ -322,7 +321,7 @@ def in_words(navigation: Navigation) -> list[str]:
 
 
 def metres(value: float) -> str:
-    """A distance, m, with as many digits as people read."""
+    """Format a distance (m) with a sensible number of digits."""
     return f"{value:.0f}" if value >= 10.0 else f"{value:.1f}"
 
 
@@ -336,17 +335,17 @@ def doubts(
     in_earth: bool,
     is_level: bool,
 ) -> list[Reason]:
-    """Each as bad as it is to a verdict; a warning is nothing to that, but worth saying.
+    """Return the reasons against a calibration, weighed by their effect on the verdict; warnings have none.
 
     Parameters
     ----------
     estimate: Of the selected model.
-    finders: Estimates that hold what the data show of the lever arm, the best first; others do not matter.
-    navigation: What is left with the selected model, on data held out; None where that is not known.
-    parameters: What was told.
-    suggested: Whether another configuration fits, which would be why the arm is another.
+    finders: Estimates of the lever arm, the best first.
+    navigation: Held-out drift with the selected model; None if not available.
+    parameters: The configuration.
+    suggested: Whether another configuration fits, which would explain a different lever arm.
     in_earth: Whether the reference is in an earth frame.
-    is_level: Whether the IMU knows the heading alone, see `IMU_LEVEL`.
+    is_level: Whether the IMU gives a heading only, see `IMU_LEVEL`.
     """
     found = [finding("IMU_LEVEL")] if is_level else []
     if not suggested:
@@ -354,7 +353,7 @@ def doubts(
     if navigation is None:
         return found
     bed = moving_bed(navigation.followed, estimate)
-    if bed is not None:  # which looks like a heading error, and like one of the reference
+    if bed is not None:  # a moving bed looks like a heading error, and like a reference error
         found.append(bed)
     elif navigation.deviation is not None:
         found.append(heading_warnings(navigation.deviation).weighed(severity_of(navigation.deviation, estimate)))

@@ -1,8 +1,8 @@
-"""What a calibration is worth to dead reckoning, and the manoeuvre that would make it worth most more.
+"""Predicted drift of dead reckoning, and the manoeuvre that reduces it most.
 
-What is left of its errors carries a vehicle off a straight leg: yaw to the side, scale ahead. That drift is predicted
-by the covariance of this recording; what another day adds to it, no manoeuvre of today takes away. A manoeuvre is
-tried by what it would measure: a model's own H and noise on that motion, added to the information that there is.
+Errors of yaw and scale move a vehicle off a straight leg, to the side and ahead. The drift is predicted from this
+recording's covariance, because no manoeuvre reduces day-to-day variation. A manoeuvre's information comes from the
+model's H and noise on its motion, and is added to the present information.
 """
 
 from __future__ import annotations
@@ -22,21 +22,22 @@ from ..results.results import Estimate
 from ..streams.aligner import Aligner
 
 KM = 1000.0
-# A manoeuvre is tried for so long, s, by samples of so many s; after so many of them nobody drives on.
+# Duration and sample interval of a manoeuvre, s, and largest number of manoeuvres.
 TRIED_S, STEP_S, MOST = 60.0, 2.0, 30
 CIRCLE_RADPS, EIGHT_RADPS = math.radians(6.0), math.radians(12.0)
 DIVE_RAD, DIVE_S = math.radians(10.0), 30.0
 SPEED_PERIOD_S = 20.0
-# The manoeuvre that was named stays, unless another brings so many times more.
+# Advantage from which another manoeuvre replaces the last suggestion.
 CLEARLY_BETTER = 1.2
 _COMPASS = (("north", 0.0), ("east", 90.0), ("south", 180.0), ("west", 270.0))
 
 
 class RecentMotion(NamedTuple):
-    """How a vehicle moves. speed: m/s. heading: rad from east to north, None where it is not known.
+    """Motion of the vehicle.
 
-    in_earth: whether the reference is in an earth frame, so that a constant error of it turns with the vehicle.
-    noise: (m/s)² per axis, of one second of reference and DVL together.
+    speed: m/s. heading: rad, counterclockwise from east; None if unknown. in_earth: whether the reference is in an
+    earth frame, so that its constant error rotates relative to the vehicle. noise: (m/s)² per axis, of one second of
+    reference and DVL.
     """
 
     speed: float
@@ -46,8 +47,7 @@ class RecentMotion(NamedTuple):
 
 
 class PredictedDrift(NamedTuple):
-    """Predicted drift of dead reckoning on a straight leg, m per km, 1σ: to the side, ahead (nan where the model does
-    not know the scale), and both together."""
+    """Predicted drift on a straight leg, m per km, 1σ: to the side, ahead (nan without scale), and both together."""
 
     side: float
     ahead: float
@@ -55,26 +55,26 @@ class PredictedDrift(NamedTuple):
 
 
 class Outlook(NamedTuple):
-    """What to drive next, and about how long until the drift is within its target, s; None if it is or never will."""
+    """Next manoeuvre, and time until the drift is within its target, s; None if it is already or never will be."""
 
     next: Reason
     seconds: float | None
 
 
 def predicted_drift(model: Model, covariance: Array, parameters: Parameters) -> PredictedDrift:
-    """Drift by what a model's state may be off, by its covariance (n, n)."""
+    """Return the drift due to a model's covariance (n, n)."""
     rows = _rows(model, parameters)
     side, ahead = (KM * math.sqrt(max(float(row @ covariance @ row), 0.0)) for row in rows)
     return PredictedDrift(side, ahead if model.scale_axes else math.nan, math.hypot(side, ahead))
 
 
 def drift_left_open(estimate: Estimate, parameters: Parameters) -> float:
-    """Drift (m per km, σ) at the speeds driven that an estimate leaves open."""
+    """Return the predicted drift (m per km, σ) of an estimate, at the speeds driven."""
     return predicted_drift(MODELS[estimate.model], estimate.velocity_covariance, parameters).both
 
 
 def _rows(model: Model, parameters: Parameters) -> Array:
-    """(2, n) velocity to port and ahead, in m/s for each m/s ahead, by the state of a model."""
+    """Return derivatives (2, n) of port and forward velocity, per m/s forward, by the states of a model."""
     t = parameters.rotation_dvl_from_body
     by_terms = t.T @ np.hstack([-skew(t[:, 0]), np.diag(t[:, 0])])
     rows: Array = by_terms[[1, 0]] @ model.error_terms_from_state
@@ -82,14 +82,14 @@ def _rows(model: Model, parameters: Parameters) -> Array:
 
 
 def is_good_enough(model: Model) -> Reason:
-    """What is said of a model's calibration whose drift is within its target."""
+    """Return the reason that a model's drift is within its target."""
     return finding("NEXT_IS_GOOD" if model.scale_axes else "NEXT_IS_GOOD_BUT_SCALE")
 
 
 def noise_of_a_second(estimate: Estimate, parameters: Parameters, seconds: float, mean_square_speed: float) -> float:
-    """`RecentMotion.noise`, as the filter's information shows it after so many s of motion at this mean square speed.
+    """Return `RecentMotion.noise` from the filter's information after a time (s) at a mean square speed.
 
-    Of an information matrix, that on the yaw by itself is the sum of squared speeds over the noise.
+    The information on yaw is the sum of squared speeds over the noise.
     """
     model = MODELS[estimate.model]
     t = parameters.rotation_dvl_from_body
@@ -101,9 +101,9 @@ def noise_of_a_second(estimate: Estimate, parameters: Parameters, seconds: float
 
 
 def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, before: Reason | None = None) -> Outlook:
-    """What to drive next: that of ten manoeuvres after which the predicted drift is least, and so on until it is good.
+    """Return the next manoeuvre: of ten, repeatedly the one with the smallest predicted drift, until that is on target.
 
-    before: what was said last, which stands while nothing is clearly better.
+    before: the last suggestion, kept unless another is clearly better.
     """
     model = MODELS[estimate.model]
     target, rows = parameters.target_drift, _rows(model, parameters)
@@ -112,7 +112,7 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
         return Outlook(is_good_enough(model), None)
     if not estimate.used or motion.speed < parameters.min_speed or motion.speed <= 0.0:
         return Outlook(finding("NEXT_WAIT"), None)
-    # samples of a minute are not as independent as a filter takes them for: by so much
+    # correlated samples hold less information than the filter assumes, by this factor
     claimed = predicted_drift(model, estimate.filter_covariance, parameters)
     shared = max(1.0, (now.both / max(claimed.both, 1e-9)) ** 2)
     tried = [
@@ -136,7 +136,7 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
             return Outlook(chosen, seconds + _until(information, gains[best], rows, target))
         information = information + gains[best]
         seconds += TRIED_S
-    assert chosen is not None  # there are manoeuvres
+    assert chosen is not None  # the list of manoeuvres is not empty
     return Outlook(chosen, None)
 
 
@@ -145,7 +145,7 @@ def _name(reason: Reason) -> object:
 
 
 def _until(information: Array, gain: Array, rows: Array, target: float) -> float:
-    """After how much of a manoeuvre, s, the drift is within its target."""
+    """Return the duration, s, of a manoeuvre after which the drift is within its target."""
     shares = np.linspace(0.0, 1.0, 13)[1:]
     left = np.linalg.inv(information + shares[:, None, None] * gain)
     drifts = KM * np.sqrt(np.einsum("ri,kij,rj->k", rows, left, rows))
@@ -153,7 +153,7 @@ def _until(information: Array, gain: Array, rows: Array, target: float) -> float
 
 
 def _manoeuvres(motion: RecentMotion) -> dict[str, tuple[Reason, tuple[Array, Array, Array]]]:
-    """Name -> what is said of it, and yaw (rad), speed (m/s), pitch (rad) over time (K,)."""
+    """Return by name the wording, and yaw (rad), speed (m/s) and pitch (rad) over time (K,)."""
     time = np.arange(0.0, TRIED_S, STEP_S)
     heading, u = motion.heading or 0.0, np.full(len(time), motion.speed)
     ahead, level = np.full(len(time), heading), np.zeros(len(time))
@@ -179,7 +179,7 @@ def _manoeuvres(motion: RecentMotion) -> dict[str, tuple[Reason, tuple[Array, Ar
 def _information(
     model: Model, parameters: Parameters, motion: RecentMotion, yaw: Array, speed: Array, pitch: Array
 ) -> Array:
-    """(n, n) that a motion would bring on a model's state, by its own H and noise."""
+    """Return the information (n, n) that a motion adds on a model's state, from its H and noise."""
     t = parameters.rotation_dvl_from_body
     ahead = np.column_stack([speed, np.zeros((len(speed), 2))])
     (ca, sa), (cb, sb), zero = (np.cos(yaw), np.sin(yaw)), (np.cos(pitch), np.sin(pitch)), np.zeros(len(yaw))
@@ -212,7 +212,7 @@ def _information(
         h[:, 0, names.index("time_offset")] = np.gradient(speed, STEP_S)
     noise = model.noise(seen) if model.noise is not None else seen.noise
     rows = own.shape[1]
-    # noise of an aided model is that of a second; a vehicle's motion goes on from sample to sample
+    # an aided model's noise is per second; motion noise of the others is correlated between samples
     seconds = STEP_S if model.aided else 1.0
     weight = seen.motion_weight if model.motion_is_noise else np.ones(len(speed))
     weighted = np.linalg.solve(noise[:, :rows, :rows], h) * (weight * seconds)[:, None, None]
@@ -221,7 +221,7 @@ def _information(
 
 
 def recent_motion(aligner: Aligner) -> RecentMotion | None:
-    """Return how the vehicle moves by its newest samples; None before the first. Its noise is not known here."""
+    """Return the motion by the newest samples, its noise unknown (nan); None before the first sample."""
     rows, imu, reference = aligner.rows, aligner.imu, aligner.reference
     if rows.size == rows.begin:
         return None

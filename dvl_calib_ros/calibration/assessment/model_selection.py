@@ -1,4 +1,4 @@
-"""Which model's estimate is the one: automatic selection with timeout and hysteresis, in stamps."""
+"""Automatic selection of the model over time, with timeout and hysteresis in stamps."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from ..models.parameters import AUTO, IAC, Parameters
 from ..numerics.samples import Mask, Stamps
 from ..results.results import Segment
 
-# The published selection; the first and the last are what the paper recommends
+# Models of the published selection; the paper recommends the first and the last
 IAC_G = ("M3", "M4")
 IAC_GF = ("M5", "M6", "M7")
 
 
 class GnssAvailability:
-    """Whether GNSS is available: paired samples keep arriving, and a change has held for the hysteresis.
+    """Availability of GNSS: paired samples keep arriving, and a change has lasted for the hysteresis.
 
-    Before the first sample GNSS is not available. losses: how often it stopped for longer than the timeout, whether or
-    not for long enough to count.
+    Initially GNSS is not available. losses: number of gaps longer than the timeout, even if shorter than the
+    hysteresis.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class GnssAvailability:
         self._changing_since_ns: int | None = None
 
     def update(self, stamp_ns: int, paired: bool, timeout_ns: int, hysteresis_ns: int) -> None:
-        """Take note of one DVL sample and whether it was paired with a reference."""
+        """Take one DVL sample, and whether it was paired with a reference."""
         if paired:
             self._last_paired_ns = stamp_ns
         fresh = self._last_paired_ns is not None and stamp_ns - self._last_paired_ns <= timeout_ns
@@ -51,7 +51,7 @@ class GnssAvailability:
             self._changing_since_ns = None
 
     def stays_with(self, stamps_ns: Stamps, paired: Mask) -> bool:
-        """Take note of samples (N,) that change nothing, and say True: of a receiver that is steadily there, or not."""
+        """Take samples (N,) if they change nothing, and return whether so: reception is steady, or steadily absent."""
         if self._changing_since_ns is not None or self._fresh != self.available:
             return False
         if self.available and paired.all():
@@ -61,16 +61,16 @@ class GnssAvailability:
 
     @property
     def reason(self) -> Reason:
-        """For the operator."""
+        """Availability in words for the operator."""
         if self._changing_since_ns is None:
             return finding("GNSS_AVAILABLE" if self.available else "GNSS_NOT_AVAILABLE")
         return finding("GNSS_GOING" if self.available else "GNSS_COMING")
 
 
 class Evidence(NamedTuple):
-    """What an estimator has to say to the selection: the code of a reason with its numbers, '' for none yet.
+    """Evidence of an estimator for the selection: code and numbers of a reason, '' for none.
 
-    pairs_elsewhere: it finds references that pairing, at the stamps as they are, does not.
+    pairs_elsewhere: the estimator finds references that pairing at the uncorrected stamps misses.
     """
 
     code: str = ""
@@ -79,12 +79,12 @@ class Evidence(NamedTuple):
 
 
 NO_EVIDENCE = Evidence()
-# References that are found elsewhere come with every block of 10 s; without them for so long, there are none.
+# Time without references from an estimator, ns, after which there are none; they come with every block of 10 s.
 REFERENCED_NS = 12_000_000_000
 
 
 class Selection:
-    """The selected model over time."""
+    """Selected model over time."""
 
     def __init__(self) -> None:
         self.gnss = GnssAvailability()
@@ -92,21 +92,21 @@ class Selection:
         self._referenced_until_ns = 0
         self._headings = self._trimmed = False
         self._by_positions: Evidence | None = None
-        # what is to be taken note of once DVL samples reach its stamp: evidence, or that headings show the current
+        # events that take effect when DVL samples reach their stamp: evidence, or None for sufficient headings
         self._coming: deque[tuple[int, Evidence | None]] = deque()
 
     def take(self, from_ns: int, evidence: Evidence) -> None:
-        """From this stamp on, go by what an estimator says: of references elsewhere, or that positions are better."""
+        """Use an estimator's evidence from this stamp on."""
         if evidence.code or evidence.pairs_elsewhere:
             insort(self._coming, (from_ns, evidence), key=lambda each: each[0])
 
     def headings_show_the_current(self, from_ns: int, trimmed: bool = False) -> None:
-        """From this stamp on, a model with attitude can do without GNSS. trimmed: it is the trim that asks for it."""
+        """Allow models with attitude and without GNSS from this stamp on. trimmed: because of the trim."""
         self._trimmed = trimmed
         insort(self._coming, (from_ns, None), key=lambda each: each[0])
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
-        """Take note of DVL samples (N,), in order of stamps, and of whether they were paired."""
+        """Take DVL samples (N,) in order of stamps, and whether they were paired."""
         while self._coming and len(stamps_ns) and self._coming[0][0] <= stamps_ns[-1]:
             from_ns, evidence = self._coming.popleft()
             at = int(np.searchsorted(stamps_ns, from_ns))
@@ -124,6 +124,7 @@ class Selection:
             self._update(stamps_ns, paired, parameters)
 
     def _update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
+        """Take samples one by one where GNSS availability changes."""
         timeout_ns, hysteresis_ns = round(parameters.gnss_timeout * 1e9), round(parameters.gnss_hysteresis * 1e9)
         if parameters.model == AUTO:
             paired = paired | (stamps_ns < self._referenced_until_ns)
@@ -134,7 +135,7 @@ class Selection:
             self.record(stamp_ns, parameters)
 
     def record(self, stamp_ns: int, parameters: Parameters) -> None:
-        """Start a new segment if another model is selected now; one that had no time is replaced."""
+        """Start a new segment if the selected model has changed; a segment without duration is replaced."""
         model = self.model(parameters)
         if self.segments and self.segments[-1].from_ns == stamp_ns:
             self.segments.pop()
@@ -142,7 +143,7 @@ class Selection:
             self.segments.append(Segment(stamp_ns, model))
 
     def model(self, parameters: Parameters) -> str:
-        """Name of the selected model."""
+        """Return the name of the selected model."""
         if parameters.model == IAC:
             aided, unaided = published_models(parameters)
         elif parameters.model == AUTO:
@@ -156,12 +157,12 @@ class Selection:
         return aided
 
     def iac_model(self, parameters: Parameters) -> str:
-        """Name of the model that the paper's own selection runs now, whatever is selected."""
+        """Return the model that the paper's selection runs now."""
         aided, unaided = published_models(parameters)
         return aided if self.gnss.available else unaided
 
     def reason(self, parameters: Parameters) -> Reason:
-        """Why it is that model."""
+        """Return the reason for the selected model."""
         if parameters.model not in (AUTO, IAC):
             return finding("MODEL_NAMED")
         chosen = {"by": parameters.model, "gnss": self.gnss.reason}
@@ -175,9 +176,9 @@ class Selection:
 
 
 def published_models(parameters: Parameters) -> tuple[str, str]:
-    """What `iac` runs: IAC-G with GNSS, IAC-GF without, of Yampolsky and Klein (see the table of models).
+    """Return the models of `iac` with and without GNSS (Yampolsky and Klein): IAC-G and IAC-GF.
 
-    Where gnss_model or gnss_free_model name no such model, as by default, the ones that the paper ends with.
+    If gnss_model or gnss_free_model name no such model, as by default, these are the paper's final ones.
     """
     aided = parameters.gnss_model if parameters.gnss_model in IAC_G else IAC_G[0]
     return aided, parameters.gnss_free_model if parameters.gnss_free_model in IAC_GF else IAC_GF[-1]
