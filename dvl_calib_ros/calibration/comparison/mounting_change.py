@@ -1,9 +1,9 @@
 """Test of whether the mounting moved between calibrations of one DVL.
 
-Each quantity is tested by itself, in the axes of a URDF: the difference of two calibrations is normally distributed
-with the sum of their covariances. The p-values are corrected for the number of quantities by Holm, and for the number
-of instants by Bonferroni. A series in time is split at the most significant instant, and either part again ("binary
-segmentation"; Scott and Knott, "A cluster analysis method for grouping means in the analysis of variance", 1974).
+Each quantity is tested separately, in the axes of a URDF: the difference of two calibrations is normally distributed
+with the sum of their covariances. The p-values are corrected for the number of quantities (Holm) and of instants
+(Bonferroni). The series is split at the most significant instant, and each part again (binary segmentation; Scott and
+Knott, "A cluster analysis method for grouping means in the analysis of variance", 1974).
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from ..numerics.frames import Array, near_angles
 from ..numerics.tests import chi2_sf, holm, smallest_found
 from ..results.extrinsics import ANGLES, GROUPS, MOUNTING, N_AXES, N_COMPONENTS, ONLY_CLOCK, ONLY_SCALE, Extrinsics
 
-# False-alarm rates of one comparison, whatever its numbers of quantities and instants: a mounting has moved at the two-
-# sided 4 σ of a normal error and is suspicious at 2 σ; scale and delay have changed at 1 %.
+# False-alarm rates of one comparison, for any numbers of quantities and instants: a mounting has moved at the two-sided
+# 4 σ of a normal error and is suspicious at 2 σ; scale and delay have changed at 1 %.
 MOVED, SUSPICIOUS, CHANCE = chi2_sf(16.0, 1), chi2_sf(4.0, 1), 0.01
-# Share of movements as large as `Comparison.smallest` that are found
+# Probability of finding a movement as large as `Comparison.smallest`
 POWER = 0.9
 
 _ALL = np.arange(N_COMPONENTS)
 
 
 class ChiSquare(NamedTuple):
-    """d'S⁻¹d, its degrees of freedom and its p-value; p is nan without any degree."""
+    """Test statistic d'S⁻¹d, degrees of freedom, and p-value, nan without degrees of freedom."""
 
     value: float
     freedom: int
@@ -44,7 +44,7 @@ class ChiSquare(NamedTuple):
 
 @dataclass(frozen=True)
 class Difference:
-    """Second less first of two calibrations, each of one recording or of several together.
+    """Second minus first of two calibrations, each of one recording or of several together.
 
     value (8,), covariance (8, 8): of `extrinsics.COMPONENTS`. compared (8,): observable in both.
     """
@@ -57,7 +57,7 @@ class Difference:
 
     @staticmethod
     def between(first: Extrinsics, second: Extrinsics) -> Difference:
-        """Subtract the first from the second; the bias of one DVL cancels."""
+        """Subtract the first from the second; a bias of the same DVL cancels."""
         compared = first.shown & second.shown
         both = first.covariance + second.covariance
         if first.dvl and first.dvl == second.dvl:
@@ -69,12 +69,12 @@ class Difference:
 
     @property
     def std(self) -> Array:
-        """(8,), nan for what is not compared."""
+        """(8,) standard deviations, nan if not compared."""
         return np.where(self.compared, np.sqrt(np.diag(self.covariance)), np.nan)
 
     @cached_property
     def p(self) -> Array:
-        """(8,) two-sided p-values corrected for their number by Holm, nan for what is not compared."""
+        """(8,) two-sided p-values with Holm's correction, nan if not compared."""
         found = np.full(N_COMPONENTS, np.nan)
         found[self.compared] = holm(
             [chi2_sf(each, 1) for each in ((self.value / self.std) ** 2)[self.compared].tolist()]
@@ -96,7 +96,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Change:
-    """Difference between the calibrations before and after an instant, each taken together up to the next change.
+    """Difference between the averages of all calibrations before and after an instant, up to the next changes.
 
     last_before, first_after: the neighbours of the instant.
     """
@@ -107,7 +107,7 @@ class Change:
 
 
 class ComparisonAnswer(NamedTuple):
-    """Consequences of a comparison's word: the severity that colours it, the exit code of the command."""
+    """Severity for colours, and exit code of the command, of a comparison's verdict."""
 
     severity: Severity
     exit_code: int
@@ -122,14 +122,14 @@ ANSWERS = {
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Answering):
-    """Several calibrations of one DVL.
+    """Comparison of several calibrations of one DVL.
 
     Parameters
     ----------
     calibrations
         In order of time.
     pairs
-        Every two.
+        All pairs.
     moved, suspicious
         Changes of angles or lever arm at 4 σ, and at 2 to 4 σ.
     suspected
@@ -154,7 +154,7 @@ class Comparison(Answering):
 
     @property
     def verdict(self) -> str:
-        """The answer: moved, suspicious or same."""
+        """Verdict: moved, suspicious or same."""
         return "moved" if self.moved else "suspicious" if self.suspicious or self.suspected else "same"
 
     word = verdict
@@ -166,24 +166,24 @@ class Comparison(Answering):
 
     @property
     def contradicting(self) -> tuple[Change, ...]:
-        """Changes of the mounting at 1 %: averaging across one gives the mounting of none, worse than a warning."""
+        """Changes of the mounting at 1 %, across which an average would be no calibration's mounting."""
         level = CHANCE / (len(self.calibrations) - 1)
         return tuple(each for each in (*self.moved, *self.suspicious) if each.difference.chance(MOUNTING) < level)
 
     @property
     def same_mounting(self) -> bool:
-        """Whether no movement is found or suspected."""
+        """Return whether no movement is found or suspected."""
         return self.verdict == "same"
 
 
 def contradicts(found: Extrinsics, initial: Extrinsics) -> Difference | None:
-    """Return the difference of an initial calibration from one of other data at 1 %; None where they agree."""
+    """Return the difference of an initial calibration from another at 1 %; None if they agree."""
     difference = Difference.between(initial, found)
     return difference if difference.chance(MOUNTING) < CHANCE else None
 
 
 def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
-    """Raise InputError if two are one calibration by two names, which would confirm itself."""
+    """Raise InputError if two names refer to one calibration, which would confirm itself."""
     for one, other in combinations(calibrations, 2):
         of_one, of_other = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
         if of_one == of_other and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):
@@ -193,15 +193,15 @@ def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
 
 
 def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
-    """Compare two calibrations and more. Raises InputError without an angle that is observable in two of them.
+    """Compare two or more calibrations. Raise InputError if no angle is observable in two of them.
 
-    Rejected calibrations take no part in the tests of accepted ones, and alone are suspicious at most: their σ does not
-    hold.
+    Rejected calibrations are excluded from tests of accepted ones, and alone can only be suspicious, because their σ is
+    not reliable.
     """
     if len(calibrations) < 2:
         name = calibrations[0].name if calibrations else "nothing"
         raise InputError(f"{name}: one alone cannot be compared; name two")
-    ordered = sorted(calibrations, key=lambda each: each.first_ns)  # stable: of equal ones as they are given
+    ordered = sorted(calibrations, key=lambda each: each.first_ns)  # stable for equal stamps
     ordered = [replace(each, value=_near(each.value, ordered[0].value)) for each in ordered]
     pairs = [Difference.between(*two) for two in combinations(ordered, 2)]
     if not any(pair.compared[MOUNTING].any() for pair in pairs):
@@ -231,9 +231,9 @@ def compare(calibrations: Sequence[Extrinsics]) -> Comparison:
 def fused(several: Sequence[Extrinsics]) -> Extrinsics:
     """Average calibrations of one mounting, weighted by their information.
 
-    Mounting, scale and delay each for themselves, by their marginal covariances: speed of sound and clocks change from
-    day to day, and what is forced to be common where it is not would bend the others. The bias of one DVL is common to
-    all and does not average out: it is a state, and its remaining σ is part of the result.
+    Mounting, scale and delay are averaged separately by their marginal covariances. Speed of sound and clocks change
+    from day to day, which would otherwise bias the mounting. The bias of one DVL is common to all: it is a state, whose
+    remaining σ is part of the result.
     """
     if len(several) == 1:
         return several[0]
@@ -242,13 +242,13 @@ def fused(several: Sequence[Extrinsics]) -> Extrinsics:
         several = [replace(each, dvl="", by_bias=np.zeros_like(each.by_bias)) for each in several]
     shown = np.any([each.shown for each in several], axis=0)
     values = np.array([_near(each.value, base.value) for each in several])
-    found, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: as the first assumes it
+    found, by_bias = values[0].copy(), np.zeros((N_COMPONENTS, N_AXES))  # not observable: value of the first
     covariance = np.zeros((N_COMPONENTS, N_COMPONENTS))
     own, columns = (np.array([getattr(each, name) for each in several]) for name in ("information", "by_bias"))
     information, vector = own.sum(axis=0), np.einsum("nij,nj->i", own, values)
     turned = own @ columns
     for index in (group[shown[group]] for group in GROUPS):
-        # with a bias of σ 1 as a further state
+        # bias of σ 1 as an additional state
         across = turned[:, index].sum(axis=0)
         of_bias = np.eye(N_AXES) + np.einsum("nia,nib->ab", columns[:, index], turned[:, index])
         of_vector = np.einsum("nia,ni->a", turned[:, index], values[:, index])
@@ -275,12 +275,12 @@ _Together = Callable[[tuple[Extrinsics, ...]], Extrinsics]
 
 
 def _near(value: Array, base: Array) -> Array:
-    """Return components (8,) with angles within half a turn of those of `base`."""
+    """Return components (8,) with angles within half a turn of `base`."""
     return np.concatenate([near_angles(value[ANGLES], base[ANGLES]), value[ANGLES.stop :]])
 
 
 def _splits(series: Sequence[Extrinsics], together: _Together) -> list[Change]:
-    """Return the difference at every instant of a series in time."""
+    """Return the difference at every instant of a series in order of time."""
     parts = ((together(tuple(series[:k])), together(tuple(series[k:]))) for k in range(1, len(series)))
     return [Change(Difference.between(*two), *ends) for two, ends in zip(parts, pairwise(series), strict=True)]
 
@@ -290,7 +290,7 @@ def _changes(
 ) -> list[Change]:
     """Find changes of some components of a series, in order of time."""
 
-    def surprise(change: Change) -> tuple[float, float]:  # beyond what a double holds as a probability by the ratio
+    def surprise(change: Change) -> tuple[float, float]:  # the ratio decides where p underflows
         ratio = np.abs(change.difference.value / change.difference.std)[components]
         return change.difference.chance(components), -float(np.nan_to_num(ratio).max())
 
@@ -304,7 +304,7 @@ def _changes(
 
 
 def _suspected(series: Sequence[Extrinsics], rejected: Sequence[Extrinsics]) -> list[Change]:
-    """Hold each rejected calibration against the accepted one next to it in time."""
+    """Compare each rejected calibration with the accepted one nearest in stamps."""
     found = []
     for each in rejected:
         nearest = min(series, key=lambda other: abs(other.first_ns - each.first_ns))

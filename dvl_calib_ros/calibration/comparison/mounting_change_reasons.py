@@ -13,14 +13,13 @@ from ..results.extrinsics import ANGLES, COMPONENTS, LEVER_ARM, MOUNTING, SCALE,
 from ..results.mounting_quantities import date
 from .mounting_change import CHANCE, POWER, SUSPICIOUS, Change, Comparison, Difference
 
-# A vehicle's builder would see a lever arm that is off by more, m. One that is configured wrongly by as much turns the
-# yaw by tenths of a degree.
+# Difference of lever arms, m, that a vehicle's builder would see; as an error it biases yaw by tenths of a degree.
 ARM_MATTERS_M = 0.3
 _ANGLE_NAMES = COMPONENTS[ANGLES]
 
 
 def reasons(comparison: Comparison) -> list[Reason]:
-    """Say what is found, the mounting first."""
+    """Return the findings, the mounting first."""
     said = [*map(moved, comparison.moved), *map(suspicious, comparison.suspicious)]
     said = [*said, *map(suspected, comparison.suspected)] or [_same(comparison)]
     said += map(scale_changed, comparison.scale_changed)
@@ -36,7 +35,7 @@ def reasons(comparison: Comparison) -> list[Reason]:
 
 
 def _same(comparison: Comparison) -> Reason:
-    """Say how small a movement could not be seen, or that no single date explains the differences."""
+    """Return the smallest movement that would be found, or that no single date explains the differences."""
     scatter = comparison.scatter
     if scatter.freedom and scatter.p < CHANCE:
         apart = max(float(np.nanmax(np.abs(pair.value[ANGLES]), initial=0.0)) for pair in comparison.pairs)
