@@ -1,4 +1,4 @@
-"""From aligned samples to what models see of them: rotations, lever arm, noise."""
+"""Observations of models from aligned samples: rotations, lever arm, noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _BITS = np.array([1, 2, 4], dtype=np.uint8)
 
 
 class Observer:
-    """Makes `Observations`, with the constants that the parameters say."""
+    """Builder of `Observations` with the constants of the parameters."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
@@ -28,10 +28,10 @@ class Observer:
         self._unaided_noise: Array = np.eye(3)[None] * parameters.gnss_free_std**2
 
     def observe(self, block: AlignedBlock, needs: Needs, sway_heave: Array) -> Observations:
-        """What models with these needs see of rows that have them. sway_heave: (2,) m/s, prior of M5 and M6."""
+        """Return the observations of rows that meet these needs. sway_heave: (2,) m/s, prior of M5 and M6."""
         lever = None
         if self._lever_arm is not None:
-            lever = np.nan_to_num(block.attitude[:, 4:]) @ self._lever_arm  # ω×l; zero where ω is not known
+            lever = np.nan_to_num(block.attitude[:, 4:]) @ self._lever_arm  # ω×l; zero where ω is unknown
         rotation_dvl_from_body = self._parameters.rotation_dvl_from_body
         common = (rotation_dvl_from_body, sway_heave)
         interval = 1e-9 * block.interval_ns
@@ -71,7 +71,7 @@ class Observer:
         )
 
     def _paired_noise(self, block: AlignedBlock, rotation_body_from_reference: Array | None) -> Array:
-        """R of the aided models (N or 1, 3, 3): T R_gnss Tᵀ + R_dvl where the messages give them."""
+        """Return R of the aided models (N or 1, 3, 3): T R_gnss Tᵀ + R_dvl where the messages give them."""
         reference = block.reference[:, 3:].reshape(-1, 3, 3)
         given = ~np.isnan(reference[:, 0, 0])
         if not self._parameters.use_message_covariance or not given.any():
@@ -84,12 +84,14 @@ class Observer:
 
 
 def _reference_in_body(block: AlignedBlock) -> tuple[Array | None, Array | None]:
-    """Rotations (N, 3, 3) that take each reference velocity to the body frame, and `Observations.earth_in_body`;
-    None, None if all are in it."""
+    """Return rotations (N, 3, 3) of references to the body frame, and `Observations.earth_in_body`.
+
+    None, None if all references are in the body frame.
+    """
     frames: Codes = block.frames
     if not frames.any():
         return None, None
-    # attitude is enu from body, so its transpose turns ENU into the body
+    # attitude is enu from body; its inverse rotates ENU to the body
     attitude = np.where((frames == _BODY)[:, None], (0.0, 0.0, 0.0, 1.0), block.attitude[:, :4])
     rotation = rotation_from_quaternion(attitude * (-1.0, -1.0, -1.0, 1.0))
     earth = rotation[:, :, :2] * (frames != _BODY)[:, None, None]
@@ -98,9 +100,9 @@ def _reference_in_body(block: AlignedBlock) -> tuple[Array | None, Array | None]
 
 
 class RowsSeen(NamedTuple):
-    """Rows first .. decided - 1 as models with some needs see them: those that have these, with their numbers.
+    """Rows first .. decided - 1 that meet the needs of some models, with their numbers.
 
-    observations: None where no row has them.
+    observations: None if no row meets them.
     """
 
     first: int
@@ -111,5 +113,5 @@ class RowsSeen(NamedTuple):
 
 
 def own_copy(block: AlignedBlock) -> AlignedBlock:
-    """A copy that what is added later does not change."""
+    """Return a copy that is independent of later additions."""
     return block.part(np.arange(len(block)))

@@ -1,9 +1,8 @@
-"""Cutting a run into folds, and what is kept of each to solve without it and to judge on it.
+"""Cross-validation: folds of a run, and sums per fold to solve without it and to judge on it.
 
-A run is cut into blocks of `verification_block`, dealt out in turn to `FOLDS` folds: neighbouring blocks go to
-different ones, so all folds see every part of a run. With Φ = I the information that samples bring is a sum
-(kalman.py), so what a fold brought is kept as one matrix per model, and solving without it leaves that matrix out. No
-second pass, constant memory.
+Blocks of `verification_block` are assigned to `FOLDS` folds in turn, so all folds cover the whole run. With Φ = I the
+information of samples is additive (kalman.py). One information matrix per fold and model is stored, and solving without
+a fold leaves it out: one pass, constant memory.
 """
 
 from __future__ import annotations
@@ -28,19 +27,19 @@ FOLDS = 5
 
 
 def folds_of(stamps_ns: Stamps, parameters: Parameters) -> NDArray[np.int64]:
-    """Fold (N,) of each sample, by its stamp alone."""
+    """Return the fold (N,) of each sample, by its stamp alone."""
     return stamps_ns // round(parameters.verification_block * 1e9) % FOLDS
 
 
 class FoldSums:
-    """Sums over samples, of each fold by itself: arrays of some shapes, as Λ (K, n, n) and Λx (K, n)."""
+    """Sums over samples per fold: arrays of given shapes, such as Λ (K, n, n) and Λx (K, n)."""
 
     def __init__(self, *shapes: tuple[int, ...]) -> None:
         self._each = [np.zeros((FOLDS, *shape)) for shape in shapes]
         self._total: tuple[Array, ...] | None = None
 
     def copy(self) -> FoldSums:
-        """The same, which goes its own way."""
+        """Return an independent copy."""
         made = copy(self)
         made._each = [sums.copy() for sums in self._each]
         return made
@@ -52,52 +51,52 @@ class FoldSums:
             sums[fold] += own
 
     def of(self, fold: int) -> tuple[Array, ...]:
-        """Those of one fold; not to be written to."""
+        """Return the sums of one fold, read-only."""
         return tuple(sums[fold] for sums in self._each)
 
     @property
     def total(self) -> tuple[Array, ...]:
-        """Over all folds; not to be written to."""
+        """Sums over all folds, read-only."""
         if self._total is None:
             self._total = tuple(sums.sum(axis=0) for sums in self._each)
         return self._total
 
     def without(self, fold: int) -> tuple[Array, ...]:
-        """Over all folds but one."""
+        """Return the sums over all folds but one."""
         others = np.arange(FOLDS) != fold
         return tuple(sums[others].sum(axis=0) for sums in self._each)
 
     def taken(self, number: int) -> Array:
-        """Give the caller one kind of sums (FOLDS, ...), who has them from now on: here they are none."""
+        """Move one kind of sums (FOLDS, ...) to the caller and reset it here."""
         self._total = None
         sums = self._each[number]
         self._each[number] = np.zeros_like(sums)
         return sums
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Reset all sums."""
         self._total = None
         for sums in self._each:
             sums[:] = 0.0
 
 
 class FoldInformation:
-    """What is known of K models, or hypotheses of one, had they not seen a fold: prior, and what each fold told.
+    """Information of K models or hypotheses without each fold: prior, and information per fold.
 
-    The random walk is taken as none.
+    The random walk is neglected.
     """
 
     def __init__(self, start: GaussianState) -> None:
-        """start: x (K, n), P (K, n, n) of the filter."""
+        """Start from x (K, n), P (K, n, n) of the filter."""
         self.begin([start.information] * FOLDS)
 
     def begin(self, known: Sequence[tuple[Array, Array]]) -> None:
-        """Go on from Λ (K, n, n) and Λx (K, n) that are known without each fold."""
+        """Restart from Λ (K, n, n) and Λx (K, n) without each fold."""
         self._begin = known
         self._told = FoldSums(known[0][0].shape, known[0][1].shape)
 
     def add(self, folds: NDArray[np.int64], data: Measurements, used: NDArray[np.bool_]) -> None:
-        """Add N samples, as far as models used them (K, N)."""
+        """Add N samples where models used them (K, N)."""
         h, z = data.whitened
         rows = np.concatenate([h, z[:, None]], axis=1).transpose(2, 1, 0, 3)  # (K, n + 1, m, N)
         weight = data.weight * used
@@ -110,20 +109,20 @@ class FoldInformation:
             self._told.add(fold, told[..., :-1, :-1], told[..., :-1, -1])
 
     def without(self, fold: int) -> tuple[Array, Array]:
-        """Λ (K, n, n) and Λx (K, n) had they not seen a fold."""
+        """Return Λ (K, n, n) and Λx (K, n) without a fold."""
         information, vector = (
             more + known for more, known in zip(self._told.without(fold), self._begin[fold], strict=True)
         )
         return information, vector
 
     def state(self, fold: int, index: int) -> GaussianState:
-        """The filter's x (n,) and P (n, n) of one of the K, had it not seen a fold."""
+        """Return x (n,) and P (n, n) of one of the K without a fold."""
         information, vector = (of_all[index] for of_all in self.without(fold))
         p = np.linalg.inv(information)
         return GaussianState(p @ vector, p)
 
     def end_day(self, start: GaussianState, of_day: NDArray[np.intp]) -> None:
-        """Go on from what is known, but of the states of the day (u,) from `start`, x (K, n), P (K, n, n)."""
+        """Restart for a new recording; states that differ per recording (u,) from `start`, x (K, n), P (K, n, n)."""
         known = []
         for fold in range(FOLDS):
             states = zip(*(self.state(fold, index) for index in range(len(start.x))), strict=True)
@@ -132,7 +131,7 @@ class FoldInformation:
 
 
 def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np.intp]) -> GaussianState:
-    """A state x (..., n), P (..., n, n) of which some (u,) are as in another of one shape with it: of another day."""
+    """Return a state x (..., n), P (..., n, n) with the states `which` (u,) replaced, uncorrelated, from another."""
     x, p = state.x.copy(), state.p.copy()
     x[..., which] = other.x[..., which]
     p[..., which, :] = 0.0
@@ -142,11 +141,11 @@ def with_states_of(state: GaussianState, other: GaussianState, which: NDArray[np
 
 
 class Moments(FoldSums):
-    """All that is kept of samples with a reference to judge any correction by.
+    """Sums over samples with a reference that suffice to judge any correction.
 
-    For each fold the number of samples, and for each axis of the body, over the samples whose reference measures it,
-    the sums of v vᵀ (3, 3, 3) and g vᵀ (3, 3), and over the axes of g² and of the variance that R says; with v (3,) m/s
-    measured, DVL frame, at the reference point, and g m/s the reference velocity along the axis.
+    Per fold: the number of samples; for each body axis, over samples whose reference measures it, Σ v vᵀ (3, 3, 3) and
+    Σ g vᵀ (3, 3); over all axes, Σ g² and Σ of the variance of R. v (3,) m/s is measured, DVL frame, at the reference
+    point; g m/s is the reference velocity along the axis.
     """
 
     def __init__(self) -> None:
@@ -174,13 +173,13 @@ class Moments(FoldSums):
             )
 
     def squared_error(self, fold: int, body_from_measured: Array) -> float:
-        """Sum over a fold of |g - C v|² (m/s)² along the measured axes, C (3, 3)."""
+        """Return Σ |g - C v|² (m/s)² over a fold along the measured axes, C (3, 3)."""
         c = body_from_measured
         _, vv, gv, gg, _ = self.of(fold)
         return float(gg - 2.0 * np.sum(c * gv) + np.einsum("ai,aij,aj->", c, vv, c))
 
 
-# Fewer samples with a reference prove nothing.
+# Fewest samples with a reference for a verification.
 ENOUGH_SAMPLES = 20
 
 
@@ -188,12 +187,12 @@ ENOUGH_SAMPLES = 20
 class HeldOutError:
     """Velocity error against the reference on held-out samples, m/s rms over the vector.
 
-    uncorrected: with the nominal mounting. corrected: with the estimate. predicted: what R of the reference and the
-    covariance of the estimate lead one to expect of corrected. Each holds the noise of the reference. calibration: the
-    part of predicted that is the estimate's. interpolated: so much more of a white reference's noise corrected may hold
-    than in uncorrected: between its samples it is quieter than at them, and a delay changes where it is asked.
-    independent: how many samples of noise without memory tell as much of its size; None: as many as there are.
-    claimed: noise of reference and DVL as their messages have it, where predicted has it as the data show it.
+    uncorrected: nominal mounting. corrected: estimate. predicted: expected value of corrected by R of the reference and
+    the covariance of the estimate. All include reference noise. calibration: contribution of the estimate to predicted.
+    interpolated: white reference noise that corrected may contain beyond uncorrected: interpolation attenuates noise
+    between samples, and a delay changes the interpolation times. independent: equivalent number of independent samples;
+    None: samples. claimed: noise of reference and DVL by their messages, if predicted uses the noise estimated from the
+    data.
     """
 
     samples: int
@@ -209,7 +208,7 @@ class HeldOutError:
 def held_out_error(
     model: Model, without: Sequence[GaussianState], moments: Moments, rotation_dvl_from_body: Array
 ) -> HeldOutError | None:
-    """Error of a model on every fold, with the state that has not seen it; None if there is too little to judge by.
+    """Return the error of a model on every fold by the state without it; None for too few samples.
 
     without: one state for each fold.
     """
@@ -232,9 +231,9 @@ def held_out_error(
 def calibration_error(
     model: Model, covariance: Array, judged: tuple[float, Array], rotation_dvl_from_body: Array
 ) -> float:
-    """Velocity error, m/s rms, that a covariance (n, n) of a model's state makes on the samples judged; 0 for none.
+    """Return the velocity error, m/s rms, due to a state covariance (n, n) on judged samples; 0 for none.
 
-    judged: the first two of the sums of `Moments`.
+    judged: the first two sums of `Moments`.
     """
     samples, vv = judged
     of_errors = model.error_terms_from_state @ covariance @ model.error_terms_from_state.T
@@ -243,16 +242,16 @@ def calibration_error(
 
 
 def held_out_from_sums(samples: int, sums: Sequence[float] | Array) -> HeldOutError | None:
-    """From sums of squares (m/s)² in the order of `HeldOutError`'s fields; None if there is too little to judge by."""
+    """Return the error from sums of squares (m/s)² in the order of `HeldOutError`; None for too few samples."""
     if samples < ENOUGH_SAMPLES:
         return None
     return HeldOutError(samples, *(math.sqrt(max(float(total), 0.0) / samples) for total in sums))
 
 
 def _calibration_variance(covariance: Array, vv: Array, rotation_body_from_dvl: Array) -> float:
-    """Sum of trace(J P Jᵀ) (m/s)² over samples of which only Σ v vᵀ is known: J is linear in v.
+    """Return Σ trace(J P Jᵀ) (m/s)² over samples from Σ v vᵀ alone, as J is linear in v.
 
-    vv: (3, 3, 3) Σ v vᵀ of the samples that are judged along each axis of the body.
+    vv: (3, 3, 3) Σ v vᵀ of the samples that are judged along each body axis.
     """
     in_body = np.einsum("ij,kaj->kai", rotation_body_from_dvl, _JACOBIAN_BY_ERROR)
     return float(np.einsum("kai,lbi,ab,ikl->", in_body, in_body, covariance, vv))

@@ -1,8 +1,7 @@
-"""What is constant on one day and another on the next.
+"""Covariance of errors that are constant in a recording and differ between recordings.
 
-By how much the heading reference is off goes into yaw one to one, the speed of sound into scale; no scatter within a
-recording shows either. A σ is worth what happens in the next recording, so that which is published, and that by which
-recordings are compared, hold both; how far a calibration is, and what its data showed, goes by the recording alone.
+Heading reference errors (yaw) and the speed of sound (scale) cause no scatter within a recording. The published σ and
+the comparison of recordings include them; convergence and observability do not.
 """
 
 from __future__ import annotations
@@ -15,8 +14,9 @@ from ..numerics.frames import Array
 
 
 def day_covariance(model: Model, parameters: Parameters) -> Array:
-    """(n, n) to be added to a model's covariance: `day_std_heading` about the body's vertical, `day_std_scale` of every
-    scale alike. Zero for models without a reference, which these do not reach.
+    """Return the addition (n, n) to the covariance of a model; zero for models without a reference.
+
+    `day_std_heading` acts about the body's vertical, `day_std_scale` on all scales alike.
     """
     found = np.zeros((model.n_state, model.n_state))
     if model.aided:

@@ -1,8 +1,7 @@
-"""The bank of linear filters: all models at once, with covariances by blocks of time.
+"""Bank of linear filters: all models in parallel, with covariances from time blocks.
 
-So switching models by hand or automatically is a change of what is read, never of what is computed, and the state
-after a switch is that of having run the model from the start. When a model is updated is a matter of speed alone:
-those of one `Group` are stacked and updated together, by blocks of any length.
+Switching models changes only which state is read, so a selected model has run from the start. The models of one `Group`
+are stacked and updated together, in blocks of any length.
 """
 
 from __future__ import annotations
@@ -29,18 +28,18 @@ from .relative_height import RelativeHeight
 from .state_history import Counts, Standing
 
 Ends = Index
-# Blocks by whose scatter σ is checked: as long as the noise of a vehicle's motion lasts.
+# Time blocks for the scatter of σ, ns: as long as the correlation of vehicle motion.
 BLOCK_NS = 10_000_000_000
 
-# From here on the vectorised batch is faster than the recursion.
+# Number of samples from which the vectorised batch is faster than the recursion.
 BATCH_FROM = 24
 
 
 class ModelCounts(NamedTuple):
-    """What one model did with the samples given to it.
+    """Sample counts of one model.
 
-    mean_nis, mean_rows: νᵀS⁻¹ν (nan if none) and number of rows, means over those it used. restarted: how often its
-    state was not finite, and it went on from before.
+    mean_nis, mean_rows: means of νᵀS⁻¹ν (nan if none) and number of rows over the used samples. restarted: number of
+    blocks skipped because the state was not finite.
     """
 
     used: int
@@ -56,10 +55,9 @@ def groups_of(
     initial: Mapping[str, GaussianState] | None = None,
     verified: bool = False,
 ) -> tuple[Group, ...]:
-    """The bank: all models, in groups of those that see the same and differ in z and H only.
+    """Return all models in groups with equal observations that differ in z and H only.
 
-    They start from the prior, or from `initial` for the models named there (shapes as the models' states). verified:
-    keep what `Group.states_without_folds` needs.
+    They start from the prior, or from `initial` by model name. verified: store what `Group.states_without_folds` needs.
     """
     alike: dict[object, list[Model]] = {}
     for model in models:
@@ -71,11 +69,10 @@ def groups_of(
 
 
 class Group:
-    """K models that see the same and differ in z and H only.
+    """K models with equal observations that differ in z and H only.
 
-    needs: of all of them. index: by name, which of the K. n_given: samples that they have had. next_row: kept here for
-    who feeds them: number of the first row that they have not been asked to take. moments: of the samples that they
-    were given, for verification by those with a reference; empty without.
+    needs: common to all. index: number k by name. n_given: samples received. next_row: for the caller, number of the
+    first row not yet passed. moments: of the samples, for the verification of models with a reference; else empty.
     """
 
     def __init__(
@@ -109,9 +106,9 @@ class Group:
     def update(
         self, stamps_ns: Stamps, seen: Observations, weight: Array, prior_known: Mask, ends: Ends | None = None
     ) -> Standing | None:
-        """Update by a block of N samples that have what the models need.
+        """Update by a block of N samples that meet the needs. Return the states after `ends` samples (E), if given.
 
-        weight, prior_known: (N,) as in `Assembler.measurements`. The states after `ends` samples (E), if given.
+        weight, prior_known: (N,) as in `Assembler.measurements`.
         """
         self.n_given += len(stamps_ns)
         if self._height is not None:
@@ -147,7 +144,7 @@ class Group:
         return standing
 
     def end_day(self) -> None:
-        """Go on with what belongs to the vehicle; what is of the day is to be found anew."""
+        """Keep the states of the vehicle for the next recording, and reset those that differ per recording."""
         if not len(self._of_day):
             return
         if self._height is not None:
@@ -158,7 +155,7 @@ class Group:
         if self._scatter is not None:
             try:
                 self._scatter.end_day(before, after, self._of_day)
-            except np.linalg.LinAlgError:  # numbers that ran away: it looks at the new day alone
+            except np.linalg.LinAlgError:  # singular: restart the scatter with this recording
                 self._scatter = BlockScatter(self._x, self._p)
         if self._folds is not None:
             with suppress(np.linalg.LinAlgError):
@@ -167,18 +164,19 @@ class Group:
         self._of_recording.clear()
 
     def _after(self, data: kalman.Measurements, process: Array | None, ends: Ends | None) -> kalman.Updated:
-        """The models updated; one whose numbers run away stays as it was before, and is counted."""
+        """Update the models. A model with non-finite numbers keeps its previous state and is counted."""
         try:
             after = _filtered(self._x, self._p, data, process, ends)
             if _is_sound(after.x, after.p):
                 return after
         except np.linalg.LinAlgError:
-            pass  # of one of them: each by itself
+            pass  # one model failed: update each alone
         return kalman.Updated.joined([self._after_alone(k, data, process, ends) for k in range(len(self._x))])
 
     def _after_alone(
         self, k: int, data: kalman.Measurements, process: Array | None, ends: Ends | None
     ) -> kalman.Updated:
+        """Update the k-th model; on non-finite numbers keep its state and count a restart."""
         own = slice(k, k + 1)
         x, p, own_data = self._x[own], self._p[own], data.model(k)
         with suppress(np.linalg.LinAlgError):
@@ -191,7 +189,7 @@ class Group:
         return kalman.Updated(x, p, nothing, nothing.astype(float), at)
 
     def _standing_at(self, after: kalman.Updated, ends: Ends, every: Ends) -> Standing:
-        """After `ends` samples; `every`: after which numbers of samples the states are known."""
+        """Return the states after `ends` samples. every: sample numbers with known states."""
         states = after.at
         assert states is not None
         at = np.searchsorted(every, ends)
@@ -200,7 +198,7 @@ class Group:
         return Standing(states.x[at], states.p[at], self._used + used, self._nis_sum + nis)
 
     def standing(self, n: int) -> Standing:
-        """The states as they are now, n times."""
+        """Return the present states, n times."""
         now = Standing(self._x[None], self._p[None], self._used[None], self._nis_sum[None])
         return Standing.joined([now] * n)
 
@@ -213,14 +211,14 @@ class Group:
         return np.diff(stamps_ns, prepend=before_ns)[:, None, None, None] * 1e-9 * rate
 
     def state(self, name: str) -> GaussianState:
-        """State and covariance of one model; not to be written to."""
-        if name not in self._states:  # asked for more than once per sample, live
+        """Return state and covariance of one model, read-only."""
+        if name not in self._states:  # used several times per live sample
             index = self.index[name]
             self._states[name] = self._assembler.state(index, self._x[index], self._p[index])
         return self._states[name]
 
     def of_recording(self, name: str) -> GaussianState:
-        """`state` with σ as much larger as blocks of time show."""
+        """Return `state` with σ inflated by the scatter of time blocks."""
         if self._scatter is None:
             return self.state(name)
         if name not in self._of_recording:
@@ -228,18 +226,18 @@ class Group:
         return self._of_recording[name]
 
     def counts_at(self, name: str, standing: Standing) -> tuple[Counts, Array]:
-        """Samples that one model has used (E,) and the sum of νᵀS⁻¹ν over them (E,)."""
+        """Return the samples used by one model (E,) and the sum of νᵀS⁻¹ν over them (E,)."""
         index = self.index[name]
         return standing.used[:, index], standing.nis_sum[:, index]
 
     def states_at(self, name: str, standing: Standing) -> GaussianState:
-        """States x (E, n) and covariances P (E, n, n) of one model, from those of all."""
+        """Return states x (E, n) and covariances P (E, n, n) of one model."""
         index = self.index[name]
         return self._assembler.state(index, standing.x[:, index], standing.p[:, index])
 
     def states_without_folds(self, name: str) -> list[GaussianState]:
-        """For every fold the state and covariance of one model had it not seen that fold."""
-        assert self._folds is not None  # asked for when the bank was made
+        """Return state and covariance of one model without each fold."""
+        assert self._folds is not None  # the bank was made with verified=True
         index, found = self.index[name], []
         for fold in range(FOLDS):
             try:
@@ -249,7 +247,7 @@ class Group:
         return found
 
     def counts(self, name: str) -> ModelCounts:
-        """Samples used and gated by one model, and its mean normalised innovation squared."""
+        """Return samples used and gated by one model, and its mean normalised innovation squared."""
         index = self.index[name]
         used = int(self._used[index])
         model = self._assembler.models[index]
@@ -263,7 +261,7 @@ class Group:
 
 
 def _joined_ends(cuts: Ends, ends: Ends | None) -> Ends | None:
-    """Numbers of samples of both, ascending; None without any."""
+    """Return the sample numbers of both, ascending; None if there are none."""
     return ends if not len(cuts) else np.array(sorted({*cuts.tolist(), *([] if ends is None else ends.tolist())}))
 
 
@@ -276,11 +274,11 @@ def _filtered(
 
 
 def _is_sound(x: Array, p: Array) -> bool:
-    """Whether all of states x (..., n), P (..., n, n) are finite, with variances above zero."""
+    """Return whether states x (..., n), P (..., n, n) are finite, with positive variances."""
     flat_x, flat_p = x.ravel(), p.ravel()
-    finite = math.isfinite(float(flat_x @ flat_x) + float(flat_p @ flat_p))  # nan and inf stay in sums
+    finite = math.isfinite(float(flat_x @ flat_x) + float(flat_p @ flat_p))  # nan and inf propagate through sums
     n = p.shape[-1]
-    # of few numbers, as live, in a third of the time of numpy's
+    # for the few numbers of a live sample faster than numpy
     return finite and min(p.reshape(-1, n * n)[:, :: n + 1].ravel().tolist()) > 0.0
 
 
@@ -288,10 +286,10 @@ _NO_CUTS = np.zeros(0, dtype=np.intp)
 
 
 class BlockScatter:
-    """`TimeBlocks` of K filters without process noise, told by their states where one block ends and the next begins.
+    """`TimeBlocks` of K filters without process noise, from their states at the block boundaries.
 
-    What a block told is the difference of the information after and before it. What they say is as of the end of the
-    last block, so it depends on stamps alone.
+    The information of a block is the difference after and before it. Results hold at the end of the last block, so they
+    depend on stamps alone.
     """
 
     def __init__(self, x: Array, p: Array) -> None:
@@ -303,9 +301,9 @@ class BlockScatter:
         self._found: dict[int, Array] = {}
 
     def cuts(self, stamps_ns: Stamps) -> Index:
-        """Take samples (N,); returns numbers (E,) of those after which a new block begins."""
+        """Add stamps (N,). Return the sample numbers (E,) after which a new block begins."""
         first, last = int(stamps_ns[0]) // BLOCK_NS, int(stamps_ns[-1]) // BLOCK_NS
-        if first == last == (first if self._last is None else self._last):  # as nearly always live
+        if first == last == (first if self._last is None else self._last):
             self._last = last
             return _NO_CUTS
         blocks = stamps_ns // BLOCK_NS
@@ -314,7 +312,7 @@ class BlockScatter:
         return np.flatnonzero(np.diff(blocks, prepend=before))
 
     def add(self, x: Array, p: Array) -> None:
-        """Take the states at the cuts, x (E, K, n), P (E, K, n, n)."""
+        """Add the states at the cuts, x (E, K, n), P (E, K, n, n)."""
         for now in _informations(x, p):
             if now is not None:
                 self._blocks.add(now[0] - self._told[0], now[1] - self._told[1], 1.0)
@@ -323,22 +321,24 @@ class BlockScatter:
         self._found.clear()
 
     def end_day(self, before: GaussianState, after: GaussianState, of_day: Index) -> None:
-        """Go on with states `after` the end of a day, x (K, n), P (K, n, n), from those `before`. of_day: which (u,) of
-        them were of the day."""
+        """End a recording: continue with states `after`, x (K, n), P (K, n, n), from those `before`.
+
+        of_day: indices (u,) of the states that differ per recording.
+        """
         self.add(before.x[None], before.p[None])
         self._blocks.end_day(of_day, *self._told, np.arange(len(before.x)))
         self._told, self._state = after.information, after
         self._last = None
 
     def inflation(self, index: int) -> Array:
-        """By how much σ (n,) of one filter has to grow."""
+        """Return the inflation factor of σ (n,) of one filter."""
         if index not in self._found:
             self._found[index] = self._blocks.inflation(index, self._state.x[index], self._state.p[index])
         return self._found[index]
 
 
 def _informations(x: Array, p: Array) -> Iterator[tuple[Array, Array] | None]:
-    """Of E states x (K, n), P (K, n, n); None of those whose numbers ran away: the filter goes on from before them."""
+    """Yield the information of E states x (K, n), P (K, n, n); None for singular ones, which are skipped."""
     try:
         yield from zip(*GaussianState(x, p).information, strict=True)
         return

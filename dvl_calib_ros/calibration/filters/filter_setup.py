@@ -1,4 +1,4 @@
-"""Between models and the Kalman filter: what it starts from, what its rows are, and what its states mean."""
+"""Setup of the Kalman filter by models: initial state, rows, gates, and the meaning of its states."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from ..numerics.tests import chi2_cdf, chi2_isf
 
 
 class Assembler:
-    """Between the Kalman filter and K models that differ in z and H only: they are of one size, with one noise.
+    """Measurements and states of K models with equal size and noise that differ in z and H only.
 
-    start: what the filter starts from, x (K, n), P (K, n, n): the prior, or `initial` for the models named there
-    (shapes as the models' states). prior: that, of all (of states of the day the same in the filter). process_rate: Q
-    per second (K, n, n): a random walk of misalignment and scale, not of nuisance states; None for none.
+    start: initial x (K, n), P (K, n, n): the prior, or `initial` by model name. prior: of all models (also used for
+    states that differ per recording). process_rate: Q per second (K, n, n), a random walk of misalignment and scale,
+    not of nuisance states; None without.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Assembler:
         self._floors = [_floor(model, parameters) for model in self.models]
         held = [_without(floor, state) for floor, state in zip(self._floors, self._starts, strict=True)]
         self.start = GaussianState(np.array([each.x for each in held]), np.array([each.p for each in held]))
-        # by how many of its rows are left where axes of the reference are not measured
+        # gate by the number of unmeasured axes
         self._gates = np.array([gate_of(max(self._m - dropped, 1), parameters) for dropped in range(self._m + 1)])
         self._gate = np.full((len(self.models), 1), self._gates[0])
         self._needs_prior = np.array([model.needs_prior for model in self.models])
@@ -50,15 +50,17 @@ class Assembler:
         self.process_rate = rate if rate.any() else None
 
     def state(self, index: int, x: Array, p: Array) -> GaussianState:
-        """One model's state and covariance out of the filter's x (..., n) and P (..., n, n)."""
+        """Return one model's state and covariance from x (..., n) and P (..., n, n) of the filter."""
         floor = self._floors[index]
         return GaussianState(x.copy(), p.copy() if floor is None else p + floor)
 
     def measurements(self, seen: Observations, weight: Array, prior_known: Mask) -> kalman.Measurements:
-        """A block of N samples. weight: (N,), see `kalman.Measurements`. prior_known: (N,) bool, whether prior sway and
-        heave were known at the sample; models that need them skip it where not."""
+        """Return the measurements of a block of N samples. weight: (N,), see `kalman.Measurements`.
+
+        prior_known: (N,) bool, prior sway and heave were known; models that need them skip other samples.
+        """
         k, n_samples = len(self.models), len(seen.velocity_dvl)
-        # in memory each element's samples follow each other, as the batch works on them
+        # samples are contiguous in memory for the batch
         z = np.empty((self._m, k, n_samples)).transpose(1, 2, 0)
         h = np.zeros((self._m, self._n, k, n_samples)).transpose(2, 3, 0, 1)
         for index, model in enumerate(self.models):
@@ -72,14 +74,17 @@ class Assembler:
         return kalman.Measurements(z, h, noise, own_weight, usable, gate)
 
     def rows_left(self, unmeasured: Unmeasured) -> Array:
-        """Rows that each model is told by each sample (K, N)."""
+        """Return the number of measured rows per model and sample (K, N)."""
         dropped = [_dropped_axes(model, unmeasured).sum(axis=1) for model in self.models]
         return self._m - np.array(dropped, dtype=float)
 
     def _drop_unmeasured(
         self, z: Array, h: Array, noise: Array, seen: Observations, unmeasured: Unmeasured
     ) -> tuple[Array, Array]:
-        """R (K, N, 3, 3) and gate (K, N), with z and H turned into the reference's frame, unmeasured rows taken out."""
+        """Rotate z and H to the frame of the reference and remove unmeasured rows.
+
+        Return R (K, N, 3, 3) and gate (K, N).
+        """
         k, n_samples = z.shape[:2]
         noise = np.broadcast_to(noise, (k, n_samples, 3, 3)).copy()
         gate = np.repeat(self._gate, n_samples, axis=1)
@@ -99,7 +104,7 @@ class Assembler:
 
 
 def _floor(model: Model, parameters: Parameters) -> Array | None:
-    """Covariance (n, n) that no data take away: of `Model.sideslip_std`, about the body's z; None for none."""
+    """Return the covariance (n, n) of `Model.sideslip_std` about body z, which no data reduce; None without."""
     if not model.sideslip_std:
         return None
     along = np.zeros(model.n_state)
@@ -108,44 +113,43 @@ def _floor(model: Model, parameters: Parameters) -> Array | None:
 
 
 def _without(floor: Array | None, state: GaussianState) -> GaussianState:
-    """What a filter starts from: what its data can never take away is added to what comes out of it."""
+    """Return the initial state without the floor, which is added to the output."""
     if floor is None:
         return state
     p = state.p - floor
-    # a state that is not of this model may claim to be better
+    # a state of another model may have a smaller covariance
     return GaussianState(state.x, p) if np.linalg.eigvalsh(p)[0] > 0.0 else state
 
 
 def _dropped_axes(model: Model, unmeasured: Unmeasured) -> Mask:
-    """(N, 3) axes of the reference's frame that a model would need, and that are not measured."""
+    """Return a mask (N, 3) of reference axes that a model needs but that are not measured."""
     needed = (model.aided, model.aided, model.vertical_from_reference)
     dropped: Mask = unmeasured.axes & needed
     return dropped
 
 
-# A prior σ of zero, as of an exact heading, is this: nothing is known with infinite information.
+# Smallest prior σ: zero, as for an exact heading, would be infinite information.
 LEAST_STD = 1e-7
 
 
 def prior(model: Model, parameters: Parameters) -> GaussianState:
-    """Zero errors with the prior standard deviations of the parameters."""
+    """Return zero errors with the prior standard deviations of the parameters."""
     std = [parameters.initial_std_misalignment] * 3 + [parameters.initial_std_scale] * (model.n_errors - 3)
     std += [getattr(parameters, each.std) if isinstance(each.std, str) else each.std for each in model.nuisance]
     return GaussianState(np.zeros(model.n_state), np.diag(np.square(np.maximum(std, LEAST_STD))))
 
 
 def gate_of(rows: float, parameters: Parameters) -> float:
-    """Largest νᵀS⁻¹ν of so many rows that is used: the chi-square quantile, inf for no gate."""
+    """Return the largest accepted νᵀS⁻¹ν of a number of rows: the chi-square quantile, inf without gate."""
     gated = 1.0 - parameters.gate_probability
     return chi2_isf(gated, rows) if 0.0 < gated < 1.0 else float("inf")  # after rounding
 
 
 def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float = 0.99) -> tuple[float, float]:
-    """Two-sided bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter. rows: of a sample, on average.
+    """Return two-sided bounds of the mean νᵀS⁻¹ν over `used` samples of a consistent filter. rows: mean per sample.
 
-    Gated samples are not in the mean, so it is that of a chi-square variable cut off at the gate:
-    E[qʲ | q <= g] = m (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal. Zero where references
-    measured no axis.
+    The mean excludes gated samples, so it is that of a chi-square variable truncated at the gate: E[qʲ | q <= g] = m
+    (m+2) ... (m+2j-2) F_{m+2j}(g) / F_m(g). The mean of many is near normal. Zero if references measured no axis.
     """
     if rows <= 0.0:
         return 0.0, 0.0
@@ -153,5 +157,5 @@ def nis_bounds(rows: float, parameters: Parameters, used: int, confidence: float
     inside = chi2_cdf(gate, m)
     mean = m * chi2_cdf(gate, m + 2) / inside
     variance = m * (m + 2) * chi2_cdf(gate, m + 4) / inside - mean**2
-    half = math.sqrt(chi2_isf(1.0 - confidence, 1.0) * variance / max(used, 1))  # as many σ as a normal one's
+    half = math.sqrt(chi2_isf(1.0 - confidence, 1.0) * variance / max(used, 1))  # normal quantile
     return mean - half, mean + half

@@ -1,12 +1,10 @@
-"""Whether the headings so far tell a current from a misalignment, for a model that needs attitude and no reference.
+"""Separability of current and misalignment by the headings so far, for models with attitude and no reference.
 
-Sway over ground is that of a misalignment, u φ_z with speed u ahead, plus that of a current c, which turns with the
-heading: (Rᵀc)_y. On one heading the two are the same to the data; over several, least squares on (φ_z, c) alone says
-by its covariance whether they come apart. It is A1's without all else that A1 estimates, and with a current ten times
-as strong as expected, so that no prior stands in for a heading.
+Sway is u φ_z + (Rᵀc)_y, with speed u ahead and a current c that rotates with the heading. The covariance of least
+squares on (φ_z, c) shows whether several headings separate the two. The prior current is ten times the expected one, so
+that headings decide and not the prior.
 
-And whether the vehicle is trimmed: a model without attitude takes the heave in the body of one that holds its depth
-with its bow up for none, and makes a pitch of it.
+The trim is tested, too: a model without attitude takes the body heave of a trimmed vehicle at constant depth for pitch.
 """
 
 from __future__ import annotations
@@ -20,20 +18,20 @@ from ..numerics.frames import Array
 from ..numerics.samples import Mask, Stamps
 from ..streams.stream_order import LONG_AGO_NS
 
-# Judged once in so long, by stamps: whoever feeds samples in blocks comes to the same answer.
+# Interval of the test, ns, by stamps, so that it does not depend on the block size.
 EVERY_NS = 10_000_000_000
-# Of what is expected of a current, so that it is headings and not the prior that show the mounting.
+# Prior current as a multiple of `current_std`, so that headings decide and not the prior.
 STRONGER = 10.0
-# The angle is told from the current once its σ is below this share of the prior's, as for what is observed.
+# The angle is observable once its σ is below this share of the prior, as in observability.py.
 SHOWN_SHARE = 0.5
-# So much mean heave of a level path, of its prior, over so many periods, is a trim.
+# A vehicle is trimmed from this mean level-path heave, in prior σ, over this many intervals.
 TRIMMED_FROM, TRIMMED_PERIODS = 2.0, 6
-# Sway that a turn leaves, s: m/s per (rad/s of turn times m/s of speed); a turning sample says little of a current.
+# σ of the sway in turns, s: m/s per (rad/s of turn times m/s of speed).
 TURN_SWAY_STD_S = 1.0
 
 
 class Headings:
-    """Sums over samples with attitude."""
+    """Sums over samples with attitude. shown: the current, or the trim, is observable. trimmed: the trim is."""
 
     def __init__(self, parameters: Parameters) -> None:
         angle, current = parameters.initial_std_misalignment, STRONGER * parameters.current_std
@@ -43,16 +41,16 @@ class Headings:
         self._least_heave = TRIMMED_FROM * parameters.heave_offset_std
         self._heave, self._periods, self._n = 0.0, 0, 0
         self.shown = self.trimmed = False
-        self._next_ns = LONG_AGO_NS  # from here on they are judged again
+        self._next_ns = LONG_AGO_NS  # stamp of the next test
 
     def waits_for(self, stamp_ns: int) -> bool:
-        """Whether a row of this stamp is one at which the samples before it are to be judged."""
+        """Return whether a row with this stamp triggers a test of the samples before it."""
         return stamp_ns >= self._next_ns
 
     def add(self, stamps_ns: Stamps, oriented: Mask, seen: Observations | None) -> int | None:
-        """Take rows that are decided (N,), of which M are oriented (N,) and are those of `seen` (M), None if none.
+        """Add decided rows (N,), of which M are oriented (N,) and have observations `seen` (M), None if none.
 
-        Returns the stamp of the row by which the current, or the trim, was shown, the first time; else None.
+        Return the stamp of the row at which the current, or the trim, first becomes observable; else None.
         """
         if self.shown:
             return None
@@ -77,12 +75,12 @@ class Headings:
         return None
 
     def end_day(self) -> None:
-        """Go on with what is known of the angle; the current is another one."""
+        """Keep the information on the angle for the next recording, and reset the current."""
         angle_std = np.sqrt(np.linalg.inv(self._information)[0, 0])
         self._information = np.diag([angle_std**-2, self._current_std**-2, self._current_std**-2])
 
     def _told(self, seen: Observations) -> Array:
-        """Information (M, 3, 3) on φ_z (rad) and the current east and north (m/s)."""
+        """Return the information (M, 3, 3) on φ_z (rad) and the current east and north (m/s)."""
         rotation, rates, ahead = seen.rotation_enu_from_body, seen.angular_velocity, seen.velocity_in_body[:, 0]
         assert rotation is not None and rates is not None
         h = np.column_stack([ahead, rotation[:, 0, 1], rotation[:, 1, 1]])
@@ -91,7 +89,7 @@ class Headings:
         return told
 
     def _level_heave(self, seen: Observations) -> Array:
-        """Heave in the body (M,) m/s of a vehicle that holds its depth with the pitch that it has."""
+        """Return the body heave (M,) m/s of a vehicle at constant depth with its pitch."""
         assert seen.rotation_enu_from_body is not None
         up = seen.rotation_enu_from_body[:, 2]
         upright, ahead = np.abs(up[:, 2]) > UPRIGHT, seen.velocity_in_body[:, 0]

@@ -1,4 +1,4 @@
-"""What the data has shown so far: per parameter, what is still missing, and how far the calibration is."""
+"""Observability of the parameters by the data so far, missing motions, and convergence."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from .filter_setup import prior
 
-# A parameter counts as observed once the data has halved its prior standard deviation: it then holds three times the
-# information of the prior.
+# Largest share of the prior σ of an observable parameter: its data then hold three times the prior information.
 OBSERVED_SHARE = 0.5
-# A DVL axis with more than this share of the motion ahead has its scale shown by it.
+# Share of the motion ahead along a DVL axis from which that motion determines its scale.
 SHARE_AHEAD = 0.25
-# From here on a lever arm (m) and a delay (s) are fine: 5 cm at 10 degrees per second are 9 mm/s, 10 ms at 1 m/s² 10.
+# σ of a fine lever arm (m) and delay (s): 5 cm at 10 degrees per second are 9 mm/s, 10 ms at 1 m/s² 10.
 FINE_STD = {"m": 0.05, "s": 0.01}
 _BODY_AXES = ("roll", "pitch", "yaw")
-# What roll and pitch need of a reference; nothing is claimed of them without.
+# Requirement of roll and pitch on a reference.
 MEASURES_VERTICAL = "a reference that measures the vertical velocity"
 
 
 class Convergence(Enum):
-    """How far a calibration is."""
+    """Progress of a calibration."""
 
     COLLECTING = "collecting"
     COARSE = "coarse"
@@ -34,12 +33,11 @@ class Convergence(Enum):
 
 
 class Observability(NamedTuple):
-    """One parameter of one model.
+    """Observability of one parameter of one model.
 
-    std: standard deviation (rad, dimensionless, m or s). observed: the data has halved the prior's. axis: the body axis
-    (roll, pitch, yaw) that an angle's uncertainty turns about, scale (across), or the name in words. missing: what to
-    do, '' once observed. progress: share of the way from the prior's standard deviation (0) to the fine threshold (1),
-    by its logarithm.
+    std: standard deviation (rad, dimensionless, m or s). observed: the data halved the prior σ. axis: the body axis
+    (roll, pitch, yaw) of an angle's uncertainty, scale (across), or the name in words. missing: required motion, ''
+    once observed. progress: logarithmic share of the way from the prior σ (0) to the fine threshold (1).
     """
 
     name: str
@@ -53,12 +51,12 @@ class Observability(NamedTuple):
 def observability(
     model: Model, covariance: Array, parameters: Parameters, tilt_needs: str = ""
 ) -> tuple[Observability, ...]:
-    """One entry per error of the DVL that the model estimates, and lever arm and delay, from its covariance (n, n).
+    """Return one entry per DVL error of a model, lever arm and delay, from its covariance (n, n).
 
-    tilt_needs: what roll and pitch lack where that is no motion.
+    tilt_needs: requirement of roll and pitch other than motion.
 
-    What the data lacks is a motion of the vehicle, so the cause is looked for in the body frame: with a DVL mounted
-    at 45 degrees, a straight leg leaves φx and φy uncertain together, and both for want of roll.
+    The missing motion is found in the body frame: with a DVL at 45 degrees, φx and φy both stay uncertain after a
+    straight leg, because roll is not observable.
     """
     prior_std = np.sqrt(np.diag(prior(model, parameters).p))
     in_body = body_angle_std(covariance, parameters)
@@ -75,7 +73,7 @@ def observability(
         missing = "" if observed else tilt_needs if tilt_needs and axis in _BODY_AXES[:2] else model.shown_by[axis]
         entries.append(Observability(name, std, observed, axis, missing, _progress(std, prior_std[index], fine_std)))
     for index, name in enumerate(model.state_names[model.n_errors :], start=model.n_errors):
-        if name in model.shown_by:  # no mere nuisance
+        if name in model.shown_by:  # published nuisance state
             std = math.sqrt(covariance[index, index])
             observed = bool(std <= OBSERVED_SHARE * prior_std[index])
             missing = "" if observed else model.shown_by[name]
@@ -91,20 +89,20 @@ def _progress(std: float, prior_std: float, fine_std: float) -> float:
 
 
 def body_angle_std(covariance: Array, parameters: Parameters) -> Array:
-    """Standard deviations (3,) rad of the misalignment about the body's axes: roll, pitch, yaw."""
+    """Return the σ (3,) rad of the misalignment about the body axes: roll, pitch, yaw."""
     t = parameters.rotation_dvl_from_body
     return np.sqrt(np.diag(t.T @ covariance[:3, :3] @ t))
 
 
 def _scale_axis(model: Model, index: int, parameters: Parameters) -> str:
-    """Whether a scale state is that of motion ahead or across the bow."""
+    """Return whether motion ahead or across the bow determines a scale state."""
     axes = [axis for axis in range(3) if model.error_terms_from_state[3 + axis, index]]
     ahead = parameters.rotation_dvl_from_body[axes, 0] ** 2
     return "scale" if ahead.sum() > SHARE_AHEAD else "scale across"
 
 
 def scale_std_ahead(model: Model, covariance: Array, parameters: Parameters) -> Array:
-    """Standard deviation of the scale-factor error of motion ahead: one number, or none if the model has no scale.
+    """Return the σ of the scale-factor error for motion ahead, (1,); (0,) without scale.
 
     A velocity along n (body x in the DVL frame) is measured too long by nᵀ diag(δk) n.
     """
@@ -115,10 +113,10 @@ def scale_std_ahead(model: Model, covariance: Array, parameters: Parameters) -> 
 
 
 def convergence(model: Model, covariance: Array, parameters: Parameters) -> Convergence:
-    """How far a model is. fine: an angle is observed, every observed angle and the scale are below their thresholds.
+    """Return the convergence of a model. Fine: an angle is observed; observed angles and scale are below thresholds.
 
-    Angles are those about the body's axes, which are what a motion shows or does not show. The scale is that of motion
-    ahead: scales of other axes may never be seen.
+    Angles are about body axes, the ones a motion makes observable. The scale is that for motion ahead, because other
+    axes may never be observable.
     """
     angles = body_angle_std(covariance, parameters)
     scales = scale_std_ahead(model, covariance, parameters)

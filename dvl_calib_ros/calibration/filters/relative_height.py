@@ -1,4 +1,4 @@
-"""Height since the last dropout, by the DVL's own vertical velocity: what a current changes with."""
+"""Height since the last dropout, integrated from the DVL's vertical velocity, for the shear of a current."""
 
 from __future__ import annotations
 
@@ -9,22 +9,21 @@ import numpy as np
 from ..numerics.frames import Array
 from ..numerics.samples import Stamps
 
-# What was so long ago is forgotten, s: a pitch that is wrong by 3 degrees adds up to 10 m at 2 m/s, and stays there,
-# where a model takes it for a part of its constant current.
+# Memory of the integral, s: a pitch error of 3 degrees adds 10 m at 2 m/s, which looks like a constant current.
 MEMORY_S = 100.0
-# Between samples further apart than this, s, nobody knows how far it rose or sank.
+# Longest gap that is integrated, s.
 LONGEST_STEP_S = 5.0
 
 
 class RelativeHeight:
-    """Integrates the vertical velocity sample by sample, so that it does not matter in what blocks they come."""
+    """Integrator of the vertical velocity, per sample, independent of the block size."""
 
     def __init__(self) -> None:
         self._height = 0.0
         self._last_ns: int | None = None
 
     def add(self, stamps_ns: Stamps, rising: Array) -> Array:
-        """Heights (N,) m after further samples. rising: (N,) m/s, positive up."""
+        """Add vertical velocities (N,) m/s, positive up. Return heights (N,) m."""
         height, last_ns = self._height, self._last_ns
         heights = np.empty(len(rising))
         for row, (stamp_ns, speed) in enumerate(zip(stamps_ns.tolist(), rising.tolist(), strict=True)):
@@ -39,5 +38,5 @@ class RelativeHeight:
         return heights
 
     def end_day(self) -> None:
-        """Forget all of it."""
+        """Reset the height."""
         self._height, self._last_ns = 0.0, None

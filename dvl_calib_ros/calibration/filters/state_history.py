@@ -1,4 +1,4 @@
-"""The models' states over time, thinned so that a run of any length fits in memory."""
+"""History of the model states, thinned to constant memory."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Counts = NDArray[np.int64]
 
 
 class Standing(NamedTuple):
-    """K models after E rows: x (E, K, n), P (E, K, n, n) as the filter has them; used, nis_sum (E, K) so far."""
+    """K models after E rows: x (E, K, n), P (E, K, n, n) of the filter; used, nis_sum (E, K) so far."""
 
     x: Array
     p: Array
@@ -25,21 +25,21 @@ class Standing(NamedTuple):
     nis_sum: Array
 
     def row(self, index: int) -> Standing:
-        """One of the rows, still as E = 1."""
+        """Return one row, as E = 1."""
         at = slice(index, index + 1)
         return Standing(self.x[at], self.p[at], self.used[at], self.nis_sum[at])
 
     @staticmethod
     def joined(rows: Sequence[Standing]) -> Standing:
-        """Rows one after the other."""
+        """Return concatenated rows."""
         x, p, used, nis_sum = zip(*rows, strict=True)
         return Standing(np.concatenate(x), np.concatenate(p), np.concatenate(used), np.concatenate(nis_sum))
 
 
 class StateTrace:
-    """States after every stride-th DVL sample in order; the stride doubles when there are too many.
+    """States after every stride-th DVL sample in order; the stride doubles when the limit is exceeded.
 
-    limit: rows kept at most. expected: how many DVL samples there will be, as far as it is known.
+    limit: most rows. expected: number of DVL samples, if known.
     """
 
     def __init__(self, limit: int, expected: int = 0) -> None:
@@ -48,16 +48,16 @@ class StateTrace:
         self.start(())
 
     def start(self, groups: Iterable[Hashable]) -> None:
-        """Start anew, with these groups of models."""
+        """Restart with these groups of models."""
         self._stride = max(1, -(-self._expected // self._limit))
         self._kept: dict[Hashable, dict[int, Standing]] = {group: {} for group in groups}
 
     def wanted(self, first: int, end: int) -> Numbers:
-        """Those of the rows first .. end - 1 after which states are wanted."""
+        """Return the rows among first .. end - 1 after which states are stored."""
         return np.arange(-(-first // self._stride) * self._stride, end, self._stride)
 
     def add(self, numbers: Numbers, group: Hashable, after: Standing) -> None:
-        """Take the states of a group's models after rows (E)."""
+        """Add the states of a group after rows (E)."""
         kept = self._kept[group]
         for index, number in enumerate(numbers.tolist()):
             kept[number] = after.row(index)
@@ -68,10 +68,10 @@ class StateTrace:
                     del each[number]
 
     def numbers(self) -> Numbers:
-        """The rows (E) after which all models' states are known."""
+        """Return the rows (E) with states of all models."""
         common = set.intersection(*(set(each) for each in self._kept.values()))
         return np.array(sorted(number for number in common if number % self._stride == 0), dtype=np.int64)
 
     def standing(self, group: Hashable, numbers: Numbers) -> Standing:
-        """The states of a group's models after these rows."""
+        """Return the states of a group after these rows."""
         return Standing.joined([self._kept[group][number] for number in numbers.tolist()])

@@ -1,7 +1,7 @@
-"""The calibration models as data (models.md, "The models").
+"""Calibration models as data (docs/models.md, "The models").
 
-A model is one entry of a table, in `published`, `own` or another package (`plugins`); nothing
-outside its definition branches on its name. What an entry says is `base.Model`.
+A model is one `base.Model` entry of `published`, `own` or another package (`plugins`). No other code branches on its
+name.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ __all__ = [
 _OWN = {model.name: model for model in (*PUBLISHED, FULL, *WITHOUT_REFERENCE, D1)}
 _PLUGGED, _PROBLEMS = plugged_models(_OWN)
 MODELS: Mapping[str, Model] = _OWN | _PLUGGED
-# What is wrong with models of other packages that cannot be used.
+# Why models of other packages cannot be used.
 BROKEN: tuple[str, ...] = tuple(_PROBLEMS)
-# Those that are filtered sample by sample.
+# Models of the linear filter, updated per sample.
 LINEAR_MODELS: tuple[Model, ...] = tuple(model for model in MODELS.values() if not model.estimator)
-# The model that takes another's place once headings show the current, by the name of that.
+# Replacement of a model once the headings make the current observable, by the name of the replaced model.
 WITH_HEADINGS: Mapping[str, str] = {
     model.instead_of: name for name, model in MODELS.items() if model.instead_of is not None
 }
-# The model that goes by positions; '' for none.
+# Name of the model that uses positions, or ''.
 WITH_POSITIONS: str = next((name for name, model in MODELS.items() if model.from_positions), "")
-# Those that go by velocities, or by none.
+# Models that use velocities or no reference.
 BY_VELOCITY: tuple[str, ...] = tuple(name for name, model in MODELS.items() if not model.from_positions)

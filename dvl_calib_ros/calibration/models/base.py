@@ -1,7 +1,6 @@
-"""A calibration model and its observations: linear in its state, ``z = H x + noise``.
+"""Calibration models and their observations: linear in the state, ``z = H x + noise``.
 
-The residual misalignment φ (DVL frame, rad) comes first, its scale-factor errors after, and last what the model must
-know to see them (nuisance states, such as a current).
+State order: residual misalignment φ (DVL frame, rad), scale-factor errors, nuisance states (such as a current).
 """
 
 from __future__ import annotations
@@ -27,20 +26,20 @@ Linearised = tuple[Array, Array]
 
 
 class Needs(Enum):
-    """What a sample must come with, beside the DVL's velocity, for a model to use it."""
+    """Input that a model requires of each sample in addition to the DVL velocity."""
 
-    __hash__ = object.__hash__  # Enum's own is slow, and asked for with every live sample
+    __hash__ = object.__hash__  # Enum.__hash__ is slow and runs for every live sample
     NOTHING = "nothing"
     REFERENCE = "reference velocity"
     ATTITUDE = "attitude and angular velocity"
 
 
 class Nuisance(NamedTuple):
-    """A state that is estimated only because it would else be taken for misalignment or scale.
+    """State that is estimated only to keep its effect out of misalignment and scale.
 
-    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. of_the_day: another on
-    another day. handed_on: gone on with from a result file all the same, as a node that is started again is on the same
-    day more often than not, and has found it by much data.
+    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. of_the_day: the value
+    differs per recording. handed_on: a result file passes it on as a prior, even if it differs per recording, because a
+    restarted node usually continues the same recording.
     """
 
     name: str
@@ -52,22 +51,20 @@ class Nuisance(NamedTuple):
 
 @dataclass(frozen=True)
 class Model:
-    """One calibration model.
+    """Calibration model: required input, measurement equation, states and filter options.
 
-    linearise: observations -> z (N, m), H (N, m, n). shown_by: what lets it see roll, pitch, yaw and scale, for the
-    operator. assumes, wrong_when: for the documentation. scale_axes: for every scale state its name and the DVL axes
-    it acts on. needs_prior: True if it uses prior sway and heave.
+    linearise: observations -> z (N, m), H (N, m, n). shown_by: for the operator, the motion that makes roll, pitch, yaw
+    and scale observable. assumes, wrong_when: for the documentation. scale_axes: name of each scale state and the DVL
+    axes that it acts on. needs_prior: uses prior sway and heave.
 
-    What a model may change of how it is filtered: noise: observations -> its own R (N or 1, 3, 3) (m/s)², of which a
-    model with fewer rows uses the first ones; None: `Observations.noise`. vertical_from_reference: it takes the
-    reference's vertical velocity for a measurement, so does without where there is none (M3 and M4 assume their own).
-    motion_is_noise: its noise is the
-    vehicle's motion, so samples count by `Observations.motion_weight`. estimator: "module:class" of the `Estimator`
-    that finds its states, '' for the linear filter.
-    sideslip_std: σ (rad) about the body's yaw axis that no data of this model can take away, and that is in its P; 0
-    for none. uses_height: it wants `Observations.height`. instead_of: the model that `auto` leaves for this one once
-    headings show the current (heading_diversity.py). from_positions: it goes by positions, not by velocities made of
-    them; `auto` takes it where these are too noisy.
+    Filter options. noise: observations -> R (N or 1, 3, 3) (m/s)², of which a model with fewer rows uses the first
+    ones; None: `Observations.noise`. motion_is_noise: vehicle motion is the noise, so samples have the weight
+    `Observations.motion_weight`. vertical_from_reference: uses the vertical velocity of the reference as a measurement.
+    estimator: "module:class" of its `Estimator`, '' for the linear filter. sideslip_std: σ (rad) about the body's yaw
+    axis that P includes because no data of this model reduce it; 0: none. uses_height: uses `Observations.height`.
+    instead_of: the model that `auto` replaces with this one once the headings make the current observable
+    (heading_diversity.py). from_positions: uses positions instead of velocities derived from them; `auto` selects it
+    where the derived velocities are too noisy.
     """
 
     name: str
@@ -91,12 +88,12 @@ class Model:
 
     @property
     def aided(self) -> bool:
-        """Whether it needs a reference: velocities, or positions."""
+        """True if the model needs a reference (velocities or positions)."""
         return self.needs is Needs.REFERENCE or self.from_positions
 
     @property
     def n_errors(self) -> int:
-        """Number of states that are errors of the DVL: misalignment and scale."""
+        """Number of DVL error states: misalignment and scale."""
         return 3 + len(self.scale_axes)
 
     @cached_property
@@ -112,12 +109,12 @@ class Model:
 
     @cached_property
     def of_day(self) -> NDArray[np.intp]:
-        """Which states (u,) are of the day (`Nuisance.of_the_day`)."""
+        """Indices (u,) of the states that differ per recording (`Nuisance.of_the_day`)."""
         return self._nuisance_that(lambda each: each.of_the_day)
 
     @cached_property
     def not_handed_on(self) -> NDArray[np.intp]:
-        """Which states (u,) are not gone on with from a result file (`Nuisance.handed_on`)."""
+        """Indices (u,) of the states that a result file does not pass on (`Nuisance.handed_on`)."""
         return self._nuisance_that(lambda each: not each.handed_on)
 
     def _nuisance_that(self, is_so: Callable[[Nuisance], bool]) -> NDArray[np.intp]:
@@ -125,7 +122,7 @@ class Model:
 
     @cached_property
     def error_terms_from_state(self) -> Array:
-        """(6, n) matrix that takes the state to φ (3) and δk per axis (3)."""
+        """Matrix (6, n) from the state to φ (3) and δk per axis (3)."""
         matrix = np.zeros((6, self.n_state))
         matrix[:3, :3] = np.eye(3)
         for column, (_, axes) in enumerate(self.scale_axes, start=3):
@@ -133,7 +130,7 @@ class Model:
         return matrix
 
 
-# What lets models see roll, pitch, yaw and scale, for the operator: with GNSS, and without.
+# For the operator: the motion that makes roll, pitch, yaw and scale observable, with and without GNSS.
 SHOWN_WITH_GNSS = {
     "roll": "motion across the bow: turns, a box or a figure eight",
     "pitch": "motion ahead: a straight leg at 1 m/s or more",
@@ -154,7 +151,7 @@ _UNIT_NOISE: Array = np.eye(3)[None]
 
 
 class Assumptions(NamedTuple):
-    """What the models beyond the paper take for granted of a vehicle's motion; each is a parameter, see there.
+    """Assumed vehicle motion of F1 and A1; each field is a parameter.
 
     motion_std, heave_offset_std, current_std: m/s. motion_correlation_time: s.
     """
@@ -171,7 +168,7 @@ ASSUMPTIONS = Assumptions()
 class Unmeasured(NamedTuple):
     """Axes that a reference velocity does not measure.
 
-    axes: (N, 3) of the reference's own frame. rotation_reference_from_body: (N, 3, 3) into that frame.
+    axes: (N, 3) in the frame of the reference. rotation_reference_from_body: (N, 3, 3).
     """
 
     axes: Mask
@@ -179,7 +176,7 @@ class Unmeasured(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """r = T (g + ω×l) (N, 3) m/s in the DVL frame, and [r×] (N, 3, 3)."""
+    """Reference velocity r = T (g + ω×l) (N, 3) m/s in the DVL frame, and [r×] (N, 3, 3)."""
 
     r: Array
     skew: Array
@@ -187,19 +184,17 @@ class Reference(NamedTuple):
 
 @dataclass(frozen=True)
 class Observations:
-    """A block of N synchronised samples, everything a model may use.
+    """Block of N synchronised samples with everything a model may use; derived quantities are computed once.
 
-    velocity_dvl: (N, 3) m/s measured, DVL frame. reference_body: (N, 3) m/s GNSS velocity of the reference point in
-    the body frame, None where the block has none. lever_velocity: (N, 3) m/s, ω×l of the DVL in the body frame, zero
-    where unknown, None without a lever arm. rotation_dvl_from_body: T (3, 3). sway_heave: (2,) m/s prior sway and
-    heave, body frame. noise: R (N or 1, 3, 3) (m/s)² of the measurement, DVL frame. rotation_enu_from_body:
-    (N, 3, 3), and angular_velocity: (N, 3) rad/s in the body frame, None where the block has no attitude. interval:
-    (N,) s since the DVL sample before. unmeasured: axes of the reference that hold what the DVL measures, by the
-    nominal mounting, for want of a measurement; None if it measures all. earth_in_body: (N, 3, 2) east and north as
-    columns in the body frame where the reference is in an earth frame, along which it may be wrong constantly; zeros
-    where it is in the body frame; None if all are.
-
-    What several models derive from these is computed once.
+    velocity_dvl: (N, 3) m/s measured, DVL frame. reference_body: (N, 3) m/s reference velocity of the reference point,
+    body frame; None without a reference. lever_velocity: (N, 3) m/s, ω×l of the DVL, body frame, zero where unknown;
+    None without a lever arm. rotation_dvl_from_body: T (3, 3). sway_heave: (2,) m/s prior sway and heave, body frame.
+    noise: R (N or 1, 3, 3) (m/s)² of the measurement, DVL frame. rotation_enu_from_body: (N, 3, 3), and
+    angular_velocity: (N, 3) rad/s, body frame; None without attitude. interval: (N,) s since the previous DVL sample.
+    unmeasured: axes of the reference that hold the DVL's own velocity (nominal mounting) because they are not measured;
+    None if all are measured. earth_in_body: (N, 3, 2) east and north as columns in the body frame, the axes of a
+    constant error of an earth-frame reference; zeros for samples with a body-frame reference, None if all have one.
+    height: (N,) m since the last dropout, None unless the model uses it.
     """
 
     velocity_dvl: Array
@@ -218,16 +213,16 @@ class Observations:
 
     @cached_property
     def reference(self) -> Reference:
-        """The reference velocity as it is."""
-        assert self.reference_body is not None  # the bank gives aided models paired blocks only
+        """Reference velocity in the DVL frame."""
+        assert self.reference_body is not None  # the filter bank passes only paired blocks to aided models
         return self._reference(self.reference_body)
 
     @cached_property
     def reference_without_heave(self) -> Reference:
-        """The reference velocity with its heave set to zero.
+        """Reference velocity with zero heave in the body frame.
 
-        In the body frame, before T: it is the vehicle, not the instrument, that does not heave. For a mounting turned
-        about z only this is the paper's r_z := 0; for a tilted one r_z := 0 would undo the known tilt.
+        For a mounting rotated about z only this is the paper's r_z := 0. For a tilted one r_z := 0 in the DVL frame
+        would undo the known tilt.
         """
         assert self.reference_body is not None
         return self._reference(self.reference_body * _HORIZONTAL)
@@ -240,32 +235,32 @@ class Observations:
 
     @cached_property
     def velocity_at_reference(self) -> Array:
-        """Measured velocity moved to the reference point (N, 3) m/s, DVL frame."""
+        """Measured velocity (N, 3) m/s at the reference point, DVL frame."""
         if self.lever_velocity is None:
             return self.velocity_dvl
         return self.velocity_dvl - self.lever_velocity @ self.rotation_dvl_from_body.T
 
     @cached_property
     def velocity_in_body(self) -> Array:
-        """Tᵀv: measured velocity at the reference point, turned by the nominal mounting (N, 3) m/s, body frame."""
+        """Measured velocity Tᵀv (N, 3) m/s at the reference point, body frame by the nominal mounting."""
         return self.velocity_at_reference @ self.rotation_dvl_from_body
 
     @cached_property
     def rising(self) -> Array:
-        """Measured vertical velocity (N,) m/s, positive up, of a block with attitude."""
+        """Measured vertical velocity (N,) m/s, positive up; needs attitude."""
         assert self.rotation_enu_from_body is not None
         up: Array = (self.rotation_enu_from_body[:, 2] * self.velocity_in_body).sum(axis=1)
         return up
 
     @cached_property
     def speed(self) -> Array:
-        """Measured speed at the reference point (N,) m/s."""
+        """Measured speed (N,) m/s at the reference point."""
         v = self.velocity_at_reference
         return np.sqrt((v * v).sum(axis=1))
 
     @cached_property
     def speed_and_prior(self) -> Array:
-        """(‖v‖, s, h): measured speed ahead, prior sway and heave (N, 3) m/s, body frame."""
+        """Expected velocity (‖v‖, s, h) (N, 3) m/s, body frame: measured speed ahead, prior sway and heave."""
         expected = np.empty((len(self.speed), 3))
         expected[:, 0] = self.speed
         expected[:, 1:] = self.sway_heave
@@ -273,35 +268,35 @@ class Observations:
 
     @cached_property
     def body_from_measured(self) -> Array:
-        """Tᵀ[v×] (N, 3, 3): how the measured velocity turns in the body frame."""
+        """Tᵀ[v×] (N, 3, 3): derivative of the body-frame velocity with respect to φ."""
         return np.matmul(self.rotation_dvl_from_body.T, skew(self.velocity_at_reference))
 
     @cached_property
     def noise_in_body(self) -> Array:
-        """Tᵀ R T (N or 1, 3, 3) (m/s)²."""
+        """Measurement noise Tᵀ R T (N or 1, 3, 3) (m/s)², body frame."""
         noise: Array = self.rotation_dvl_from_body.T @ self.noise @ self.rotation_dvl_from_body
         return noise
 
     @cached_property
     def measured_in_body(self) -> Array:
-        """(N or 1, 3) 1 for the axes of the body along which the reference measures, 0 for the others."""
+        """Indicator (N or 1, 3): 1 for body axes along which the reference measures, else 0."""
         if self.unmeasured is None:
             return np.ones((1, 3))
         axes, turned = self.unmeasured
-        # an axis of the earth counts for the axis of the body that is nearest to it
+        # an earth axis is assigned to the nearest body axis
         along = np.einsum("nai,na->ni", turned**2, axes.astype(float))
         measured: Array = (along < 0.5).astype(float)
         return measured
 
     @cached_property
     def motion_weight(self) -> Array:
-        """(N,) share of its own information that a sample adds where the vehicle's motion is the noise.
+        """Information weight (N,) of samples whose noise is the motion of the vehicle.
 
-        Sway and heave wander: with a correlation time τ, samples Δt apart hold Δt / 2τ of independent ones (the
-        integrated autocorrelation of exp(-|t|/τ)), so σ does not shrink with the DVL's rate.
+        Sway and heave are correlated over τ: samples Δt apart hold Δt / 2τ independent ones (integrated autocorrelation
+        of exp(-|t|/τ)), so σ does not shrink with the DVL's rate.
         """
         if self.interval is None:
             return np.ones(len(self.velocity_dvl))
         tau = self.assumptions.motion_correlation_time
-        # the first sample has no interval; nor may a weight be zero
+        # the first sample has no interval, and weights must be positive
         return np.clip(self.interval, 1e-3, 2.0 * tau) / (2.0 * tau) if tau > 0.0 else np.ones(len(self.interval))

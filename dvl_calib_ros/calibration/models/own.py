@@ -1,4 +1,4 @@
-"""Models of our own: F1, A1, and the entries of `full` and D1."""
+"""Models F1 and A1 (linear) and the entries of `full` and D1 (own estimators)."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ import numpy as np
 from ..numerics.frames import Array, skew, turned_skew
 from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuisance, Observations
 
-# Sway of a vehicle that turns unseen, m/s
+# Sway (m/s, 1 σ) of a vehicle whose turns are not measured
 UNSEEN_TURN_SWAY_STD = 0.1
 
 
 def _f1(seen: Observations) -> Linearised:
-    """z = (Tᵀv)_yz, H = [-(Tᵀ[v×])_yz, 1] on φ, s, h: sway and heave are unknown constants, not zeros.
+    """Linearise F1: z = (Tᵀv)_yz, H = [-(Tᵀ[v×])_yz, 1] on φ, s, h (docs/models.md, "F1").
 
-    (Tᵀ(v + [v×]φ))_y = s, (...)_z = h. Where M7 compares lengths, which feel a misalignment only to second order and
-    so find half of it, the direction of travel feels all of it; how much of the sway is taken for misalignment and
-    how much for current is what their prior variances say, (σ_φ ‖v‖)² against σ_c². Roll would show where sway and
-    heave vary together, but in turns they do so by themselves: of [v×] only the motion ahead is used.
+    Sway s and heave h are unknown constants. Their priors decide the share of sway assigned to misalignment: (σ_φ ‖v‖)²
+    against σ_c². Only the forward part of [v×] is used: in turns, sway and heave vary together and would look like
+    roll.
     """
     ahead = np.zeros_like(seen.velocity_in_body)
     ahead[:, 0] = seen.velocity_in_body[:, 0]
@@ -32,27 +31,25 @@ def _f1_noise(seen: Observations) -> Array:
     return np.diag([heave + UNSEEN_TURN_SWAY_STD**2, heave, 1.0])[None]
 
 
-# Sway and heave that a turn leaves beside what is in proportion to it, s: m/s per (rad/s of turn · m/s of speed).
-# On Snapir, vehicles skid by 1.8 s and leave a third of it unexplained.
+# Sway and heave noise in turns beyond the proportional skid, s: m/s per (rad/s of turn · m/s of speed). On Snapir the
+# skid is 1.8 s, and a third of it remains unexplained.
 TURN_SWAY_STD_S, TURN_HEAVE_STD_S = 1.0, 0.5
-# No vehicle swims exactly along its bow: by a bent fin, trim or the turn of its propeller it goes askew by so much, rad
-# (0.35 degrees), which without a reference nothing tells from a misalignment. Ten recordings of Snapir scatter by 0.35.
+# Steady sideslip (bent fin, trim, propeller torque), rad: 0.35 degrees. Without a reference it is not separable from
+# misalignment. Ten recordings of Snapir scatter by 0.35 degrees.
 SIDESLIP_STD = 0.006
-# By how much a current changes with depth, m/s per m: by as much as it is strong (`current_std`) over 20 m.
+# Shear of the current with depth, m/s per m: as large as `current_std` over 20 m.
 SHEAR_STD = 0.005
-# A vehicle more than this far from upright does not hold depth by its pitch.
+# Least vertical component of the body z axis at which a vehicle holds depth by its pitch (60 degrees of tilt).
 UPRIGHT = 0.5
 
 
 def _a1(seen: Observations) -> Linearised:
-    """Sway of a current and of turns, heave of a pitch: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h, s.
+    """Linearise A1: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h, s (docs/models.md, "A1").
 
-    (Tᵀ(v + [v×]φ))_y = (Rᵀ(c + s z))_y + b ω_z u: a current turns with the heading, a misalignment does not, so flying
-    several headings tells them apart; z is the height, by which the current changes; b is the skid in turns. On one
-    heading c and φ about z are the same to the data and their priors decide, as in F1.
-    (Tᵀ(v + [v×]φ))_z = (1 + d) e + h: e is the heave of a vehicle that holds its depth with this pitch and roll, the
-    vertical axis R's third row being n: n·v_b = 0. d = -1 is one that moves where it points; data with changing
-    pitch tells. R = rotation_enu_from_body, u the measured speed ahead.
+    (Tᵀ(v + [v×]φ))_y = (Rᵀ(c + s z))_y + b ω_z u: current c with shear s over height z, skid b in turns. On one heading
+    c and yaw are not separable, so their priors decide, as in F1. (Tᵀ(v + [v×]φ))_z = (1 + d) e + h: e is the heave of
+    a level path at this attitude, n·v_b = 0 with n the third row of R; d = -1 is a vehicle that moves where it points.
+    R = rotation_enu_from_body, u the measured speed ahead.
     """
     rotation, rates, v = seen.rotation_enu_from_body, seen.angular_velocity, seen.velocity_in_body
     assert rotation is not None and rates is not None
@@ -119,8 +116,8 @@ WITHOUT_REFERENCE = (
 )  # fmt: skip
 
 
-# The states of `full`: misalignment, scale, lever arm, bias of the DVL, deviation of the heading (one and two cycles);
-# and of each day: delays of DVL and reference, constant error of the reference.
+# States of `full`: misalignment, scale, lever arm, DVL bias, heading deviation (one and two cycles);
+# per recording: delays of DVL and reference, constant error of the reference.
 PHI, SCALE, LEVER_ARM, BIAS, HEADING = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11), slice(11, 15)
 DELAY, REFERENCE_DELAY, REFERENCE_ERROR = 15, 16, slice(17, 20)
 N_STATE = 20
@@ -133,7 +130,7 @@ def heading_cycles(rotation_enu_from_body: Array) -> Array:
 
 
 def linearise_full(seen: Observations) -> Linearised:
-    """z = g - T'v and H (N, 3, 20) of `full` at zero errors, body frame: what a motion would tell it."""
+    """Linearise `full` at zero errors: z = g - T'v (N, 3) and H (N, 3, 20), body frame."""
     assert seen.reference_body is not None
     body_from_dvl = seen.rotation_dvl_from_body.T
     h = np.zeros((len(seen.velocity_dvl), 3, N_STATE))
@@ -150,14 +147,14 @@ def linearise_full(seen: Observations) -> Linearised:
     return seen.reference_body - seen.velocity_in_body, h
 
 
-# What shows the states that are more than nuisance, by name.
+# Motion that makes the published nuisance states observable, by state.
 _SHOWN_TO_FULL = {
     "lever_arm_x": "turns to both sides, or of different sharpness (needs angular velocity)",
     "lever_arm_y": "turns to both sides, or of different sharpness (needs angular velocity)",
     "lever_arm_z": "rolling and pitching: waves, or dives (needs angular velocity)",
     "time_offset": "speeding up and slowing down, entering and leaving turns (needs angular velocity)",
 }
-# What registration leaves open of the reference's clock, s.
+# Prior σ of the reference delay after registration, s.
 REFERENCE_DELAY_STD_S = 0.05
 
 
@@ -190,7 +187,10 @@ FULL = Model(
 
 
 def _per_second(seen: Observations) -> Linearised:
-    """z = -Tᵀv, H = [Tᵀ[v×], -Tᵀv] on φ and δk: what is displaced in a second, of which `legs` takes the integral."""
+    """Linearise D1's displacement rate: z = -Tᵀv, H = [Tᵀ[v×], -Tᵀv] on φ and δk.
+
+    `legs` integrates both over time.
+    """
     t, v = seen.rotation_dvl_from_body.T, seen.velocity_dvl
     h = np.empty((len(v), 3, 4))
     h[:, :, :3] = turned_skew(t, v.T).transpose(2, 0, 1)

@@ -1,4 +1,4 @@
-"""What is known of one parameter: type, unit, range, description."""
+"""Specification of one parameter: type, unit, range, description."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ import numpy as np
 
 
 class ParameterError(ValueError):
-    """A parameter that does not exist or whose value cannot be used; the message names it and says what would do."""
+    """Unknown parameter or unusable value; the message names it and the accepted values."""
 
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """What is known about a parameter beside its name."""
+    """Specification of a parameter apart from its name."""
 
     default: Any
     description: str
@@ -38,7 +38,7 @@ class ParameterSpec:
         return len(self.default)
 
     def check(self, name: str, value: Any) -> Any:
-        """The value in its own type (whole numbers become doubles, arrays tuples), or ParameterError."""
+        """Return the value in its own type (integers as doubles, arrays as tuples), or raise ParameterError."""
         if self.kind == "double_array":
             if isinstance(value, str | bytes) or not hasattr(value, "__len__") or len(value) != self.length:
                 raise ParameterError(f"{name}: expected an array of {self.length} numbers, got {value!r}")

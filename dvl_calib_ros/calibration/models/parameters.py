@@ -1,7 +1,7 @@
-"""Every parameter, once: name, default, type, unit, range and description.
+"""Schema of all parameters: name, default, type, unit, range and description, in SI units and radians.
 
-From this schema come the node's declarations and descriptors, the validation of YAML files offline, the table in the
-docs/reference.md and `config/calibration.yaml`. All in SI units and radians.
+It generates the node's declarations and descriptors, the offline validation of YAML files, the table in
+docs/reference.md and `config/calibration.yaml`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ IAC = "iac"
 FROM_FRAME_ID = "from_frame_id"
 UNKNOWN, TOLD, FROM_REFERENCE = "unknown", "told", "from_reference"
 FROM_MESSAGE, FLU, FRD = "from_message", "flu", "frd"
-# Axes of a world: north-west-up beside VelocityFrame's
+# North-west-up, a world frame in addition to VelocityFrame
 NWU = "nwu"
 IMU_ENU, IMU_NED = "enu", "ned"
 XYZ, XY = "xyz", "xy"
@@ -37,7 +37,7 @@ _UNAIDED = tuple(name for name, model in MODELS.items() if not model.aided)
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters of a calibration, checked when made. Raises ParameterError."""
+    """Validated parameters of a calibration. The constructor raises ParameterError."""
 
     model: str = _parameter(
         AUTO,
@@ -523,37 +523,37 @@ class Parameters:
 
     @staticmethod
     def from_mapping(values: Mapping[str, Any]) -> Parameters:
-        """Parameters with these values, the rest at their defaults. ParameterError names what is unknown or wrong."""
+        """Return parameters with these values, else defaults. Raise ParameterError for a bad name or value."""
         check_names(values)
         return Parameters(**values)
 
     def replace(self, **values: Any) -> Parameters:
-        """A copy with these values, checked."""
+        """Return a validated copy with these values."""
         check_names(values)
         return dataclasses.replace(self, **values)
 
     def as_dict(self) -> dict[str, Any]:
-        """Name -> value with arrays as lists, for YAML and JSON."""
+        """Return values by name with arrays as lists, for YAML and JSON."""
         return {name: list(value) if isinstance(value := getattr(self, name), tuple) else value for name in SCHEMA}
 
     @property
     def is_z_down(self) -> bool:
-        """Whether base_frame is forward-right-down."""
+        """True if base_frame is forward-right-down."""
         return self.base_axes == FRD
 
     @property
     def body_axes(self) -> tuple[str, str, str]:
-        """Which way x, y and z of base_frame point, in words."""
+        """Directions of x, y and z of base_frame in words."""
         return ("ahead", "to starboard", "down") if self.is_z_down else ("ahead", "to port", "up")
 
     @property
     def up(self) -> float:
-        """The vertical, upwards, along z of base_frame: 1 or, z down, -1."""
+        """Sign of the upward vertical along z of base_frame: 1, or -1 if z is down."""
         return -1.0 if self.is_z_down else 1.0
 
     @cached_property
     def rotation_dvl_from_body(self) -> Array:
-        """T (3, 3), from mounting_rpy."""
+        """T (3, 3) of mounting_rpy."""
         return rotation_from_rpy(self.mounting_rpy).T
 
 
@@ -561,7 +561,7 @@ SCHEMA: Mapping[str, ParameterSpec] = {field.name: field.metadata["spec"] for fi
 
 
 def check_names(names: Mapping[str, Any]) -> None:
-    """Raise ParameterError for a name that is not a parameter, with the nearest one that is."""
+    """Raise ParameterError for an unknown parameter name, with the nearest known one."""
     for name in names:
         if name not in SCHEMA:
             near = difflib.get_close_matches(str(name), SCHEMA, n=1)

@@ -1,12 +1,12 @@
-"""Models that other packages bring.
+"""Calibration models of other packages.
 
-A package brings one by an entry point of the group `dvl_calib_ros.models` that names a `Model`:
+A package declares an entry point of the group `dvl_calib_ros.models` that names a `Model`:
 
     [project.entry-points."dvl_calib_ros.models"]
     W1 = "my_vehicle.models:W1"
 
-Such a model is filtered with the package's own; or it names an `Estimator` of that package which finds its states. The
-estimator is in another module than the entry: entries are looked for while this package is still being imported.
+The linear filter runs the model, unless it names an `Estimator`. The estimator must be in another module than the
+entry: entry points are loaded while this package is still being imported.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ ENTRY_POINTS = "dvl_calib_ros.models"
 
 
 def plugged_models(own: Mapping[str, Model]) -> tuple[dict[str, Model], list[str]]:
-    """By name the models of other packages, and what is wrong with those that cannot be used, in words.
+    """Return the models of other packages by name, and an error message for each unusable one.
 
-    own: those that there are already.
+    own: models that exist already.
     """
     models: dict[str, Model] = {}
     problems = []
@@ -37,7 +37,7 @@ def plugged_models(own: Mapping[str, Model]) -> tuple[dict[str, Model], list[str
 
 
 def load(name: str) -> object:
-    """What "module:attribute" names. Raises whatever the import raises."""
+    """Import and return the attribute of "module:attribute". Raise any error of the import."""
     from importlib import import_module
 
     module, _, attribute = name.partition(":")
@@ -51,7 +51,7 @@ def _loaded(name: str, value: str, known: Mapping[str, Model]) -> dict[str, Mode
             raise TypeError(f"{value} is no Model")
         if model.name in known:
             raise ValueError(f"there is a model {model.name!r} already; give it another name")
-    except Exception as error:  # whatever a foreign package does wrong
+    except Exception as error:  # another package may raise any error
         raise InputError(
             f"model {name!r} of an installed package: cannot be used ({type(error).__name__}: {error}); mend or "
             "uninstall that package"
@@ -60,16 +60,16 @@ def _loaded(name: str, value: str, known: Mapping[str, Model]) -> dict[str, Mode
 
 
 def _points() -> Iterator[tuple[str, str]]:
-    """Name and value of each entry point."""
+    """Yield name and value of each entry point."""
     if any(_names_the_group(folder) for folder in sys.path):
-        from importlib.metadata import entry_points  # takes longer than all else here
+        from importlib.metadata import entry_points  # slow import
 
         for point in entry_points(group=ENTRY_POINTS):
             yield point.name, point.value
 
 
 def _names_the_group(folder: str) -> bool:
-    """Whether a package that is installed in a folder of the path brings a model."""
+    """Return whether a package installed in a folder of sys.path declares a model."""
     try:
         with os.scandir(folder or ".") as entries:
             found = [entry.path for entry in entries if entry.name.endswith((".dist-info", ".egg-info"))]

@@ -1,4 +1,4 @@
-"""M1-M7, the published models: Yampolsky and Klein, "Information-Aided DVL Calibration".
+"""Published models M1-M7: Yampolsky and Klein, "Information-Aided DVL Calibration".
 
 M1, M2 are its baselines; M3, M4 are IAC-G; M5-M7 are IAC-GF. All hold in any right-handed frame with x ahead.
 """
@@ -16,7 +16,7 @@ from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Obse
 def _gnss_aided(
     scale_axes: tuple[tuple[str, tuple[int, ...]], ...], heave_is_zero: bool, seen: Observations
 ) -> Linearised:
-    """M1-M4: z = r - v, H = [r×, -r on the scaled axes]."""
+    """Linearise M1-M4: z = r - v, H = [r×, -r on the scaled axes]."""
     r, r_skew = seen.reference_without_heave if heave_is_zero else seen.reference
     h = np.zeros((len(r), 3, 3 + len(scale_axes)))
     h[:, :, :3] = r_skew
@@ -27,19 +27,19 @@ def _gnss_aided(
 
 
 def _m5(seen: Observations) -> Linearised:
-    """z = r - v, H = [r×], r = T (‖v‖, s, h)."""
+    """Linearise M5: z = r - v, H = [r×], r = T (‖v‖, s, h)."""
     r = seen.speed_and_prior @ seen.rotation_dvl_from_body.T
     return r - seen.velocity_at_reference, skew(r)
 
 
 def _m6(seen: Observations) -> Linearised:
-    """z = (‖v‖, s, h) - Tᵀv, H = Tᵀ[v×], body frame."""
+    """Linearise M6: z = (‖v‖, s, h) - Tᵀv, H = Tᵀ[v×], body frame."""
     z = seen.speed_and_prior - seen.velocity_in_body
     return z, seen.body_from_measured
 
 
 def _m7(seen: Observations) -> Linearised:
-    """z = ‖v‖ - (Tᵀv)_x, H = first row of Tᵀ[v×]."""
+    """Linearise M7: z = ‖v‖ - (Tᵀv)_x, H = first row of Tᵀ[v×]."""
     z = seen.speed - seen.velocity_in_body[:, 0]
     return z[:, None], seen.body_from_measured[:, :1]
 

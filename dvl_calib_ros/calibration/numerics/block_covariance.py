@@ -1,10 +1,9 @@
-"""How certain an estimate is, by the scatter of blocks of time: the σ that the data show beside the filter's own.
+"""Uncertainty of an estimate from the scatter of time blocks, in addition to the covariance of the filter.
 
-A filter's covariance holds what R claims of white noise. Noise that is larger or lasts longer, and what the model does
-not know, make the estimates of different stretches differ by more. With Λ_b, y_b what block b told (Λ = Λ₀ + Σ Λ_b),
-the score s_b = y_b - Λ_b x of a block at the common estimate x has covariance Λ_b if all is as claimed; what it really
-scatters by is Σ s_b s_bᵀ, and P (Λ₀ + Σ s_b s_bᵀ) P what x then is worth (the "sandwich"; White, "Maximum likelihood
-estimation of misspecified models", 1982).
+The covariance of a filter assumes white noise R. Larger or correlated noise and model errors make stretches differ
+more. With Λ_b, y_b the information of block b (Λ = Λ₀ + Σ Λ_b), its score s_b = y_b - Λ_b x at the common estimate x
+has covariance Λ_b under the model. The actual scatter Σ s_b s_bᵀ gives the "sandwich" covariance P (Λ₀ + Σ s_b s_bᵀ) P
+(White, "Maximum likelihood estimation of misspecified models", 1982).
 """
 
 from __future__ import annotations
@@ -18,30 +17,29 @@ from numpy.typing import NDArray
 from .frames import Array
 from .tests import chi2_isf
 
-# Blocks kept; when they are full, neighbours are joined and blocks are twice as long. So memory is bounded, and effects
-# that last for minutes show in the end.
+# Most blocks. When full, neighbours are joined and the block length doubles: memory is bounded, and the scatter covers
+# effects of minutes.
 MOST = 64
-# With fewer, the scatter says little: of 8 its own standard deviation is a quarter.
+# Fewest blocks of a scatter: with 8 its relative σ is a quarter.
 FEWEST = 8
-# By chance a scatter may exceed the filter's σ up to this quantile without being taken for more. What is beyond the
-# other is made by no chance, and how much it is is known by as many blocks as there are: 3 σ are to be what they are.
+# Upper-tail probabilities of the scatter: beyond CHANCE σ is inflated, and the excess beyond RARELY is scaled by
+# Student's t, so that 3 σ keep their probability with few blocks.
 CHANCE, RARELY = 0.1, 0.02
-# No fewer blocks that tell alike are taken to tell a quantity: the scatter of fewer is none.
+# Smallest equivalent number of blocks with equal information.
 FEWEST_ALIKE = 5.0
-# Neighbours of so many blocks are correlated if their coefficient is more than so many times its σ, 1/√m: of noise that
-# lasts as long as blocks do more would show in half of the runs of four minutes. No more than this is believed of it.
+# Fewest blocks for a correlation of neighbours, significant coefficient in σ (1/√m), and largest coefficient used. A
+# higher threshold would miss noise as long as a block in half of the four-minute recordings.
 LASTING_FROM, LASTS, MOST_LASTING = 16, 1.5, 0.85
 
 
 class TimeBlocks:
-    """Information of consecutive blocks of time, for K hypotheses or models at once.
+    """Information of consecutive time blocks, for K hypotheses or models.
 
-    count: number of blocks. weight: number of samples that all count for. total: Λ (K, n, n) and y (K, n) of all of
-    them; not to be written to.
+    count: number of blocks. weight: equivalent number of samples. total: sums Λ (K, n, n) and y (K, n), read-only.
     """
 
     def __init__(self) -> None:
-        # with room for MOST of them
+        # capacity: MOST blocks
         self._information = np.zeros((0, 0, 0, 0))
         self._vector = np.zeros((0, 0, 0))
         self.total: tuple[Array, Array] = np.zeros((0, 0, 0)), np.zeros((0, 0))
@@ -52,11 +50,11 @@ class TimeBlocks:
 
     @property
     def kept(self) -> tuple[Array, Array]:
-        """Of each block, in order, Λ_b (B, K, n, n) and y_b (B, K, n)."""
+        """Λ_b (B, K, n, n) and y_b (B, K, n) of each block, in order."""
         return self._information[: self.count], self._vector[: self.count]
 
     def add(self, information: Array, vector: Array, weight: float) -> None:
-        """Add what a stretch told: Λ_b (K, n, n), y_b (K, n). weight: number of samples that it counts for."""
+        """Add the information of a stretch: Λ_b (K, n, n), y_b (K, n). weight: equivalent number of samples."""
         self.weight += weight
         self.total = (self.total[0] + information, self.total[1] + vector) if self.count else (information, vector)
         if self.count and self._in_last < self._each:
@@ -65,7 +63,7 @@ class TimeBlocks:
             self._in_last += 1
             return
         if not self.count:
-            # written to, so that memory does not grow with the blocks for ten minutes
+            # filled, so that the memory is allocated now and not over ten minutes
             self._information = np.full((MOST, *information.shape), np.nan)
             self._vector = np.full((MOST, *vector.shape), np.nan)
         if self.count == MOST:
@@ -78,16 +76,16 @@ class TimeBlocks:
         self._in_last = 1
 
     def end_day(self, of_day: NDArray[np.intp], information: Array, vector: Array, source: NDArray[np.intp]) -> None:
-        """Leave to what was told only what it says of the states that go on, the others being found anew.
+        """Reduce the blocks to the states that continue in the next recording.
 
-        of_day: (u,) which states those others are. information (K, n, n), vector (K, n): of all that is known. source:
-        (K,) from which of the K each takes its past.
+        of_day: indices (u,) of the other states. information (K, n, n), vector (K, n): total. source: (K,) index of the
+        hypothesis whose past each one takes.
         """
         if not len(of_day):
             return
         n, k = information.shape[-1], len(information)
         within = np.linalg.inv(information[np.ix_(np.arange(k), of_day, of_day)])
-        # scores of the day's own states are known to vanish: what they would, were x another, is taken off the others
+        # eliminate the per-recording states: their scores vanish at the estimate
         onto = np.broadcast_to(np.eye(n), (k, n, n)).copy()
         onto[:, :, of_day] -= information[:, :, of_day] @ within
         onto[:, of_day] = 0.0
@@ -99,25 +97,25 @@ class TimeBlocks:
         self.choose(source)
 
     def choose(self, source: NDArray[np.intp]) -> None:
-        """Let each of K have its past from others. source: (K,) from which of those there are."""
+        """Give each hypothesis the past of another. source: (K,) indices of the present ones."""
         if self.count:
             self._information, self._vector = self._information[:, source], self._vector[:, source]
             self.total = self.kept[0].sum(axis=0), self.kept[1].sum(axis=0)
 
     def of(self, index: int) -> BlocksOfOne:
-        """What the blocks so far say of one of the K."""
+        """Return the blocks of one of the K."""
         if not self.count:
             return BlocksOfOne(np.zeros((0, 0, 0)), np.zeros((0, 0)), np.zeros((0, 0)))
         information, vector = (each[:, index].copy() for each in self.kept)
         return BlocksOfOne(information, vector, self.total[0][index])
 
     def inflation(self, index: int, x: Array, p: Array, lasts: float = LASTS, rarely: float | None = RARELY) -> Array:
-        """`inflations` of one of the K, x (n,), P (n, n)."""
+        """Return `inflations` for one of the K, x (n,), P (n, n)."""
         return inflations([self.of(index)], x[None], p[None], lasts=lasts, rarely=rarely)[0]
 
 
 class BlocksOfOne(NamedTuple):
-    """Of one hypothesis or model what each block told, Λ_b (B, n, n) and y_b (B, n), and the sum of all Λ_b (n, n)."""
+    """Blocks of one hypothesis or model: Λ_b (B, n, n), y_b (B, n), and Σ Λ_b (n, n)."""
 
     information: Array
     vector: Array
@@ -132,11 +130,11 @@ def inflations(
     lasts: float = LASTS,
     rarely: float | None = RARELY,
 ) -> Array:
-    """By how much σ of each state has to grow, at least 1, by S times blocks (S, n). x (S, n), P (S, n, n).
+    """Return the σ inflation factors (S, n), at least 1, of estimates x (S, n), P (S, n, n).
 
-    The largest over blocks as they are, and over two and four of them together. variance: (S, r) of r quantities that
-    are judged instead, whose covariance with the states p (S, r, n) then is. lasts, rarely: as
-    `LASTS` and `RARELY`; None where σ is compared with more than 3 of it.
+    A factor is the largest over single blocks and over blocks joined by two and four. variance: (S, r) of r other
+    quantities, with p (S, r, n) their covariance with the states. lasts, rarely: see `LASTS` and `RARELY`; rarely None:
+    without the factor of Student's t, for thresholds above 3 σ.
     """
     variance = np.diagonal(p, axis1=1, axis2=2) if variance is None else variance
     factor = np.ones(variance.shape)
@@ -145,14 +143,14 @@ def inflations(
         at = np.flatnonzero(counts == count)
         scores = np.stack([blocks[number].vector - blocks[number].information @ x[number] for number in at.tolist()])
         information = np.stack([blocks[number].information for number in at.tolist()])
-        # of the variance that blocks claim of each quantity the part of each (S, m, r)
+        # share of each block in the claimed variance of each quantity (S, m, r)
         parts = np.einsum("srn,smnk,srk->smr", p[at], information, p[at], optimize=True)
         factor[at] = _inflations(scores, parts, p[at], variance[at], lasts, rarely)
     return factor
 
 
 def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: float, rarely: float | None) -> Array:
-    """(S, r), by scores (S, m, n) and the parts (S, m, r) of the variance that they claim."""
+    """Return factors (S, r) from scores (S, m, n) and the shares (S, m, r) of the variance that they claim."""
     factor = np.ones(variance.shape)
     claimed = parts.sum(axis=1)
     while scores.shape[1] >= FEWEST:
@@ -166,7 +164,7 @@ def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: f
         if rarely is not None:
             surely = np.maximum(found - claimed * (chi2_isf(rarely, m - 1) / (m - 1)), 0.0)
             beyond = beyond + surely * (of_few(alike - 1.0) ** 2 - 1.0)
-        # the prior's part of P is not the data's to judge
+        # the prior part of P is not judged by the data
         more = 1.0 + beyond / np.maximum(variance, 1e-300)
         factor = np.maximum(factor, np.where(found > by_chance, np.sqrt(np.maximum(more, 1.0)), 1.0))
         scores, parts = (_paired(each) for each in (scores, parts))
@@ -174,7 +172,7 @@ def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: f
 
 
 def _paired(values: Array) -> Array:
-    """Neighbours of (S, m, ...) as one; an odd one goes to the last."""
+    """Join neighbours of (S, m, ...); an odd last one is added to the last pair."""
     m = values.shape[1]
     pairs = values[:, 0 : m - m % 2 : 2] + values[:, 1::2]
     if m % 2:
@@ -183,22 +181,21 @@ def _paired(values: Array) -> Array:
 
 
 def alike_of(parts: Array) -> Array:
-    """Of how many alike blocks a sum (S, r) of parts (S, m, r) is: those that tell most of it may be few."""
+    """Return the equivalent number (S, r) of blocks with equal shares, from shares (S, m, r)."""
     number = parts.sum(axis=1) ** 2 / np.maximum((parts**2).sum(axis=1), 1e-300)
     return np.clip(number, FEWEST_ALIKE, parts.shape[1])
 
 
 def of_few(dof: Array) -> Array:
-    """By how much 3 σ has to be more where σ is of so few: Student's t (Cornish and Fisher)."""
+    """Return the factor of 3 σ if σ has few degrees of freedom: Student's t (Cornish and Fisher)."""
     return np.asarray(1.0 + 2.5 / dof + 5.75 / dof**2)
 
 
 def _lasting(scatter: Array, lasts: float) -> Array:
-    """By how much the variance of the sum of each of series (S, n, m) is more than that of their terms.
+    """Return the variance of the sum of series (S, n, m) over the sum of their variances.
 
-    What lasts longer than a block is in neighbours alike, and where few blocks are left it is not seen otherwise.
-    As of a process of first order, by the correlation of neighbours, which a mean that was taken off makes smaller by
-    (1 + 4 ρ) / m (Kendall, 1954).
+    First-order process with the correlation of neighbouring blocks, corrected for the bias (1 + 4 ρ) / m due to the
+    subtracted mean (Kendall, 1954). It covers noise that lasts longer than a block.
     """
     m = scatter.shape[-1]
     if m < LASTING_FROM:

@@ -1,8 +1,7 @@
-"""Tails and quantiles of the usual distributions, on `scipy.special` alone.
+"""Tails and quantiles of common distributions by `scipy.special`.
 
-`scipy.stats` says the same, but importing it takes longer (half a second of CPU) than most of what it is asked here: so
-no module that a command needs for its everyday answer imports it, nor `scipy.signal`, which imports it (a test says
-which may).
+`scipy.stats` takes half a second of CPU to import. No module of everyday commands imports it, or `scipy.signal`, which
+imports it; a test lists the exceptions.
 """
 
 from __future__ import annotations
@@ -15,45 +14,45 @@ from .frames import Array
 
 
 def chi2_sf(x: ArrayLike, dof: ArrayLike) -> Array:
-    """P(X > x) of chi-square."""
+    """Return P(X > x) of chi-square."""
     return np.asarray(chdtrc(dof, x))
 
 
 def chi2_isf(p: float, dof: ArrayLike) -> Array:
-    """x that chi-square exceeds with probability p."""
+    """Return the x that chi-square exceeds with probability p."""
     return np.asarray(chdtri(dof, p))
 
 
 def chi2_logsf(x: ArrayLike, dof: ArrayLike) -> Array:
-    """log P(X > x) of chi-square; -inf where the probability is no number any more."""
+    """Return log P(X > x) of chi-square; -inf on underflow."""
     x = np.asarray(x, dtype=float)
     median = 2.0 * gammaincinv(0.5 * np.asarray(dof), 0.5)
-    with np.errstate(divide="ignore"):  # each where it is exact
+    with np.errstate(divide="ignore"):  # each branch where it is exact
         return np.where(x > median, np.log(chdtrc(dof, x)), np.log1p(-chdtr(dof, x)))
 
 
 def f_sf(x: ArrayLike, dof: ArrayLike, dof_of_denominator: ArrayLike) -> Array:
-    """P(X > x) of Fisher's F."""
+    """Return P(X > x) of Fisher's F."""
     return np.asarray(fdtrc(dof, dof_of_denominator, x))
 
 
 def normal_sf(x: ArrayLike) -> Array:
-    """P(X > x) of a standard normal variable."""
+    """Return P(X > x) of a standard normal variable."""
     return np.asarray(ndtr(-np.asarray(x, dtype=float)))
 
 
 def normal_isf(p: ArrayLike) -> Array:
-    """x that a standard normal variable exceeds with probability p."""
+    """Return the x that a standard normal variable exceeds with probability p."""
     return np.asarray(-ndtri(p))
 
 
 def binomial_sf(count: int, n: int, p: float) -> float:
-    """P(X >= count) of n trials that succeed with probability p each."""
+    """Return P(X >= count) of n trials with success probability p."""
     return 1.0 if count <= 0 else float(bdtrc(count - 1, n, p))
 
 
 def binomial_interval(count: int, n: int) -> tuple[float, float]:
-    """Clopper and Pearson's 95 per cent interval of the probability of success, of `count` in n trials."""
+    """Return the 95 per cent interval of Clopper and Pearson of the success probability, for `count` in n trials."""
     low = 0.0 if count == 0 else float(betaincinv(count, n - count + 1, 0.025))
     high = 1.0 if count == n else float(betaincinv(count + 1, n - count, 0.975))
     return low, high

@@ -1,4 +1,4 @@
-"""The nonlinear DVL error model, its exact inverse, and what follows from it (models.md, "Error model").
+"""Nonlinear DVL error model, its exact inverse and derivatives (docs/models.md, "Error model").
 
 ``v_d = (I + diag(δk)) (I + [φ×]) T v_b`` with ``T = rotation_dvl_from_body``: the nominal mounting, φ (3,) rad the
 residual misalignment and δk (3,) the scale-factor errors, both in the DVL frame.
@@ -16,13 +16,13 @@ _IDENTITY: Array = np.eye(3)
 
 
 def distort(velocity_body: Array, misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
-    """What a DVL with these errors measures of a body velocity: (..., 3) m/s -> (..., 3) m/s in the DVL frame."""
+    """Return the DVL measurement (..., 3) m/s, DVL frame, of body velocities (..., 3) m/s with these errors."""
     matrix = np.diag(1.0 + np.asarray(scale)) @ (np.eye(3) + skew(misalignment)) @ rotation_dvl_from_body
     return velocity_body @ matrix.T
 
 
 def correction_matrix(misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
-    """Matrix that takes the measured DVL velocity to the corrected body velocity: the inverse of `distort`.
+    """Return the matrix from measured DVL velocity to corrected body velocity: the inverse of `distort`.
 
     (..., 3) rad, (..., 3) -> (..., 3, 3).
     """
@@ -35,18 +35,18 @@ def correction_matrix(misalignment: Array, scale: Array, rotation_dvl_from_body:
 
 
 def correct(velocity_dvl: Array, misalignment: Array, scale: Array, rotation_dvl_from_body: Array) -> Array:
-    """Corrected body velocity of measured DVL velocities: (..., 3) m/s -> (..., 3) m/s."""
+    """Return corrected body velocities (..., 3) m/s of measured DVL velocities (..., 3) m/s."""
     return velocity_dvl @ correction_matrix(misalignment, scale, rotation_dvl_from_body).T
 
 
-# [v×] and -diag(v) side by side (3, 6) are linear in v: their elements, row by row, are v @ CORRECTION_JACOBIAN.
+# [v×] and -diag(v), joined (3, 6), are linear in v: their elements, row by row, are v @ CORRECTION_JACOBIAN.
 CORRECTION_JACOBIAN: Array = np.concatenate([skew(np.eye(3)), [-np.diag(axis) for axis in np.eye(3)]], axis=2).reshape(
     3, 18
 )
 
 
 def correction_jacobian(velocity_dvl: Array, rotation_dvl_from_body: Array) -> Array:
-    """d(corrected body velocity)/d(φ, δk) at small errors: (3,) m/s -> (3, 6).
+    """Return d(corrected body velocity)/d(φ, δk) at small errors: (3,) m/s -> (3, 6).
 
     From the first-order inverse ``v_b = Tᵀ (v - φ×v - δk∘v)``: columns ``Tᵀ[v×]`` and ``-Tᵀ diag(v)``.
     """
@@ -54,10 +54,9 @@ def correction_jacobian(velocity_dvl: Array, rotation_dvl_from_body: Array) -> A
 
 
 def corrected_mounting(misalignment: Array, rotation_dvl_from_body: Array) -> Array:
-    """Corrected mounting as ``rotation_body_from_dvl`` (3, 3).
+    """Return the corrected mounting as ``rotation_body_from_dvl`` (3, 3).
 
-    ``I + [φ×]`` is not a rotation. The nearest one (its polar factor) turns about φ by atan‖φ‖, because in the plane
-    across φ the matrix is ``[[1, -‖φ‖], [‖φ‖, 1]]``, a rotation by that angle times a length.
+    It uses the nearest rotation to ``I + [φ×]`` (its polar factor): the rotation about φ by atan‖φ‖.
     """
     norm = float(np.linalg.norm(misalignment))
     if norm == 0.0:

@@ -1,6 +1,6 @@
 """Rotations and frames (REP-103, REP-105).
 
-Names of rotations say both frames: ``v_a = rotation_a_from_b @ v_b``. Quaternions are ``(x, y, z, w)`` as in
+Names of rotations hold both frames: ``v_a = rotation_a_from_b @ v_b``. Quaternions are ``(x, y, z, w)`` as in
 geometry_msgs. Angles are radians.
 """
 
@@ -24,7 +24,7 @@ ENU_FROM_NWU: Array = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.
 ENU_FROM_NED: Array = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-# skew(a) is linear in a: its nine elements, row by row, are a @ _SKEW. One product instead of seven assignments.
+# skew(a) is linear in a: its nine elements, row by row, are a @ _SKEW.
 _SKEW: Array = np.zeros((3, 9))
 for _axis, _row, _column in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
     _SKEW[_axis, 3 * _row + _column] = 1.0
@@ -32,19 +32,19 @@ for _axis, _row, _column in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
 
 
 def skew(a: ArrayLike) -> Array:
-    """Cross-product matrix: ``skew(a) @ b == cross(a, b)``. Shape (..., 3) -> (..., 3, 3), finite values."""
+    """Return the cross-product matrix, ``skew(a) @ b == cross(a, b)``: (..., 3) -> (..., 3, 3), finite values."""
     a = np.asarray(a, dtype=float)
     return (a @ _SKEW).reshape(*a.shape, 3)
 
 
 def turned_skew(rotation: Array, a: Array) -> Array:
-    """``rotation @ skew(a)`` of (m, 3) and vectors as columns (3, N), (m, 3, N): one product, as it is linear in a."""
+    """Return ``rotation @ skew(a)`` (m, 3, N) of a rotation (m, 3) and vectors as columns (3, N)."""
     of_axes = (rotation @ _SKEW.reshape(3, 3, 3)).reshape(3, -1)
     return (of_axes.T @ a).reshape(len(rotation), 3, a.shape[1])
 
 
 def cross(a: Array, b: Array) -> Array:
-    """a × b of vectors (..., 3): `numpy.cross` without the axes that it moves about, which take most of its time."""
+    """Return a × b of vectors (..., 3); faster than `numpy.cross`, which moves axes."""
     x, y, z = (a[..., axis] for axis in range(3))
     u, v, w = (b[..., axis] for axis in range(3))
     product: Array = np.empty((*np.broadcast_shapes(a.shape, b.shape),))
@@ -55,9 +55,9 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def squared(a: Array) -> Array:
-    """Squares of the lengths of vectors (..., k), k >= 1: (...).
+    """Return squared lengths (...) of vectors (..., k), k >= 1.
 
-    To the last bit ``(a**2).sum(axis=-1)``, which of 4000 x 3 takes seven times as long.
+    Equal to ``(a**2).sum(axis=-1)`` to the last bit, and seven times faster for 4000 x 3.
     """
     squares = a * a
     total: Array = squares[..., 0].copy()
@@ -67,16 +67,16 @@ def squared(a: Array) -> Array:
 
 
 def product(matrix: Array, vector: Array) -> Array:
-    """(..., m, n) times (..., n)."""
+    """Return the products (..., m) of matrices (..., m, n) and vectors (..., n)."""
     found: Array = (matrix @ vector[..., None])[..., 0]
     return found
 
 
 def rotation_from_rpy(rpy: ArrayLike) -> Array:
-    """Rotation of a URDF ``origin rpy``: turns about the fixed axes X, then Y, then Z.
+    """Return the rotation of a URDF ``origin rpy``: about the fixed axes X, then Y, then Z.
 
-    ``(..., 3)`` -> ``(..., 3, 3)``; with the pose of a child in its parent it is ``rotation_parent_from_child``, and
-    with roll, pitch, yaw of a body in a navigation frame ``rotation_navigation_from_body``.
+    ``(..., 3)`` -> ``(..., 3, 3)``: ``rotation_parent_from_child`` for the pose of a child in its parent. Roll, pitch,
+    yaw of a body in a navigation frame give ``rotation_navigation_from_body``.
     """
     roll, pitch, yaw = np.moveaxis(np.asarray(rpy, dtype=float), -1, 0)
     cr, sr, cp, sp, cy, sy = (
@@ -91,10 +91,10 @@ def rotation_from_rpy(rpy: ArrayLike) -> Array:
 
 
 def rpy_from_rotation(rotation: ArrayLike) -> Array:
-    """Inverse of `rotation_from_rpy` for one rotation: (3, 3) -> roll, pitch, yaw (3,), pitch within ±pi/2."""
+    """Return roll, pitch, yaw (3,) of one rotation (3, 3), pitch within ±pi/2; inverse of `rotation_from_rpy`."""
     r = np.asarray(rotation, dtype=float)
     pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
-    if math.hypot(r[0, 0], r[1, 0]) < 1e-12:  # gimbal lock: only yaw -/+ roll is defined, put it all in yaw
+    if math.hypot(r[0, 0], r[1, 0]) < 1e-12:  # gimbal lock: only yaw -/+ roll is defined; assign it to yaw
         return np.array([0.0, pitch, math.atan2(-r[0, 1], r[1, 1])])
     return np.array([math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
 
@@ -106,7 +106,7 @@ def near_angles(angles: ArrayLike, nominal: ArrayLike) -> Array:
 
 
 def over_ground(speed: ArrayLike, course: ArrayLike) -> Array:
-    """East, north, up (..., 3) m/s of a speed (...) and a course (...) rad, from true north, clockwise.
+    """Return east, north, up (..., 3) m/s of a speed (...) and a course (...) rad, clockwise from true north.
 
     Up is exactly 0, which marks an axis as not measured.
     """
@@ -115,14 +115,14 @@ def over_ground(speed: ArrayLike, course: ArrayLike) -> Array:
 
 
 def whole_degrees(rotation: Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw (rad) of a rotation (3, 3), to whole degrees."""
+    """Return roll, pitch, yaw (rad) of a rotation (3, 3), rounded to whole degrees."""
     roll, pitch, yaw = (np.radians(np.round(np.degrees(rpy_from_rotation(rotation)))) + 0.0).tolist()
     return roll, pitch, yaw
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
-    """Unit quaternion (x, y, z, w), w >= 0, of one rotation (3, 3). Shepperd's method: the largest term first."""
-    r = np.asarray(rotation, dtype=float).tolist()  # of one, numbers by themselves are several times faster
+    """Return the unit quaternion (x, y, z, w), w >= 0, of one rotation (3, 3), by Shepperd's method."""
+    r = np.asarray(rotation, dtype=float).tolist()  # for one rotation, plain floats are several times faster
     diagonal = [r[0][0], r[1][1], r[2][2]]
     trace = sum(diagonal)
     terms = [*diagonal, trace]
@@ -141,7 +141,7 @@ def quaternion_from_rotation(rotation: ArrayLike) -> Quaternion:
 
 
 def rotation_from_quaternion(q: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4) in the order x, y, z, w."""
+    """Return rotation matrices (..., 3, 3) of unit quaternions (..., 4) in the order x, y, z, w."""
     q = np.asarray(q, dtype=float)
     x, y, z, w = (q[..., i] for i in range(4))
     xx, yy, zz, xy, xz, yz, xw, yw, zw = x * x, y * y, z * z, x * y, x * z, y * z, x * w, y * w, z * w
@@ -153,7 +153,7 @@ def rotation_from_quaternion(q: ArrayLike) -> Array:
 
 
 def rotation_vector(q: ArrayLike) -> Array:
-    """Axis times angle (..., 3) rad, at most pi, of unit quaternions (..., 4); exact for small and large angles."""
+    """Return axis times angle (..., 3) rad, at most pi, of unit quaternions (..., 4), exact for all angles."""
     quaternion = np.asarray(q, dtype=float)
     vector, scalar = quaternion[..., :3], quaternion[..., 3:]
     sine = np.sqrt(squared(vector))[..., None]
@@ -162,12 +162,12 @@ def rotation_vector(q: ArrayLike) -> Array:
     return turn
 
 
-# Cosine of half the angle of a short arc: below 2 mrad the chord is exact to 1e-10 and keeps clear of 0/0.
+# Cosine of half the angle of a short arc: below 2 mrad the chord is exact to 1e-10 and avoids 0/0.
 _SHORT_ARC = 0.9999995
 
 
 def slerps(q0: Array, q1: Array, fraction: Array) -> Array:
-    """Spherical linear interpolation between N pairs of unit quaternions (N, 4) along the shorter arc.
+    """Interpolate N pairs of unit quaternions (N, 4) spherically along the shorter arc.
 
     fraction: (N,) in 0..1. nan where either is nan.
     """
@@ -185,7 +185,7 @@ def slerps(q0: Array, q1: Array, fraction: Array) -> Array:
 
 
 def attitude_enu_flu_from_ned_frd(rpy: ArrayLike) -> Array:
-    """Attitude as marine instruments give it, as ROS wants it.
+    """Convert the attitude of marine instruments to ROS.
 
     Roll, pitch, yaw (..., 3) of a forward-right-down body in north-east-down (Z-Y-X order) ->
     ``rotation_enu_from_body`` (..., 3, 3) of the forward-left-up body.
@@ -194,7 +194,7 @@ def attitude_enu_flu_from_ned_frd(rpy: ArrayLike) -> Array:
 
 
 def nearest_rotation(products: Array) -> Array:
-    """The rotations C (..., 3, 3) that minimise Σ|a - C b|², of Σ a bᵀ (..., 3, 3).
+    """Return the rotations C (..., 3, 3) that minimise Σ|a - C b|², from Σ a bᵀ (..., 3, 3).
 
     Wahba's problem, by singular values (Markley, "Attitude determination using vector observations", 1988).
     """
@@ -206,12 +206,12 @@ def nearest_rotation(products: Array) -> Array:
 
 
 def turn_between(before: Array, after: Array) -> Array:
-    """Axis times angle (3,) rad of the turn from one mounting (3, 3) to another, about the body's axes."""
+    """Return axis times angle (3,) rad of the rotation between two mountings (3, 3), about body axes."""
     return rotation_vector(quaternion_from_rotation(after @ before.T))
 
 
 def rotation_of(vector: Array) -> Array:
-    """Inverse of `turn_between` from no turn at all: (3,) rad -> (3, 3) (Rodrigues)."""
+    """Return the rotation (3, 3) of axis times angle (3,) rad, by the formula of Rodrigues."""
     angle = float(np.linalg.norm(vector))
     if angle == 0.0:
         return np.eye(3)

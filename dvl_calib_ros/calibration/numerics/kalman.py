@@ -1,14 +1,10 @@
-"""The Kalman filter over a constant state, for K models at once: sample by sample, or a whole block.
+"""Kalman filter over a constant state for K models, per sample or per block.
 
-Letters as in the literature: x state, P covariance, z measurement, H its matrix, R its noise, S innovation
-covariance, K gain.
+x state, P covariance, z measurement, H its matrix, R its noise, S innovation covariance, K gain.
 
-Two ways to the same numbers (equal to 1e-10, proved in test_kalman.py):
-
-`recursion` is the filter: one predict and update per sample, covariance in Joseph form.
-`batch` uses that with Φ = I and Q = 0 the filter is prior-regularised weighted least squares for every k at once: the
-information of the first k samples is a running sum. Vectorised over time it is some thirty times faster than a filter
-in Python, and the state after any sample comes with it.
+`recursion` predicts and updates per sample, with the covariance in Joseph form. `batch` uses that with Φ = I and Q = 0
+the filter is prior-regularised weighted least squares for every k: the information of the first k samples is a running
+sum, vectorised over time. Both agree to 1e-10 (test_kalman.py); `batch` is thirty times faster.
 """
 
 from __future__ import annotations
@@ -27,36 +23,35 @@ from .frames import Array, product
 
 Mask = NDArray[np.bool_]
 
-# Gate decisions of a block are found by repetition (see `batch`); a block that needs more than this goes to the
-# recursion instead. Data with ordinary outliers settles in two or three.
+# Most passes of the gate decisions of a block (see `batch`), else the recursion is used. Data with ordinary outliers
+# need two or three.
 MAX_GATE_PASSES = 12
 
 
 class GaussianState(NamedTuple):
-    """A state (n,) and its covariance (n, n)."""
+    """State (n,) and covariance (n, n)."""
 
     x: Array
     p: Array
 
     @property
     def information(self) -> tuple[Array, Array]:
-        """P⁻¹ and P⁻¹x, of (..., n) states; raises LinAlgError where P has no inverse."""
+        """P⁻¹ and P⁻¹x of (..., n) states; raises LinAlgError if P is singular."""
         inverse = np.linalg.inv(self.p)
         return inverse, product(inverse, self.x)
 
     def raised(self, factor: Array) -> GaussianState:
-        """The same with each standard deviation times a factor (n,); symmetric to the last bit, as P is."""
+        """Return the state with each σ multiplied by a factor (n,); P stays exactly symmetric."""
         return GaussianState(self.x, self.p * (factor[:, None] * factor))
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """N measurements for each of K models, of m rows, on n states.
+    """N measurements of m rows for each of K models with n states.
 
-    z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (K or 1, N), share
-    of its own information that a sample adds, in 0..1 (below 1 for samples that share their noise with others).
-    usable: (K, N), False where a model must not use a sample. gate: (K or 1, N or 1), largest normalised innovation
-    squared that is used, inf for no gate.
+    z: (K, N, m). h: (K, N, m, n). r: (K or 1, N or 1, m, m), symmetric positive definite. weight: (K or 1, N),
+    information weight of a sample, in 0..1 (below 1 for samples that share noise). usable: (K, N), False where a model
+    must not use a sample. gate: (K or 1, N or 1), largest accepted normalised innovation squared, inf without gate.
     """
 
     z: Array
@@ -68,19 +63,19 @@ class Measurements:
 
     @cached_property
     def whitened(self) -> tuple[Array, Array]:
-        """H (m, n, K, N) and z (m, K, N) of rows that are turned and scaled so that their noise is 1."""
+        """H (m, n, K, N) and z (m, K, N), transformed to unit noise."""
         h, z = np.moveaxis(self.h, (2, 3), (0, 1)), np.moveaxis(self.z, 2, 0)
         low, inverse_diagonal = _cholesky([[self.r[..., i, j] for j in range(i + 1)] for i in range(len(z))])
         return np.stack(_forward(low, inverse_diagonal, [*h])), np.stack(_forward(low, inverse_diagonal, [*z]))
 
     def part(self, at: slice) -> Measurements:
-        """The samples of a slice."""
+        """Return the samples of a slice."""
         r = self.r if self.r.shape[1] == 1 else self.r[:, at]
         gate = self.gate if self.gate.shape[1] == 1 else self.gate[:, at]
         return Measurements(self.z[:, at], self.h[:, at], r, self.weight[:, at], self.usable[:, at], gate)
 
     def model(self, k: int) -> Measurements:
-        """Those of one model, as K = 1."""
+        """Return the measurements of one model, as K = 1."""
         own = slice(k, k + 1)
         r = self.r if len(self.r) == 1 else self.r[own]
         weight = self.weight if len(self.weight) == 1 else self.weight[own]
@@ -90,11 +85,11 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Updated:
-    """What a block of measurements made of the state.
+    """State after a block of measurements.
 
     x: (K, n), p: (K, n, n) after the last sample. used: (K, N). nis: (K, N) normalised innovation squared νᵀS⁻¹ν of
-    every sample against the state before it, of usable samples only (0 elsewhere). at: x (E, K, n), P (E, K, n, n)
-    after the numbers of samples that were asked for, if any.
+    usable samples against the state before them, else 0. at: x (E, K, n), P (E, K, n, n) after the requested numbers of
+    samples, if any.
     """
 
     x: Array
@@ -105,7 +100,7 @@ class Updated:
 
     @staticmethod
     def joined(models: Sequence[Updated]) -> Updated:
-        """Of models one after the other, each as K = 1."""
+        """Return the joined updates of models, each with K = 1."""
         x, p, used, nis = (
             np.concatenate(each) for each in zip(*((m.x, m.p, m.used, m.nis) for m in models), strict=True)
         )
@@ -117,13 +112,13 @@ class Updated:
 def recursion(
     x: Array, p: Array, data: Measurements, process: Array | None = None, ends: NDArray[np.intp] | None = None
 ) -> Updated:
-    """Filter N samples one after the other.
+    """Filter N samples in sequence.
 
-    x: (K, n). p: (K, n, n). process: (N, K, n, n) covariance Q that the state gains before each sample, or None.
-    ends: (E,) ascending numbers of samples (0..N) after which the state is wanted, too. Raises LinAlgError where S is
-    not positive definite, or numbers are not finite.
+    x: (K, n). p: (K, n, n). process: (N, K, n, n) covariance Q added before each sample, or None. ends: (E,) ascending
+    numbers of samples (0..N) after which the state is returned, too. Raises LinAlgError if S is not positive definite,
+    or a number is not finite.
     """
-    # each model by itself: products of single matrices cost a third of those of stacks, and live there is one sample
+    # per model: products of single matrices cost a third of those of stacks, and a live block has one sample
     models = [
         _recursion_of_one(x[k], p[k], data, k, None if process is None else process[:, k], ends is not None)
         for k in range(len(x))
@@ -140,9 +135,9 @@ def recursion(
 def _recursion_of_one(
     x: Array, p: Array, data: Measurements, k: int, process: Array | None, on_the_way: bool
 ) -> tuple[list[GaussianState], list[bool], list[float]]:
-    """`recursion` of the k-th model: x (n,), P (n, n), Q (N, n, n).
+    """Filter with the k-th model: x (n,), P (n, n), Q (N, n, n), see `recursion`.
 
-    Returns the state at the end, or, on_the_way, before the first sample and after each; which are used; and their nis.
+    Return the final state or, if on_the_way, the states before the first and after each sample; used flags; nis.
     """
     n_samples, n = data.z.shape[1], len(x)
     identity = _identity(n)
@@ -164,11 +159,11 @@ def _recursion_of_one(
             raise np.linalg.LinAlgError("the numbers have run away")
         use = usable[i] and nis_i <= gate[i]
         if use:
-            if weight[i] != 1.0:  # the gate asks whether this sample fits; the update, how much it may weigh
+            if weight[i] != 1.0:  # the gate tests the sample at full weight; only the update uses the reduced one
                 r_i = r_i / weight[i]
             gain = _solve_definite(hpht + r_i, pht.T).T
             x = x + gain @ innovation
-            # Joseph form: a sum of two positive semidefinite terms, so rounding cannot make P indefinite
+            # Joseph form: a sum of positive semidefinite terms, so rounding cannot make P indefinite
             ikh = identity - gain @ h
             p = ikh @ p @ ikh.T + gain @ r_i @ gain.T
             p = 0.5 * (p + p.T)
@@ -181,15 +176,15 @@ def _recursion_of_one(
 
 @cache
 def _identity(n: int) -> Array:
-    """1 (n, n), not to be written to."""
+    """Return the identity (n, n), read-only."""
     return np.eye(n)
 
 
 @cache
 def _dposv() -> Callable[[Array, Array], tuple[Array, Array, int]]:
-    """LAPACK's, imported when the first sample comes by itself: it takes 0.2 s, which recordings need not wait for.
+    """Return dposv of LAPACK. The import takes 0.2 s, so it waits for the first single sample.
 
-    Live, nor need the first message: see `prepare`.
+    Live, `prepare` imports it before the first message.
     """
     from scipy.linalg.lapack import dposv
 
@@ -198,12 +193,12 @@ def _dposv() -> Callable[[Array, Array], tuple[Array, Array, int]]:
 
 
 def prepare() -> None:
-    """Import what the first sample that comes by itself would else wait for."""
+    """Import what the first single sample needs."""
     _dposv()
 
 
 def _solve_definite(s: Array, b: Array) -> Array:
-    """S⁻¹b for one symmetric positive definite S (m, m). Raises LinAlgError where it is not."""
+    """Return S⁻¹b for one symmetric positive definite S (m, m), else raise LinAlgError."""
     _, solution, failed = _dposv()(s, b)
     if failed:
         raise np.linalg.LinAlgError("S is not positive definite")
@@ -211,12 +206,12 @@ def _solve_definite(s: Array, b: Array) -> Array:
 
 
 def batch(x: Array, p: Array, data: Measurements, ends: NDArray[np.intp] | None = None) -> Updated:
-    """Filter N samples at once, without process noise; the same result as `recursion`."""
+    """Filter N samples together, without process noise; the same result as `recursion`."""
     h, _ = data.whitened
-    # states that no sample sees change only with those that they are correlated with
+    # unmeasured states change only by their correlation with measured ones
     seen = np.flatnonzero([column.any() for column in h.swapaxes(0, 1)])
     if not len(seen):
-        seen = np.zeros(1, dtype=np.intp)  # any will do
+        seen = np.zeros(1, dtype=np.intp)  # any state
     solved = _solve(x[:, seen], p[:, seen[:, None], seen], data, seen)
     if solved is None:
         return recursion(x, p, data, None, ends)
@@ -228,9 +223,10 @@ def batch(x: Array, p: Array, data: Measurements, ends: NDArray[np.intp] | None 
 
 
 def _with_unseen(x: Array, p: Array, seen: NDArray[np.intp], after: GaussianState) -> GaussianState:
-    """All states x (E, K, n), P (E, K, n, n) after measurements of some.
+    """Return all states x (E, K, n), P (E, K, n, n) after measurements of some.
 
-    x (K, n), P (K, n, n): of all, before. seen: (s,) which are measured. after: of these, x (E, K, s), P (E, K, s, s).
+    x (K, n), P (K, n, n): all states before. seen: (s,) indices of the measured ones. after: these, x (E, K, s), P (E,
+    K, s, s).
     """
     rest = np.delete(np.arange(x.shape[1]), seen)
     before = p[:, seen[:, None], seen]
@@ -248,10 +244,10 @@ def _with_unseen(x: Array, p: Array, seen: NDArray[np.intp], after: GaussianStat
 
 
 def least_squares(x: Array, p: Array, data: Measurements, ends: Sequence[int]) -> GaussianState:
-    """Prior-regularised least squares over the first `ends` samples (E ascending numbers): x (E, K, n), P (E, K, n, n).
+    """Solve prior-regularised least squares over the first `ends` samples: x (E, K, n), P (E, K, n, n).
 
-    The state of the other ways, without gate and process noise. Only sums over the samples, no innovations and no
-    history: the fastest where nobody asks for them.
+    ends: E ascending numbers. Equal to the filters without gate and process noise, and the fastest: it sums over the
+    samples without innovations or history.
     """
     k, n_samples, m, n = data.h.shape
     weighted = _inverse(data.r) @ data.h
@@ -269,8 +265,8 @@ def least_squares(x: Array, p: Array, data: Measurements, ends: Sequence[int]) -
     return GaussianState((p_after @ state)[..., 0], p_after)
 
 
-# Small dense algebra, element by element, each element an array over models and time: for 3x3 and 4x4 matrices this
-# is ten times faster than a LAPACK call per matrix. Symmetric matrices and lower triangles are lists of rows [i][j<=i].
+# Small dense algebra by elements, each an array over models and time: for 3x3 and 4x4 matrices ten times faster than a
+# LAPACK call per matrix. Symmetric matrices and lower triangles are lists of rows [i][j<=i].
 
 Elements = Sequence[Sequence[Array]]
 
@@ -284,7 +280,7 @@ class _Solved(NamedTuple):
     nis: Array
 
     def after(self, ends: NDArray[np.intp]) -> GaussianState:
-        """x (E, K, n) and P (E, K, n, n) after so many samples."""
+        """Return x (E, K, n) and P (E, K, n, n) after these numbers of samples."""
         p = np.linalg.inv(_full([[column[:, ends].T for column in row] for row in self.information]))
         p = 0.5 * (p + p.swapaxes(-1, -2))
         state = np.stack([column[:, ends].T for column in self.information_state], axis=-1)
@@ -292,12 +288,12 @@ class _Solved(NamedTuple):
 
 
 def _solve(x: Array, p: Array, data: Measurements, seen: NDArray[np.intp]) -> _Solved | None:
-    """The information after every sample, on the states (s,) that are seen: x (K, s), P (K, s, s).
+    """Return the information after every sample on the measured states (s,): x (K, s), P (K, s, s).
 
-    Whether a sample passes the gate depends on the samples before it. So: guess by the state before all of them which
-    pass, compute every state at once, gate every sample against its state, and repeat with what passed until nothing
-    changes. Each pass settles at least the first sample still wrong, so the fixed point is the recursion's own sequence
-    of decisions. None when it does not settle in MAX_GATE_PASSES.
+    The gate of a sample depends on the samples before it, so gate decisions are iterated: start with the decisions of
+    the initial state, compute all states, gate every sample against its state, and repeat until nothing changes. Each
+    pass settles at least the first wrong sample, so the fixed point has the decisions of the recursion. Return None
+    without convergence in MAX_GATE_PASSES.
     """
     n = x.shape[1]
     prior = np.linalg.inv(p)
@@ -306,7 +302,7 @@ def _solve(x: Array, p: Array, data: Measurements, seen: NDArray[np.intp]) -> _S
     if len(seen) < h.shape[1]:
         h = h[:, seen]
     wh = h if (data.weight == 1.0).all() else h * data.weight
-    # with room in front for the prior: the running sums are then taken in place
+    # a leading column for the prior, so that running sums are in place
     room = (x.shape[0], data.z.shape[1] + 1)
     gained = [[_gain(wh[:, i], h[:, j], room) for j in range(i + 1)] for i in range(n)]
     gained_state = [_gain(wh[:, i], z, room) for i in range(n)]
@@ -332,10 +328,10 @@ def _solve(x: Array, p: Array, data: Measurements, seen: NDArray[np.intp]) -> _S
 
 
 def _passes_before(x: Array, prior: Array, prior_state: Array, h: Array, z: Array, gate: Array) -> Mask:
-    """Which samples (K, N) pass the gate by the state x (K, n) with Λ (K, n, n) and Λx (K, n) before all of them."""
+    """Return which samples (K, N) pass the gate of the initial x (K, n), Λ (K, n, n), Λx (K, n)."""
     innovation = [each - _dot(row, x.T[..., None]) for row, each in zip(h, z, strict=True)]
     passes = _dot(innovation, innovation) <= gate
-    # S is no less than R, so only those that fail with R alone may fail
+    # S >= R, so only samples that fail with R alone may fail
     k, at = np.nonzero(~passes)
     if len(k):
         n = x.shape[1]
@@ -352,7 +348,7 @@ def _gain(a: Array, b: Array, room: tuple[int, int]) -> Array:
 
 
 def _running_sum(first: Array, gained: Array, used: Mask | None) -> Array:
-    """The prior's (K,) and what each sample adds (K, 1 + N, the first column free) -> sums (K, N+1)."""
+    """Return sums (K, N+1) of the prior (K,) and the gains of samples (K, 1 + N, first column free)."""
     gained[:, 0] = first
     if used is None:
         return np.cumsum(gained, axis=1)
@@ -363,13 +359,13 @@ def _running_sum(first: Array, gained: Array, used: Mask | None) -> Array:
 
 
 def _full(lower: Elements) -> Array:
-    """Rows [i][j<=i] of a symmetric matrix -> (..., n, n)."""
+    """Return the symmetric matrices (..., n, n) of rows [i][j<=i]."""
     n = len(lower)
     return np.stack([np.stack([lower[max(i, j)][min(i, j)] for j in range(n)], axis=-1) for i in range(n)], axis=-2)
 
 
 def _cholesky(a: Elements) -> tuple[list[list[Array]], list[Array]]:
-    """Lower L with A = L Lᵀ, and the inverses of its diagonal."""
+    """Return the lower L of A = L Lᵀ, and the inverses of its diagonal."""
     low: list[list[Array]] = []
     inverse_diagonal: list[Array] = []
     for i, row in enumerate(a):
@@ -388,7 +384,7 @@ def _cholesky(a: Elements) -> tuple[list[list[Array]], list[Array]]:
 
 
 def _invert_lower(low: Elements, inverse_diagonal: Sequence[Array]) -> list[list[Array]]:
-    """L⁻¹."""
+    """Return L⁻¹."""
     n = len(low)
     inverse: list[list[Array]] = []
     for i in range(n):
@@ -401,7 +397,7 @@ def _invert_lower(low: Elements, inverse_diagonal: Sequence[Array]) -> list[list
 
 
 def _inverse(a: Array) -> Array:
-    """Inverses of symmetric positive definite matrices (..., m, m)."""
+    """Return inverses of symmetric positive definite matrices (..., m, m)."""
     m = a.shape[-1]
     low = _invert_lower(*_cholesky([[a[..., i, j] for j in range(i + 1)] for i in range(m)]))
     columns = [[low[row][j] for row in range(j, m)] for j in range(m)]
@@ -409,7 +405,7 @@ def _inverse(a: Array) -> Array:
 
 
 def whitening(noise: Array) -> Array:
-    """L⁻¹ (..., m, m) of noise = L Lᵀ, which makes it 1; nan where noise is not positive definite."""
+    """Return L⁻¹ (..., m, m) of noise = L Lᵀ; nan where noise is not positive definite."""
     m = noise.shape[-1]
     with np.errstate(invalid="ignore", divide="ignore"):
         rows = _invert_lower(*_cholesky([[noise[..., i, j] for j in range(i + 1)] for i in range(m)]))
@@ -421,7 +417,7 @@ def whitening(noise: Array) -> Array:
 
 
 def _forward(low: Elements, inverse_diagonal: Sequence[Array], b: Sequence[Array]) -> list[Array]:
-    """L⁻¹ b."""
+    """Return L⁻¹ b."""
     y: list[Array] = []
     for i, value in enumerate(b):
         if i:
@@ -431,7 +427,7 @@ def _forward(low: Elements, inverse_diagonal: Sequence[Array], b: Sequence[Array
 
 
 def _dot(a: Sequence[Array] | Array, b: Sequence[Array] | Array, out: Array | None = None) -> Array:
-    """Sum of products of two rows of arrays."""
+    """Return the sum of products of two rows of arrays."""
     total: Array = np.multiply(a[0], b[0], out=out)
     if len(a) > 1:
         product = np.empty_like(total)
@@ -444,9 +440,10 @@ def _dot(a: Sequence[Array] | Array, b: Sequence[Array] | Array, out: Array | No
 def _normalised_innovation_squared(
     information: Elements, information_state: Sequence[Array], h: Array, z: Array
 ) -> Array:
-    """νᵀS⁻¹ν (K, N) with S = HPHᵀ + 1 and ν = z - Hx, from Λ = P⁻¹ = LLᵀ: with U = L⁻¹Hᵀ, HPHᵀ = UᵀU.
+    """Return νᵀS⁻¹ν (K, N) with S = HPHᵀ + 1 and ν = z - Hx.
 
-    information, information_state: Λ and Λx before each sample, elements (K, N or 1).
+    With P⁻¹ = LLᵀ and U = L⁻¹Hᵀ, HPHᵀ = UᵀU. information, information_state: Λ and Λx before each sample, elements (K,
+    N or 1).
     """
     low, inverse_diagonal = _cholesky(information)
     y = _forward(low, inverse_diagonal, information_state)
@@ -459,6 +456,6 @@ def _normalised_innovation_squared(
 
 
 def distance_squared(s: Elements, innovation: Sequence[Array]) -> Array:
-    """νᵀS⁻¹ν. s: lower triangle of S, innovation: ν, element by element."""
+    """Return νᵀS⁻¹ν. s: lower triangle of S, innovation: ν, both by elements."""
     whitened = _forward(*_cholesky(s), innovation)
     return _dot(whitened, whitened)

@@ -1,8 +1,8 @@
-"""What the calibration core is fed with: samples of three streams, one by one (live) or as columns (recordings).
+"""Sample types of the three streams: single (live) or as columns (recordings).
 
-A live sample is a tuple of plain floats, not arrays: it is built and read once, at up to kHz rates, and a float costs a
-tenth of an array element there. A recording's samples come as a `SampleBlock`, one row per message. Stamps are
-integer nanoseconds; a float second would lose the nanoseconds of 2026.
+A live sample is a tuple of floats: built and read once at up to kHz rates, where a float costs a tenth of an array
+element. Recorded samples are rows of a `SampleBlock`. Stamps are integer nanoseconds, because a float second cannot
+resolve a nanosecond of 2026.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class VelocityFrame(Enum):
     NED = "ned"
 
 
-# A row's frame is its place in this tuple.
+# Frames by code (index).
 FRAMES: tuple[VelocityFrame, ...] = tuple(VelocityFrame)
 FRAME_CODES = {frame: code for code, frame in enumerate(FRAMES)}
 
@@ -40,7 +40,7 @@ FRAME_CODES = {frame: code for code, frame in enumerate(FRAMES)}
 class DvlSample(NamedTuple):
     """Velocity over ground measured by the DVL.
 
-    velocity: m/s in the DVL frame. covariance: (3, 3) (m/s)², or None where the message does not give one.
+    velocity: m/s in the DVL frame. covariance: (3, 3) (m/s)², None if the message has none.
     """
 
     stamp_ns: int
@@ -49,9 +49,9 @@ class DvlSample(NamedTuple):
 
 
 class ReferenceSample(NamedTuple):
-    """Reference (GNSS) velocity of the vehicle's reference point over ground.
+    """Reference (GNSS) velocity of the reference point over ground.
 
-    velocity: m/s in `frame`. covariance: (3, 3) (m/s)² in `frame`, or None where the message does not give one.
+    velocity: m/s in `frame`. covariance: (3, 3) (m/s)² in `frame`, None if the message has none.
     """
 
     stamp_ns: int
@@ -61,7 +61,7 @@ class ReferenceSample(NamedTuple):
 
 
 class ImuSample(NamedTuple):
-    """Attitude and angular velocity of the body; either is None where the IMU does not give it.
+    """Attitude and angular velocity of the body; None if the IMU does not provide it.
 
     orientation: unit quaternion (x, y, z, w) of ``rotation_enu_from_body``. angular_velocity: rad/s, body frame.
     """
@@ -75,24 +75,23 @@ Sample = DvlSample | ReferenceSample | ImuSample
 
 
 class Stream(Enum):
-    """The three streams, by the names that they are counted under."""
+    """The three streams, by their names in counts."""
 
-    __hash__ = object.__hash__  # Enum's own is slow, and asked for with every live sample
+    __hash__ = object.__hash__  # Enum.__hash__ is slow and runs for every live sample
     DVL = "dvl"
     REFERENCE = "reference"
     IMU = "imu"
 
 
-# Columns of values: velocity (m/s); of the IMU a quaternion (x, y, z, w) and the angular velocity (rad/s).
+# Number of value columns: velocity (m/s); for the IMU quaternion (x, y, z, w) and angular velocity (rad/s).
 WIDTH = {Stream.DVL: 3, Stream.REFERENCE: 3, Stream.IMU: 7}
 
 
 @dataclass(frozen=True)
 class Covariances:
-    """Velocity covariances of N rows, of which few are distinct: most drivers send the same with every message.
+    """Velocity covariances of N rows, stored once per distinct value, because most drivers repeat them.
 
-    distinct: (C, 3, 3) (m/s)², as the messages have them. index: (N,) which of them is a row's, -1 where its message
-    gives none.
+    distinct: (C, 3, 3) (m/s)², as in the messages. index: (N,) into distinct, -1 for a message without covariance.
     """
 
     distinct: Array
@@ -100,12 +99,12 @@ class Covariances:
 
     @staticmethod
     def none(n: int) -> Covariances:
-        """Of n rows without covariance."""
+        """Return the covariances of n rows without any."""
         return Covariances(np.zeros((0, 3, 3)), np.full(n, -1, dtype=np.intp))
 
     @staticmethod
     def of(values: Array, n: int) -> Covariances:
-        """From one (3, 3) of all rows, or (N, 3, 3); what a row repeats of the one before is kept once."""
+        """Return covariances from one (3, 3) for all rows, or (N, 3, 3); consecutive repetitions are stored once."""
         values = np.asarray(values, dtype=float)
         if values.shape == (3, 3):
             return Covariances(values[None], np.zeros(n, dtype=np.intp))
@@ -113,16 +112,16 @@ class Covariances:
             raise ValueError(f"covariance: expected (3, 3) or ({n}, 3, 3), got {values.shape}")
         if not n:
             return Covariances.none(0)
-        raw = np.ascontiguousarray(values).reshape(n, 9).view(np.int64)  # bits, so that nan repeats nan
+        raw = np.ascontiguousarray(values).reshape(n, 9).view(np.int64)  # compare bits, so that nan equals nan
         changes = np.concatenate([[True], (raw[1:] != raw[:-1]).any(axis=1)])
         return Covariances(values[changes], np.cumsum(changes) - 1)
 
     def part(self, at: slice | Index | Mask) -> Covariances:
-        """The rows of a slice, of indices or of a mask."""
+        """Return the rows of a slice, of indices or of a mask."""
         return Covariances(self.distinct, self.index[at])
 
     def joined(self, *others: Covariances) -> Covariances:
-        """These rows and then those of others."""
+        """Return these rows followed by those of others."""
         index, n = [self.index], len(self.distinct)
         for other in others:
             index.append(np.where(other.index < 0, -1, other.index + n))
@@ -133,14 +132,13 @@ class Covariances:
 
 @dataclass(frozen=True)
 class SampleBlock:
-    """Columns of one stream: N messages in their order of arrival.
+    """Columns of one stream: N messages in order of arrival.
 
-    stream: whose they are. stamps_ns: (N,) of the header. values: (N, 3) velocity, m/s, in the DVL's frame or in that
-    of `frames`; of the IMU (N, 7), a unit quaternion (x, y, z, w) of ``rotation_enu_from_body`` and the angular
-    velocity, rad/s, body frame, nan where a message does not give one. covariances: of velocities. frames: (N,) of the
-    reference, places in `FRAMES`. refused: (N,) 0 for a sample, else 1 + the place in `reasons` of why the message is
-    none (wrong frame, no bottom lock, undecodable ...); the row's other columns then mean nothing. arrival: (N,)
-    strictly increasing, by which the rows of all streams are put in the order in which they arrived.
+    stamps_ns: (N,) of the header. values: (N, 3) velocity, m/s, in the DVL frame or the frame of `frames`; for the IMU
+    (N, 7), unit quaternion (x, y, z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body frame, nan
+    where missing. covariances: of velocities. frames: (N,) of the reference, indices in `FRAMES`. refused: (N,) 0 for a
+    sample, else 1 + index in `reasons` of the reason (wrong frame, no bottom lock, undecodable ...); other columns of
+    such a row are undefined. arrival: (N,) strictly increasing, the order of arrival over all streams.
     """
 
     stream: Stream
@@ -170,16 +168,16 @@ class SampleBlock:
 
     @property
     def orientation(self) -> Array:
-        """(N, 4) of the IMU."""
+        """Orientation (N, 4) of the IMU."""
         return self.values[:, :4]
 
     @property
     def angular_velocity(self) -> Array:
-        """(N, 3) rad/s of the IMU."""
+        """Angular velocity (N, 3) rad/s of the IMU."""
         return self.values[:, 4:]
 
     def part(self, at: slice | Index | Mask) -> SampleBlock:
-        """The rows of a slice, of indices or of a mask."""
+        """Return the rows of a slice, of indices or of a mask."""
         return replace(
             self,
             stamps_ns=self.stamps_ns[at],
@@ -191,7 +189,7 @@ class SampleBlock:
         )
 
     def joined(self, *others: SampleBlock) -> SampleBlock:
-        """These rows and then those of others, of the same stream; many at once, as each time all are copied."""
+        """Return these rows followed by those of others of the stream; each call copies all rows."""
         reasons = tuple(dict.fromkeys(reason for each in (self, *others) for reason in each.reasons))
         refused = []
         for each in (self, *others):
@@ -207,8 +205,8 @@ class SampleBlock:
         )
 
     def samples(self) -> Iterator[Sample | str]:
-        """Row by row as live: the sample, or why a message is none."""
-        covariances: list[Array | None] = [*self.covariances.distinct, None]  # -1 is the last one
+        """Yield each row as a live sample, or the reason why its message is none."""
+        covariances: list[Array | None] = [*self.covariances.distinct, None]  # index -1 is None
         rows = zip(
             self.stamps_ns.tolist(), self.values.tolist(), self.covariances.index.tolist(), self.frames.tolist(),
             self.refused.tolist(), strict=True,
@@ -240,10 +238,10 @@ def sample_block(
     refused: Codes | None = None,
     reasons: Sequence[str] = (),
 ) -> SampleBlock:
-    """A `SampleBlock`, with what is the same for all rows given once.
+    """Return a `SampleBlock`; values common to all rows may be given once.
 
-    covariance: (3, 3) or (N, 3, 3) (m/s)², None where not given. frames: one, or (N,) places in `FRAMES`. arrival: by
-    default in the order of the rows, and of use only if it is the one stream.
+    covariance: (3, 3) or (N, 3, 3) (m/s)², None if not given. frames: one, or (N,) indices in `FRAMES`. arrival:
+    default is row order, valid for a single stream only.
     """
     n = len(stamps_ns)
     if not isinstance(covariance, Covariances):
@@ -261,19 +259,19 @@ def sample_block(
 
 
 def no_samples(stream: Stream) -> SampleBlock:
-    """A block without rows."""
+    """Return a block without rows."""
     return sample_block(stream, np.zeros(0, dtype=np.int64), np.zeros((0, WIDTH[stream])))
 
 
 class Streams(NamedTuple):
-    """What arrived on all three streams in one stretch of a recording; `SampleBlock.arrival` says in which order."""
+    """Blocks of all three streams in one stretch of a recording, ordered by `SampleBlock.arrival`."""
 
     dvl: SampleBlock
     reference: SampleBlock = no_samples(Stream.REFERENCE)
     imu: SampleBlock = no_samples(Stream.IMU)
 
     def halves(self) -> tuple[Streams, Streams]:
-        """The rows that arrived first, and the others."""
+        """Return the first and second half of the rows by arrival."""
         middle = np.sort(np.concatenate([each.arrival for each in self]))[sum(map(len, self)) // 2]
         at = [int(np.searchsorted(each.arrival, middle)) for each in self]
         return (
@@ -282,7 +280,7 @@ class Streams(NamedTuple):
         )
 
     def arriving_by_stamp(self) -> Streams:
-        """The same as if every message arrived when it was stamped; at the same stamp IMU, reference, DVL."""
+        """Return the streams with arrival in order of stamps; for equal stamps IMU, reference, DVL."""
         blocks = (self.imu, self.reference, self.dvl)
         stamps = np.concatenate([block.stamps_ns for block in blocks])
         arrival = np.empty(len(stamps), dtype=np.int64)
@@ -295,7 +293,7 @@ class Streams(NamedTuple):
         return Streams(dvl, reference, imu)
 
     def in_order(self) -> Iterator[tuple[Stream, Sample | str]]:
-        """All rows as live, in their order of arrival."""
+        """Yield all rows as live samples, in order of arrival."""
         rows = [block.samples() for block in self]
         streams = np.repeat(np.arange(3), [len(block) for block in self])
         order = np.argsort(np.concatenate([block.arrival for block in self]), kind="stable")
@@ -304,9 +302,9 @@ class Streams(NamedTuple):
 
 
 class SampleUse:
-    """Why a DVL sample in order is not used by any model; `USED` if it is. Codes of `AlignedBlock.verdict`.
+    """Reason why no model uses a DVL sample in order, or `USED`. Codes of `AlignedBlock.verdict`.
 
-    AWAITING: not known until it has, or can no longer have, an angular velocity.
+    AWAITING: until an angular velocity arrives, or can no longer arrive.
     """
 
     USED, SLOW, FROZEN, TURNING, NO_TURN_RATE, AWAITING = range(6)
@@ -314,7 +312,7 @@ class SampleUse:
 
 
 class Pairing:
-    """Whether a DVL sample has a reference velocity, or why not. Codes of `AlignedBlock.pairing`."""
+    """State of the pairing of a DVL sample with a reference velocity. Codes of `AlignedBlock.pairing`."""
 
     AWAITING, PAIRED, UNPAIRED, WITHOUT_ATTITUDE = range(4)
     NAMES = ("awaiting_reference", "paired", "unpaired", "without_attitude")
@@ -322,17 +320,16 @@ class Pairing:
 
 @dataclass(frozen=True)
 class AlignedBlock:
-    """N DVL samples in order of stamps, with what the other streams say at their times.
+    """N DVL samples in order of stamps, with the other streams interpolated at their times.
 
-    stamps_ns: (N,) compensated for dvl_time_offset. row: (N,) number of the DVL's message since the start, from 0.
+    stamps_ns: (N,) corrected for dvl_time_offset. row: (N,) number of the DVL message since the start, from 0.
     velocity_dvl: (N, 3) m/s, DVL frame. covariance: (N, 3, 3) (m/s)² of it, nan where not given. interval_ns: (N,)
-    since the sample before, 0 for the first. verdict: (N,) see `SampleUse`. prior_known: (N,) whether prior sway and
-    heave were known by then. attitude: (N, 7) interpolated quaternion (x, y, z, w) of ``rotation_enu_from_body`` and
-    angular velocity, rad/s, body frame; nan where not known. pairing: (N,) see `Pairing`. reference: (N, 12)
-    interpolated velocity (3), m/s, and covariance (9, nan where not given), in the frame of frames: (N,) places in
-    `FRAMES`; nan where unpaired. unmeasured: (N,) a bit (1, 2, 4) for each axis of that frame that the reference does
-    not measure. weight: (N,) share of its own information that a sample's reference brings: below 1 where neighbours
-    share it.
+    since the previous sample, 0 for the first. verdict: (N,) see `SampleUse`. prior_known: (N,) prior sway and heave
+    were known. attitude: (N, 7) quaternion (x, y, z, w) of ``rotation_enu_from_body`` and angular velocity, rad/s, body
+    frame; nan where unknown. pairing: (N,) see `Pairing`. reference: (N, 12) velocity (3), m/s, and covariance (9, nan
+    where not given), in the frame of frames: (N,) indices in `FRAMES`; nan where unpaired. unmeasured: (N,) a bit (1,
+    2, 4) per axis of that frame that the reference does not measure. weight: (N,) information weight of the reference,
+    below 1 where neighbours share its samples.
     """
 
     stamps_ns: Stamps
@@ -353,34 +350,34 @@ class AlignedBlock:
         return len(self.stamps_ns)
 
     def share(self, with_reference: bool) -> Array:
-        """(N,) share of its own information that a row brings: all of it to models that need no reference."""
+        """Return the information weight (N,) of each row: 1 for models without reference."""
         return self.weight if with_reference else np.ones(len(self))
 
     def part(self, at: slice | Index | Mask) -> AlignedBlock:
-        """The rows of a slice, of indices or of a mask."""
+        """Return the rows of a slice, of indices or of a mask."""
         return AlignedBlock(*(column[at] for column in self.columns()))
 
     def columns(self) -> tuple[NDArray[Any], ...]:
-        """All columns, in the order of the fields."""
+        """Return all columns, in the order of the fields."""
         return tuple(getattr(self, each.name) for each in fields(self))
 
     @cached_property
     def usable(self) -> Mask:
-        """(N,) rows for models that need nothing else."""
+        """Mask (N,) of rows for models without further needs."""
         return self.verdict == SampleUse.USED
 
     @cached_property
     def oriented(self) -> Mask:
-        """(N,) rows for models that need attitude and angular velocity."""
+        """Mask (N,) of rows for models that need attitude and angular velocity."""
         return self.usable & ~np.isnan(self.attitude[:, 0]) & ~np.isnan(self.attitude[:, 4])
 
     @cached_property
     def paired(self) -> Mask:
-        """(N,) rows for models that need a reference velocity."""
+        """Mask (N,) of rows for models that need a reference velocity."""
         return self.usable & (self.pairing == Pairing.PAIRED)
 
     def reasons(self) -> list[str]:
-        """(N,) in words, why a row does not go to every model: the gates' verdict, else the pairing's."""
+        """Return per row (N,) in words why some models cannot use it: verdict of the gates, else pairing."""
         return [
             SampleUse.NAMES[verdict] if verdict else Pairing.NAMES[pairing]
             for verdict, pairing in zip(self.verdict.tolist(), self.pairing.tolist(), strict=True)

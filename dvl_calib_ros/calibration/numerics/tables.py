@@ -1,4 +1,4 @@
-"""Columns that grow at their end and are forgotten at their start, so that memory stays flat."""
+"""Tables of columns that grow at the end and shrink at the start, with bounded memory."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 SMALLEST = 128
-# What is held fills no more than this of the room, so that rows are moved a few times in all.
+# Largest filled share of the capacity, so that rows are seldom moved.
 FULL = 0.75
 
 
 class RowTable:
-    """Rows with a column per entry of `LAYOUT` (dtype, shape of one element), which are attributes of these names.
+    """Rows with a column per entry of `LAYOUT` (dtype, shape of one element), an attribute of that name.
 
-    The arrays are longer than what they hold: rows are in the slots begin .. size - 1. A row's number, counted since
-    the start, stays its own: slot + base. Where memory `IS_REUSED`, rows may be overwritten by others once they are
-    forgotten: only where nobody keeps a view of them.
+    Rows are in the slots begin .. size - 1 of longer arrays. The number of a row since the start is slot + base, and
+    constant. If memory `IS_REUSED`, discarded rows may be overwritten, so no views of them may be kept.
     """
 
     LAYOUT: ClassVar[Mapping[str, tuple[Any, tuple[int, ...]]]]
@@ -33,11 +32,11 @@ class RowTable:
 
     @property
     def end(self) -> int:
-        """Number of the row that comes next."""
+        """Number of the next row."""
         return self.base + self.size
 
     def extend(self, n: int) -> slice:
-        """The slots of n new rows, to be filled in."""
+        """Return the slots of n new rows, to be filled by the caller."""
         if self.size + n > self._capacity:
             self._make_room(n)
         first = self.size
@@ -45,7 +44,7 @@ class RowTable:
         return slice(first, self.size)
 
     def reserve(self, n: int) -> None:
-        """Take room for n rows at a time, and write to it: memory that is only taken grows as it is filled."""
+        """Reserve and touch memory for n rows, so that it does not grow while it is filled."""
         held = self.size - self.begin
         if n > FULL * self._capacity:
             self._move(math.ceil(n / FULL))
@@ -59,7 +58,7 @@ class RowTable:
         self._move(capacity)
 
     def _move(self, capacity: int) -> None:
-        """Have what is held at the beginning of so much room, in the memory that there is where that `IS_REUSED`."""
+        """Move the rows to the start of an array of this capacity; the present one if it `IS_REUSED`."""
         held = self.size - self.begin
         for name, (dtype, shape) in self.LAYOUT.items():
             before = getattr(self, name)
@@ -70,16 +69,16 @@ class RowTable:
         self.begin, self.size, self._capacity = 0, held, capacity
 
     def forget_before(self, slot: int) -> None:
-        """Give up the rows before a slot."""
+        """Discard the rows before a slot."""
         self.begin = max(self.begin, slot)
 
     def between(self, column: NDArray[np.int64], first: int, end: int) -> slice:
-        """Slots of the rows where one of the columns, increasing, is from `first` on and below `end`."""
+        """Return the slots of rows with an increasing column from `first` to below `end`."""
         held = column[self.begin : self.size]
         start, stop = (np.searchsorted(held, (first, end)) + self.begin).tolist()
         return slice(start, stop)
 
     def clear(self) -> None:
-        """Give up all rows; numbers go on."""
+        """Discard all rows; numbers continue."""
         self.base += self.size
         self.begin = self.size = 0

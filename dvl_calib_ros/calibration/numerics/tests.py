@@ -1,7 +1,7 @@
 """Significance of one test (chi-square) and of many (Holm), without SciPy.
 
-Calibrating asks for a handful of these numbers; `scipy.special`, which has them for arrays (`distributions`), takes a
-quarter of a second of CPU to import, a third of what a short replay may take.
+A calibration needs few of these numbers; importing `scipy.special` (`distributions`) takes a quarter of a second of
+CPU.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from .frames import Array
 
 
 def holm(p_values: Sequence[float]) -> Array:
-    """p-values (N,) as large as they are by Holm's step-down procedure, that holds whatever their dependence."""
+    """Return p-values (N,) adjusted by Holm's step-down procedure, which holds under any dependence."""
     p = np.asarray(p_values, dtype=float)
     order = np.argsort(p)
     adjusted = np.empty(len(p))
@@ -25,28 +25,28 @@ def holm(p_values: Sequence[float]) -> Array:
 
 
 def smallest_found(p: float, power: float) -> float:
-    """Return the true size, in σ, that a two-sided test of a normal error at level p finds with a power above 0.5."""
+    """Return the true error, in σ, that a two-sided test at level p detects with a power above 0.5."""
     return math.sqrt(chi2_isf(p, 1.0)) + math.sqrt(chi2_isf(2.0 * (1.0 - power), 1.0))
 
 
 _EPSILON = 4e-16
-# Passes for a quantile, of which Newton takes about ten; terms of a fraction, which takes about √dof
+# Limits of passes for a quantile (Newton takes about ten) and of terms of a fraction (about √dof).
 _PASSES, _TERMS = 200, 100_000
 
 
 def chi2_cdf(x: float, dof: float) -> float:
-    """P(X <= x) of chi-square with dof > 0, not necessarily whole."""
+    """Return P(X <= x) of chi-square with dof > 0, not necessarily an integer."""
     return _tails(0.5 * x, 0.5 * dof)[0]
 
 
 def chi2_sf(x: float, dof: float) -> float:
-    """P(X > x)."""
+    """Return P(X > x) of chi-square."""
     return _tails(0.5 * x, 0.5 * dof)[1]
 
 
 @lru_cache
 def chi2_isf(p: float, dof: float) -> float:
-    """x that chi-square exceeds with probability p, 0 < p < 1: Newton's method between bounds that close in."""
+    """Return the x that chi-square exceeds with probability p, 0 < p < 1, by bracketed Newton's method."""
     a, x, low, high = 0.5 * dof, 0.5 * dof, 0.0, math.inf
     for _ in range(_PASSES):
         below, above = _tails(x, a)
@@ -63,7 +63,7 @@ def chi2_isf(p: float, dof: float) -> float:
 
 
 def _tails(x: float, a: float) -> tuple[float, float]:
-    """Regularised incomplete gamma functions P(a, x) and Q(a, x): the smaller one as exact as logarithms are.
+    """Return the regularised incomplete gamma functions P(a, x) and Q(a, x); the smaller one to rounding.
 
     Abramowitz and Stegun, Handbook of Mathematical Functions, 6.5.29 (series) and 6.5.31 (continued fraction).
     """
@@ -79,7 +79,7 @@ def _tails(x: float, a: float) -> tuple[float, float]:
             total += term
         below = scale * total
         return below, 1.0 - below
-    # Lentz: its numerators and denominators as ratios of neighbours
+    # Lentz: ratios of neighbouring numerators and denominators
     b = x + 1.0 - a
     c, d = math.inf, 1.0 / b
     fraction = d

@@ -1,1 +1,1 @@
-"""Clock offsets, rotation, lever arm and scale of the three instruments, from their data alone."""
+"""Registration: clock offsets, mounting, lever arm and scale from the data of DVL, reference and IMU."""

@@ -1,7 +1,7 @@
-"""Clock domains: streams stamped by one clock or by several, from the times of arrival.
+"""Clock domains: streams stamped by one clock or by several, from their arrival times.
 
-Where velocities and turns show how the clocks stand, it does not matter when messages came. Where they do not, stamps
-that differ by more than any delay that is looked for pair velocities of other times.
+Arrival times matter where the motion does not determine the delays. There, an offset beyond every searched delay pairs
+velocities of different times.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..streams.interpolation import LONGEST_DELAY_S
 
 
 class ArrivalOffset(NamedTuple):
-    """Stamps of a stream are ahead of those of the other by so many s beyond what the parameters take off."""
+    """Offset `ahead` (s) of the stamps of a stream relative to another stream, beyond the configured delays."""
 
     stream: Stream
     other: Stream
@@ -27,20 +27,20 @@ class ArrivalOffset(NamedTuple):
 
     @property
     def side(self) -> str:
-        """In words."""
+        """Direction of the offset in words."""
         return "ahead of" if self.ahead > 0.0 else "behind"
 
 
 def limit_s(parameters: Parameters) -> float:
-    """Clocks that differ by less are for the calibration to find, s."""
+    """Return the largest clock offset that the calibration estimates, s."""
     return LONGEST_DELAY_S + parameters.position_window
 
 
 def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, late_s: float = 0.0) -> list[ArrivalOffset]:
-    """Streams by another clock than the rest.
+    """Return the streams stamped by another clock than the rest.
 
-    ahead: of each stream, the DVL first, how far its stamps are ahead of its messages' arrival, s, beside any common
-    time. late_s: by how much that may be wrong.
+    ahead: stamp minus arrival time of each stream, s, up to a common offset; the DVL first. late_s: uncertainty of
+    these values.
     """
     offsets = {
         Stream.DVL: parameters.dvl_time_offset,
@@ -50,7 +50,7 @@ def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, late_s
     corrected = {stream: seconds - offsets[stream] for stream, seconds in ahead.items()}
     if len(corrected) < 2:
         return []
-    # beside the DVL's, unless of three that is the one that is alone
+    # relative to the DVL, unless the DVL is the outlier of three
     other = next(iter(corrected))
     if len(corrected) > 2:
         middle = sorted(corrected.values())[1]
@@ -61,7 +61,7 @@ def arrival_offset(ahead: Mapping[Stream, float], parameters: Parameters, late_s
         for stream in corrected
         if stream is not other
     )
-    # samples that are old when they are stamped arrive by neither clock's fault
+    # samples that are old when they are stamped have a configured delay, but no clock offset
     return [
         each
         for each in found
@@ -74,27 +74,27 @@ SPOKEN: Mapping[Stream, str] = {
     Stream.REFERENCE: "the reference's",
     Stream.IMU: "the IMU's",
 }
-# Seconds by which a well-known clock is ahead of UTC, to the second (since 2017).
+# Offsets of known time scales from UTC, in whole seconds (since 2017).
 WELL_KNOWN = {18: "GPS time, without its leap seconds, is 18 s ahead of UTC", 37: "TAI is 37 s ahead of UTC"}
 
 
-# So many messages of a stream, evenly spread, tell well enough how far its stamps are ahead; no more are kept.
+# Most stamps kept per stream, evenly spread; more do not improve the median.
 MOST = 8192
-# Live, one by one, so many are added together.
+# Live messages per addition.
 AT_ONCE = 64
 
 
 class StreamClocks:
-    """Of messages the stamp against that of the DVL's message that arrived last before it, or live the next."""
+    """Stamps of each stream relative to the last DVL message before it (live: the next one)."""
 
     def __init__(self) -> None:
         self._ahead: dict[Stream, _Spread] = {stream: _Spread() for stream in (Stream.REFERENCE, Stream.IMU)}
-        self._newest: dict[Stream, int] = {}  # live, stamps by stream, and what waits to be added of each
+        self._newest: dict[Stream, int] = {}  # live: newest stamp by stream, and values to be added
         self._waiting: dict[Stream, list[int]] = {stream: [] for stream in self._ahead}
-        self._said: tuple[Parameters, list[Reason]] | None = None  # of all that came
+        self._said: tuple[Parameters, list[Reason]] | None = None  # of all messages so far
 
     def arrived(self, stream: Stream, stamp_ns: int) -> None:
-        """Take one message of a stream, live."""
+        """Add one live message of a stream."""
         self._newest[stream] = stamp_ns
         if stream is Stream.DVL:
             for other, waiting in self._waiting.items():
@@ -109,7 +109,7 @@ class StreamClocks:
         self._waiting[stream] = []
 
     def add(self, streams: Streams) -> None:
-        """Take what arrived one after the other."""
+        """Add blocks of recorded messages, in order."""
         self._said = None
         dvl = _read(streams.dvl)
         for stream, block in ((Stream.REFERENCE, streams.reference), (Stream.IMU, streams.imu)):
@@ -119,7 +119,7 @@ class StreamClocks:
             self._ahead[stream].add(other.stamps_ns - dvl.stamps_ns[before])
 
     def objections(self, parameters: Parameters) -> list[Reason]:
-        """What clocks that differ by more than any model looks for say against every calibration."""
+        """Return findings of clock offsets beyond the range of every model."""
         if self._said is None or self._said[0] is not parameters:
             self._said = parameters, self._objections(parameters)
         return self._said[1]
@@ -147,19 +147,19 @@ class StreamClocks:
 
 
 class _Spread:
-    """Every so many-th of some numbers, for them to be no more than MOST. kept: those (M,)."""
+    """Evenly thinned numbers, at most MOST. kept: (M,)."""
 
     def __init__(self) -> None:
         self.kept: Stamps = np.zeros(0, dtype=np.int64)
         self._every = 1
-        self._next = 0  # of what comes, the place of the next one to be kept
+        self._next = 0  # index of the next kept number in the input
 
     def add(self, values: Stamps) -> None:
-        """Take further ones (N,)."""
+        """Add numbers (N,)."""
         self.kept = np.concatenate([self.kept, values[self._next :: self._every]])
         self._next = (self._next - len(values)) % self._every
         while len(self.kept) > MOST:
-            # the next one to be kept is the one after the last by so many, where that one stays
+            # if the last number remains (odd count), the next one is a doubled step after it
             self._next += self._every * (len(self.kept) % 2)
             self.kept = self.kept[::2]
             self._every *= 2

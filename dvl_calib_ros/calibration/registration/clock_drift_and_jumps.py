@@ -1,7 +1,7 @@
-"""Clocks that do not stand still beside each other: one that drifts, or that leaps once.
+"""Detection of a clock that drifts, or that steps once, relative to the others.
 
-A recording is registered in stretches. Where their clocks are not one, it is asked which single clock explains them:
-one that is later by so much for each second, or from some stretch on; the stretch in which it leaps may be anything.
+A recording is registered in stretches of time. If their delays differ, the single clock that explains the differences
+is selected: by a drift, or by a step between stretches or within one (whose delay is then free).
 """
 
 from __future__ import annotations
@@ -20,28 +20,30 @@ from ..streams.interpolation import DvlColumns, ImuColumns, TurnRates
 from .gauss_newton import APART, ARM, LATE, Fitted, MotionFit, N
 from .motion_streams import MotionStreams
 
-# By how much (δ, ρ) of a fit are more for each second that a stream's stamps are later.
+# Change of (δ, ρ) of a fit per second of delay of a stream.
 DIRECTIONS: Mapping[str, tuple[float, float]] = {"dvl": (1.0, 0.0), "reference": (-1.0, 1.0), "imu": (0.0, -1.0)}
-# Lags of interpolation and filters change by as much from one stretch to another, s.
+# σ of the changes of interpolation and filter delays between stretches, s.
 LAGS_S = 0.03
-# From here on a clock that moves is one, from end to end: s, in σ, and in chi-square; another clock has to explain it
-# by so much less to be told from it, and what is left may be so much for each degree of freedom.
+# Thresholds of a clock change from end to end: seconds, σ, chi-square gain, chi-square margin to the next clock, and
+# largest residual chi-square per degree of freedom.
 SHOWN_FROM_S, SIGMAS, GAIN, TOLD_APART, LEFT = 0.1, 6.0, 18.0, 8.0, 4.0
-# A leap ahead leaves a hole of its size in the stamps, which is known to such a share.
+# Smallest gap in the stamps as a share of the forward step that caused it.
 HOLE = 0.8
-# More is no parameter's (`dvl_clock_drift`, s/s, and `dvl_time_jump`, s).
+# Limits of the parameters `dvl_clock_drift`, s/s, and `dvl_time_jump`, s.
 MOST_DRIFT, MOST_LEAP_S = 0.01, 10.0
-# A clock that moves is looked for in stretches this long, s, and no more of them.
+# Length of the stretches, s, and most stretches of a recording.
 STRETCH_S, MOST_STRETCHES = 90.0, 16
-# What it costs, in chi-square, that one stretch is anything; and so many at least on either side of a leap.
+# Chi-square cost of a stretch with a free delay, and fewest stretches on either side of a step.
 ANYTHING, EACH_SIDE = 10.0, 2
 NO_STREAMS: Mapping[str, Array] = {}
 
 
 @dataclass(frozen=True)
 class ClockChange:
-    """whose: by the name of `DIRECTIONS`, "" where that does not show. drift: by how much later its stamps get, s/s
-    since time 0. leap: by how much later they are from `at` (s) on. std: σ of whichever of both it is."""
+    """Drift (s/s since time 0) of one clock, or step: additional delay `leap` (s) from `at` (s) on.
+
+    whose: key of `DIRECTIONS`, "" if not identifiable. std: σ of drift or step.
+    """
 
     whose: str
     drift: float = 0.0
@@ -51,7 +53,7 @@ class ClockChange:
 
     @property
     def reason(self) -> Reason:
-        """Whose clock moves, with the remedy."""
+        """Finding that names the clock, with the remedy."""
         whose = {"dvl": "the DVL's", "imu": "the IMU's", "reference": "the reference's", "": "one"}[self.whose]
         ppm = {"ppm": 1e6 * self.drift, "std": 1e6 * self.std}
         if self.drift and self.whose == "dvl":
@@ -62,10 +64,9 @@ class ClockChange:
         return finding("CLOCK_LEAPS", whose=whose, way=way, seconds=abs(self.leap), std=self.std, at=self.at)
 
     def timed(self, motion: MotionStreams, fit: MotionFit, x: Array, rotation: Array, level: float) -> ClockChange:
-        """A leap ahead at the hole that it leaves in the stamps, if there is just one; else at the time at which the
-        clocks before it and those after it explain most together.
+        """Return the step at the only matching gap in the stamps, else at the time of least total cost.
 
-        x: (9,) the state before it. rotation: (3, 3) and level (m/s), that `fit` found with it taken off.
+        x: (9,) state before the step. rotation (3, 3), level (m/s): fitted by `fit` with the step corrected.
         """
         if not self.leap:
             return self
@@ -83,11 +84,11 @@ class ClockChange:
             return self
         place = int(np.argmin(np.cumsum((before[own] - behind[other])[near])))
         seconds = float(fit.times[shared][near][place])
-        # between the DVL's stamps before it and those after it
+        # converted to DVL stamps, midway between those before and after a forward step
         return replace(self, at=seconds + (float(x[APART]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
 
     def taken_off(self, epoch_ns: int) -> dict[str, float]:
-        """The parameters that take it off, which only the DVL's clock has. epoch_ns: stamp of time 0."""
+        """Return the parameters that correct a change of the DVL clock. epoch_ns: stamp of time 0."""
         if self.whose != "dvl" or abs(self.drift) > MOST_DRIFT or abs(self.leap) > MOST_LEAP_S:
             return {}
         if self.drift:
@@ -95,7 +96,7 @@ class ClockChange:
         return {"dvl_time_jump": round(self.leap, 3), "dvl_time_jump_at": round(1e-9 * epoch_ns + self.at, 3)}
 
     def steadied(self, motion: MotionStreams) -> MotionStreams:
-        """The motion without it."""
+        """Return the motion with the change corrected."""
         m = motion
         if self.whose == "reference":
             times, at = self._true(m.reference_times)
@@ -108,39 +109,41 @@ class ClockChange:
         return replace(m, dvl=DvlColumns(times, m.dvl.velocity[at]))
 
     def _true(self, times: Array) -> tuple[Array, Mask]:
-        """Times that increase, and whose (N,) they are."""
+        """Return the corrected times that increase, and their mask (N,)."""
         true = times - self.drift * times - self.leap * (times >= self.at)
         at = np.diff(np.maximum.accumulate(true), prepend=-np.inf) > 0.0
         return true[at], at
 
 
 class _Course(NamedTuple):
-    """of: (S,) by how much a clock is later in each stretch, for each unit. kept: (S,) False where it is anything. at:
-    (s) since when, None of a drift."""
+    """Hypothetical delay (S,) in each stretch per unit of the change, with a drift or a step at `at` (s).
+
+    kept: (S,) False for a stretch with a free delay. at: None for a drift.
+    """
 
     of: Array
     kept: Mask
     at: float | None
 
     def fits(self, value: float, stamps: Array | None, reach: float) -> bool:
-        """Whether a clock that is later by value (s) has the stamps (N,) s for that; None for unknown ones."""
+        """Return whether stamps (N,) s allow a step of value (s); a forward step needs a gap. None: unknown stamps."""
         if self.at is None or value <= 0.0 or stamps is None:
             return True
         return bool(len(_holes(stamps, value, self.at, reach)))
 
 
 def stamps(motion: MotionStreams) -> Mapping[str, Array]:
-    """Times (N,) s of each stream, by the names of `DIRECTIONS`."""
+    """Return the times (N,) s of each stream, by the keys of `DIRECTIONS`."""
     return {"dvl": motion.dvl.times, "reference": motion.reference_times, "imu": motion.imu.times}
 
 
 def _reach(times: Array) -> float:
-    """About a leap within times (N,), how far off (s) it may be."""
+    """Return the uncertainty (s) of the time of a step within times (N,)."""
     return float(np.ptp(times)) / MOST_STRETCHES + STRETCH_S
 
 
 def _holes(times: Array, leap: float, at: float, reach: float) -> Index:
-    """Which of times (N,) come before a hole of the size of a leap (s), within reach of it."""
+    """Return indices of times (N,) before gaps of the size of a step (s), within reach of it."""
     gap = np.diff(times)
     return np.flatnonzero((gap > HOLE * leap) & (np.abs(times[1:] - at) < reach + gap))
 
@@ -148,17 +151,17 @@ def _holes(times: Array, leap: float, at: float, reach: float) -> Index:
 def unsteady(
     times: Array, stretches: Sequence[Fitted], is_turned: bool, streams: Mapping[str, Array] = NO_STREAMS
 ) -> ClockChange | None:
-    """Which clock moves through stretches at times (S,) s; None where that is not beyond doubt.
+    """Return the significant change of one clock over stretches at times (S,) s, else None.
 
-    streams: as of `stamps`; where stamps have no hole, their clock has not leapt ahead.
+    streams: stamps of each stream; a clock whose stamps have no gap has no forward step.
     """
     if len(times) < 2 * EACH_SIDE:
         return None
-    # where the vehicle hardly speeds up, a clock looks like an arm; but that is the same in all stretches
+    # a delay without acceleration looks like a lever arm, which is the same in all stretches
     states = [*range(N)[ARM], APART, LATE]
     seen = np.array([each.x[states] for each in stretches])
     lags = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
-    # of a stretch blocks of time are few: noise that lasts shows in what is left
+    # a stretch has few time blocks, so the autocorrelation of its residuals estimates lasting noise
     lasting = [np.maximum(each.inflation / each.raised[states], 1.0) for each in stretches]
     p = np.array(
         [each.p[np.ix_(states, states)] * np.outer(*[by] * 2) for each, by in zip(stretches, lasting, strict=True)]
@@ -179,7 +182,7 @@ def unsteady(
                 found.append((left, value, std, name, course))
     left, value, std, name, course = min(found, key=lambda each: each[0])
     length = float(np.ptp(times)) if course.at is None else 1.0
-    # stretches scatter by more than they claim where noise lasts as long as they do: all is worth as much less
+    # noise as long as a stretch adds scatter, so all evidence is scaled down
     scatter = max(1.0, left / (seen.size - len(states) - 1.0))
     std *= math.sqrt(scatter)
     is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > SIGMAS * std
@@ -191,7 +194,7 @@ def unsteady(
 
 
 def _leaps(times: Array) -> Iterator[_Course]:
-    """Between two stretches, and within one."""
+    """Yield steps between two stretches, and within one."""
     n = np.arange(len(times))
     for at in range(EACH_SIDE, len(times) - EACH_SIDE + 1):
         yield _Course((n >= at).astype(float), n >= 0, float(times[at - 1 : at + 1].mean()))
@@ -200,7 +203,7 @@ def _leaps(times: Array) -> Iterator[_Course]:
 
 
 def _explained(seen: Array, weight: Array, moved: Array, kept: Mask) -> tuple[float, float, float]:
-    """What is left in chi-square of states (S, k) that are one, and `moved` (S, k) times a value; that, and its σ."""
+    """Return residual chi-square, value and its σ for states (S, k): one common state plus `moved` (S, k) · value."""
     k = seen.shape[1]
     h = np.concatenate([np.broadcast_to(np.eye(k), (len(seen), k, k)), moved[:, :, None]], axis=2)[kept]
     z, w = seen[kept], weight[kept]

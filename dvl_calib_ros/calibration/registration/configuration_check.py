@@ -1,8 +1,7 @@
-"""What configuration the data fit, where the one given is grossly wrong: frames, axes, mounting.
+"""Check of the configuration against the data: frames, axes, mounting.
 
-A mounting wrong by 45 degrees, or a reference that is not in the frame that it is said to be in, shows in a filter only
-as samples that are gated. So the motion is registered as it would be with the reference in the body, in ENU and in NED,
-with whatever mounting fits, and what fits is said.
+In a filter a mounting that is wrong by 45 degrees, or a wrong reference frame, shows only as rejected samples. So the
+motion is registered with the reference in the body, in ENU and in NED, each with free mounting.
 """
 
 from __future__ import annotations
@@ -23,28 +22,28 @@ from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitt
 from .motion_streams import GAP_S, Curves, MotionStreams
 from .registration import Registration
 
-# A configuration is wrong from here on: what is left of the motion, as a share of it, is that of 10 degrees.
+# Misfit, as a share of the speed, from which a configuration is wrong: that of 10 degrees.
 WRONG_FROM = math.sin(math.radians(10.0))
-# What is said to fit leaves less than this share, and less than half of what the configuration given leaves.
+# Largest misfit of a reported configuration, as a share of the speed and of the misfit of the configured one.
 FITS_BELOW, BETTER_BY = math.sqrt(0.05), 0.5
-# A rotation this near another is that one, rad: what is left is misalignment, for the calibration to find.
+# Rotations nearer than this are the same but for a misalignment, rad.
 SAME_WITHIN = math.radians(12.0)
-# Mountings are drawn with multiples of such an angle, rad, and one that is the same but for a misalignment is named.
+# Step of mounting angles in drawings, rad; a fitted mounting near a multiple is reported as the multiple.
 DRAWN = math.pi / 4.0
-# Signs of the DVL's axes: as given, y or z mirrored, turned over. A vehicle that goes ahead shows that of x.
+# Signs of the DVL axes: as configured, y or z mirrored, both. Motion ahead determines the sign of x.
 SIGNS: Sequence[Array] = [np.array([1.0, y, z]) for y in (1.0, -1.0) for z in (1.0, -1.0)]
-# What leaves so many times what the registration leaves is no explanation, by few rows and by all.
+# Largest residual of an explanation as a multiple of the registered one, and an extra factor for few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
-# An axis points the other way, or is scaled alone, where its factor says so by this many σ (two-sided p = 6e-7: eight
-# tests of each look, and a look every few blocks), and by so much more than another speed of sound would.
+# σ from which an axis factor is significant (two-sided p = 6e-7: eight tests per check, a check every few blocks), and
+# the smallest excess factor of one axis, above any error of the speed of sound.
 SIGNIFICANT, SCALED_ALONE = 5.0, 0.2
-# A registration explains the motion with a misalignment (rad) and a scale below these.
+# Largest misalignment (rad) and scale error of a right configuration.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
-# So many σ of a turn are chance.
+# Rotations below this multiple of σ are insignificant.
 BY_CHANCE = 3.0
-# From where the DVL's delay is looked for, s: within what a calibration finds, at a step that is short beside waves.
+# Initial DVL delays, s: the range of a calibration, in steps that are short compared to waves.
 LATE_S = (-2.4, -1.2, 0.0, 1.2, 2.4)
-# Whatever else is tried than what is configured is tried without another lever arm.
+# Constraints of alternative configurations: synchronised reference, configured lever arm.
 WITHOUT_ARM: Sequence[Array] = (REFERENCE, *np.eye(N)[ARM])
 _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
@@ -57,10 +56,16 @@ def fitting_configuration(
     given: Registration | None,
     dvl_axes: str = "from_message",
 ) -> Reason | None:
-    """What fits much better than what is configured; None if nothing does, or the configuration fits.
+    """Return the finding of a configuration that fits much better than the configured one, else None.
 
-    declared: the frame that the reference is said to be in. nominal: rotation_body_from_dvl (3, 3). given: the motion
-    registered with it. dvl_axes: the parameter.
+    Parameters
+    ----------
+    motion: Streams as configured.
+    declared: Configured reference frame.
+    nominal: (3, 3) configured rotation_body_from_dvl.
+    lever_arm: (3,) m configured DVL position from the reference point, body frame.
+    given: Registration of the motion as configured; None if it failed.
+    dvl_axes: The parameter of this name.
     """
     if not all(motion.measured):
         return None
@@ -81,7 +86,7 @@ def fitting_configuration(
     also_turned = set()
     for frame in _FRAMES:
         fit = MotionFit(_as_if(motion, declared, frame), lever_arm, curves, FEW_ROWS)
-        # the mountings that have a name, and whichever fits
+        # mountings with a name, and a free one
         likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
         of_use = FITS_BELOW * fit.speed / math.sqrt(3.0)
         each = [nearest(fit, rotation, most=of_use) for rotation in likely]
@@ -91,12 +96,12 @@ def fitting_configuration(
             found[frame] = min(some, key=lambda one: one.level)
     if not found:
         return None
-    # of two that fit alike the frame given is the likelier
+    # of two similar fits the configured frame is likelier
     best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
     if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
     wrong = _wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
-    if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # which leaves less than the best rotation
+    if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
 
@@ -107,36 +112,38 @@ def nearest(
     held: Sequence[Array] = WITHOUT_ARM,
     most: float = math.inf,
 ) -> Fitted | None:
-    """The best with a DVL that is late by no more than a calibration finds; None without any. most: m/s, of which what
-    is left may be, to be of use."""
+    """Return the best fit over the DVL delays that a calibration covers, or None.
+
+    held: rows of states held at zero. most: largest useful residual, m/s.
+    """
     each = (fit(0.0, late, rotation_body_from_dvl, held, most=most) for late in LATE_S)
     found = [one for one in each if one is not None and np.isfinite(one.x).all()]
     return min(found, key=lambda one: one.level, default=None)
 
 
 def misfit(one: Fitted, nominal: Array, left: float | None = None) -> float:
-    """What is left, as a share of the speed, with a mounting (3, 3): what a turn explains that is no misalignment is.
+    """Return the misfit with a mounting (3, 3) as a share of the speed; a rotation beyond misalignment counts.
 
-    left: as another measure than its own has it.
+    left: residual share to use instead of the fit's own.
     """
     turned = _shown_turn(one.rotation_body_from_dvl, nominal, one.std[TURN])
     return _left(one.left if left is None else left, float(one.x[SCALE]), turned)
 
 
 def _shown_turn(rotation: Array, nominal: Array, std: Array) -> float:
-    """By what angle (rad) a mounting is turned from another, but for what chance turns it by, with σ (3,) rad: a level
-    vehicle hardly shows its roll."""
+    """Return the significant angle (rad) between two mountings (3, 3). std: (3,) rad per body axis."""
     about = np.abs(turn_between(nominal, rotation))
     return float(np.linalg.norm(np.maximum(about - BY_CHANCE * std, 0.0)))
 
 
 def _left(left: float, scale: float, turned: float) -> float:
+    """Return the residual share, increased by rotation (rad) and scale if they exceed a misalignment."""
     is_misalignment = turned < MISALIGNED and abs(scale) < SCALED
     return left if is_misalignment else math.hypot(left, 2.0 * math.sin(0.5 * turned), scale)
 
 
 def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame) -> MotionStreams:
-    """The motion with its reference, said to be in one frame, as in another."""
+    """Return the motion with its reference declared in one frame, read in another."""
     reference, ned = motion.reference, VelocityFrame.NED
     if (declared is ned) is not (frame is ned):
         reference = reference @ ENU_FROM_NED.T
@@ -146,17 +153,16 @@ def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame)
 def _wrong_axes(
     motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, most: float, dvl_axes: str
 ) -> Reason | None:
-    """Return the finding of axes of the DVL that are mirrored, turned over, or scaled alone.
+    """Return the finding of DVL axes that are mirrored, turned over, or scaled alone, else None.
 
-    Each pattern of signs is registered with clocks of its own: in waves a clock that is off by half of one looks like a
-    sign. That which leaves least is judged by the factors of its axes, beside lever arm and delay. most: m/s per axis
-    that it may leave.
+    Each sign pattern has its own delay, because in waves a delay of half a period looks like a sign. The axis factors
+    of the best pattern decide. most: largest residual, m/s per axis.
     """
     found: list[tuple[float, Array, Fitted]] = []
     for signs in SIGNS:
         quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FEW_ROWS)
         near = nearest(quick, nominal, (REFERENCE,), FAR_WORSE * most)
-        # axes turned over, and turned back by the fit, are those as given
+        # a fit that rotates the axes back is the configured pattern
         if near is not None and _shown_turn(near.rotation_body_from_dvl, nominal, near.std[TURN]) < MISALIGNED:
             found.append((near.level, signs, near))
     if not found:
@@ -186,16 +192,16 @@ def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
 def _named(
     declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, also_turned: bool
 ) -> Reason | None:
-    """also_turned: the axes of the body turned round fit as well."""
+    """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
     same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
-    if same_frame and as_given:  # a large misalignment, for the calibration to find
+    if same_frame and as_given:  # a large misalignment is left to the calibration
         return None
     body = VelocityFrame.BODY
     frame = {"name": "the body frame" if best is body else best.value.upper(), "frame": best.value}
     earth = body not in (best, declared)
     if as_given and earth and also_turned:
         return finding("REFERENCE_OR_IMU_NED", **frame)
-    if as_given:  # the frame explains it
+    if as_given:  # the frame alone explains the misfit
         return finding("REFERENCE_LOOKS", **frame)
     if not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
         return finding("IMU_LOOKS_NED")
@@ -210,11 +216,11 @@ def _named(
 
 
 def _as_drawn(rotation: Array) -> Array:
-    """The rotation by multiples of `DRAWN` that a mounting (3, 3) is the same as; itself if it is of none."""
+    """Return the nearest mounting (3, 3) in multiples of `DRAWN` if it is the same but for a misalignment."""
     drawn = rotation_from_rpy(np.round(rpy_from_rotation(rotation) / DRAWN) * DRAWN)
     return drawn if angle_between(rotation, drawn) < SAME_WITHIN else rotation
 
 
 def angle_between(a: Array, b: Array) -> float:
-    """Angle of the rotation between two rotations (3, 3), rad."""
+    """Return the angle between two rotations (3, 3), rad."""
     return math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(a.T @ b)) - 1.0))))

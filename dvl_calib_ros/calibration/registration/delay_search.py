@@ -1,9 +1,9 @@
-"""Where two clocks may stand: the misfit of DVL and reference over all delays within a minute, at once.
+"""Search of both delays: the misfit of DVL and reference over all delays within a minute.
 
-On a common grid of time, with B(t; ρ) = R(t)ᵀ g(t + ρ) the reference, stamped ρ late, as in the body by the IMU's
-attitude, and v(t + τ) the DVL, stamped τ late, Σ|B - C v|² = Σ|B|² + Σ|v|² - 2 tr(C Σ v Bᵀ). The sums over t are
-correlations, which Fourier transforms give for all τ at once. The rotation C is the mounting where that is known, else
-the best there is (Wahba's problem: Markley, "Attitude determination using vector observations", 1988).
+On a common time grid, B(t; ρ) = R(t)ᵀ g(t + ρ) is the reference with delay ρ in the body, v(t + τ) the DVL with delay
+τ, and Σ|B - C v|² = Σ|B|² + Σ|v|² - 2 tr(C Σ v Bᵀ). The sums over t are correlations; Fourier transforms give them for
+all τ. C is the nominal mounting or the best rotation (Wahba's problem: Markley, "Attitude determination using vector
+observations", 1988).
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from ..numerics.robust import median
 from ..streams.interpolation import attitude_at
 from .motion_streams import MotionStreams
 
-# Clocks further apart than this are looked for nowhere, s.
+# Largest searched delay, s.
 LONGEST_S = 60.0
-# Steps of the grid, s, and how many times it has at most: a vehicle's turns last longer, and a quadrupled recording
-# takes four times as long.
+# Grid steps of short and long recordings, s, most steps of a short one, and most grid points: memory and time are
+# bounded, and turns of a vehicle last longer than a step.
 STEP_S, LONG_STEP_S, MANY, MOST = 0.5, 1.0, 500, 7200
-# Samples further apart than so many of their intervals leave a hole in the grid, and than this, s.
+# Gaps longer than both this multiple of the sample interval and this time (s) are not interpolated.
 HOLE_INTERVALS, HOLE_S = 2.6, 2.5
-# Of the shorter stream so much has to overlap, and so many seconds.
+# Smallest overlap: share of the shorter stream, and seconds.
 OVERLAP, SHORTEST_S = 0.4, 20.0
-# Minima nearer to each other than this are one, s.
+# Smallest distance of two minima, s.
 APART_S = 2.0
 
 
 class ClockPlace(NamedTuple):
-    """reference, dvl: how late the stamps of each are beside the IMU's, s. misfit: share of the squares left there."""
+    """Candidate delays of reference and DVL relative to the IMU, s. misfit: share of the squares left."""
 
     reference: float
     dvl: float
@@ -39,7 +39,7 @@ class ClockPlace(NamedTuple):
 
 
 class _Series(NamedTuple):
-    """On the grid, zero where it is not known. values (N, 3), known (N,) 0 or 1, squares (N,) of the values."""
+    """Stream on the grid: values (N, 3), known (N,) 0 or 1, squares (N,) of the values; zero where unknown."""
 
     values: Array
     known: Array
@@ -47,10 +47,10 @@ class _Series(NamedTuple):
 
 
 def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: int = 4) -> list[ClockPlace]:
-    """The likeliest places of the clocks, the best first, and beside these the best within 3 s.
+    """Return the likeliest delays by misfit, always with the best ones within 3 s.
 
-    rotation_body_from_dvl: (3, 3), None where the mounting is not known. Without an attitude, or with a reference in
-    the body, only the difference of the two clocks shows, and is taken for the DVL's.
+    rotation_body_from_dvl: (3, 3), None if unknown. Without an attitude, or with a body-frame reference, only the
+    relative delay is observable and is assigned to the DVL.
     """
     late, misfit = _misfits(motion, rotation_body_from_dvl)
     by_reference = late if misfit.shape[0] > 1 else np.zeros(1)
@@ -61,7 +61,8 @@ def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: in
 
 
 def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> list[ClockPlace]:
-    around = np.pad(misfit, 1, constant_values=np.inf)  # of a broad one no flank takes the place of another
+    """Return the lowest local minima of the misfit."""
+    around = np.pad(misfit, 1, constant_values=np.inf)  # only local minima, so that flanks of a broad one do not count
     is_lowest = np.minimum(misfit, np.minimum(around[2:, 1:-1], around[:-2, 1:-1])) == misfit
     is_lowest &= np.minimum(misfit, np.minimum(around[1:-1, 2:], around[1:-1, :-2])) == misfit
     misfit = np.where(is_lowest, misfit, np.inf)
@@ -78,7 +79,7 @@ def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> lis
 
 
 def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Array]:
-    """Delays (L,) s, and the misfit (L or 1, L) by the delay of the reference and that of the DVL."""
+    """Return delays (L,) s, and the misfit (L or 1, L) by reference delay and DVL delay."""
     step, grid = _grid(motion)
     reach = round(LONGEST_S / step)
     late = step * np.arange(-reach, reach + 1)
@@ -100,7 +101,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
             values = np.einsum("nji,nj->ni", attitude, b.values) * known[:, None]
             b = _Series(values, known, b.squares * known)
         of_b = np.fft.rfft(np.column_stack([b.values, b.known, b.squares]), size, axis=0)
-        # Σ_t b(t) v(t + lag): count, squares of either where the other is known, and products of all components
+        # Σ_t b(t) v(t + lag): count, squares of each where the other is known, products of all components
         pairs = [
             np.conj(of_b[:, 3]) * of_v[:, 3],
             np.conj(of_b[:, 3]) * of_v[:, 4],
@@ -118,14 +119,14 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
             alike = sums[3]
         else:
             matrices = sums[3:].T.reshape(-1, 3, 3)
-            alike = np.linalg.svd(matrices, compute_uv=False).sum(axis=1)  # of either handedness: it only looks
+            alike = np.linalg.svd(matrices, compute_uv=False).sum(axis=1)  # either handedness will do for a search
         enough = (count >= least) & (squares > 0.0)
         misfit[row, enough] = (squares - 2.0 * alike)[enough] / (0.5 * squares[enough])
     return late, np.maximum(misfit, 0.0)
 
 
 def _grid(motion: MotionStreams) -> tuple[float, Array]:
-    """Step and times (N,) s that hold all streams, of a long recording its beginning."""
+    """Return step (s) and times (N,) s of the grid over all streams, cut off for long recordings."""
     times = [motion.dvl.times, motion.reference_times]
     start, end = min(t[0] for t in times), max(t[-1] for t in times)
     step = STEP_S if end - start <= MANY * STEP_S else LONG_STEP_S
@@ -133,7 +134,7 @@ def _grid(motion: MotionStreams) -> tuple[float, Array]:
 
 
 def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
-    """Means over about a step, linearly between them."""
+    """Return a stream on the grid: means over about one step, linearly interpolated."""
     bins = np.floor((times - grid[0]) / step)
     starts = np.flatnonzero(np.diff(bins, prepend=bins[:1] - 1.0))
     count = np.diff(np.append(starts, len(times)))
@@ -149,7 +150,7 @@ def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
 
 
 def _shifted(series: _Series, steps: int) -> _Series:
-    """The series as it is so many steps later: x(t + steps)."""
+    """Return the series shifted by steps: x(t + steps)."""
     if steps == 0:
         return series
     moved = []

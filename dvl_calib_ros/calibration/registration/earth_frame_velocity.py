@@ -1,7 +1,7 @@
-"""Whether the direction of a velocity turns with the heading, as that of one in the earth's frame does.
+"""Detection of velocities in an earth frame: their direction rotates with the heading.
 
-A vehicle goes much the same way in its own axes whatever its heading. Velocities that a driver has turned into the
-earth's frame agree with a reference there, as if both were in the body: only the heading tells, and no residual.
+In its own axes a vehicle moves in much the same direction on every heading. DVL velocities that a driver rotated into
+the earth frame agree with an earth-frame reference without residual, so only the heading reveals them.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import numpy as np
 
 from ..numerics.frames import Array
 
-# So many samples, and a speed (m/s), tell a direction.
+# Fewest samples, and lowest speed (m/s), that determine a direction.
 ENOUGH, SLOW = 60, 0.2
-# Mean resultant lengths: of directions that are one, and of headings that are several (some 25° about their mean).
+# Mean resultant lengths: above ONE directions agree; below SEVERAL headings differ (25° about their mean).
 ONE, SEVERAL = 0.9, 0.9
-# Directions are the earth's if their spread is this much smaller in the earth.
+# Largest ratio of the spread in the earth frame to the spread in the body frame for earth-frame velocities.
 CLEARLY = 0.25
 
 
 class Directions:
-    """Sums of horizontal directions, unit complex numbers; constant memory."""
+    """Sums of horizontal directions as unit complex numbers, in constant memory."""
 
     def __init__(self) -> None:
         self._n = 0
         self._body = self._enu = self._ned = self._heading = 0.0 + 0.0j
 
     def add(self, velocity: Array, rotation_enu_from_body: Array) -> None:
-        """Take velocities (N, 3) m/s, said to be in the body, and the attitudes (N, 3, 3) at their times."""
+        """Add velocities (N, 3) m/s, nominally in the body frame, and their attitudes (N, 3, 3)."""
         along = velocity[:, 0] + 1j * velocity[:, 1]
         ahead = rotation_enu_from_body[:, 0, 0] + 1j * rotation_enu_from_body[:, 1, 0]
         use = (np.abs(along) > SLOW) & (np.abs(ahead) > 0.5)
@@ -44,9 +44,9 @@ class Directions:
 
     @property
     def turn_with_heading(self) -> bool:
-        """Whether the velocities look like the earth's, ENU or NED.
+        """True if the velocities are in an earth frame, ENU or NED.
 
-        Over one heading a vehicle that yaws in waves, and goes straight on, looks like NED.
+        NED needs several headings: a vehicle that yaws in waves on a straight course looks like NED.
         """
         of_body, of_enu, of_ned = (1.0 - self._length(each) for each in (self._body, self._enu, self._ned))
         if of_enu < 1.0 - ONE and of_enu < CLEARLY * of_body:
@@ -55,7 +55,7 @@ class Directions:
 
     @property
     def stay_in_the_body(self) -> bool:
-        """Whether several headings show that the velocities do not turn with them."""
+        """True if the velocity direction is constant in the body over several headings."""
         return self._headings_are_several and self._length(self._body) > ONE
 
     @property

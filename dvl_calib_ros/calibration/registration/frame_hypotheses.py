@@ -1,9 +1,9 @@
-"""Frame hypotheses: in which axes velocities and attitudes are, by how well DVL and reference agree.
+"""Frame hypotheses: axes of velocities and attitudes, judged by the agreement of DVL and reference.
 
-Under each reading of the data (frame of the reference, axes and world of the IMU, axes of the DVL) velocities of one
-time are compared: with the mounting, where it is known, else after the best rotation. A DVL that sits ahead, or is
-stamped late, can look as if it were turned; so the readings that compare well are registered, with lever arm and delay.
-The posterior of a reading is its prior, which the caller states, times a tempered likelihood of the residual.
+A reading fixes the frame of the reference, the axes and world of the IMU, and the axes of the DVL. Simultaneous
+velocities are compared with the known mounting, or after the best rotation. A lever arm or a delay can look like a
+rotation, so the readings that agree well are registered. The posterior of a reading is its prior, set by the caller,
+times a tempered likelihood of the residual.
 """
 
 from __future__ import annotations
@@ -37,30 +37,30 @@ from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_n
 from .motion_streams import GAP_S, Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at
 
-# Fewer samples say nothing about frames.
+# Fewest samples of a comparison.
 ENOUGH_SAMPLES = 12
-# Weight of "as it is" in the rotation's fit, as a share of the mean squared speed: it decides the turns that the motion
-# does not show (roll of a vehicle that only goes ahead), and moves one that is shown by less than 0.1 degrees.
+# Weight of the prior rotation, as a share of the mean squared speed: it decides unobservable rotations (roll of a
+# vehicle that only moves ahead) and changes observable ones by less than 0.1 degrees.
 AS_IT_IS = 1e-3
-# The worst tenth of the samples (outliers, lags in turns) does not take part.
+# Share of samples kept; the rest are outliers or lags in turns.
 KEPT_SHARE = 0.9
-# What is declared is doubted if another reading leaves less than this share of the difference ...
+# Largest residual ratio of another reading to the declared one for it to be preferred ...
 CLEARLY = 0.5
-# ... and fits in itself: what it leaves is below this share of the speed (17 degrees of misalignment).
+# ... and largest residual of it, as a share of the speed (17 degrees of misalignment).
 FITS = 0.3
-# Data need a turn about the direction of travel if it leaves less than this share.
+# Largest residual ratio that justifies a rotation about the direction of travel.
 ROLLED = 0.8
-# Independent samples of three axes that a comparison counts for. A residual below this share of the speed is none.
+# Equivalent number of independent samples of a comparison, and smallest residual, as a share of the speed.
 INDEPENDENT, LEAST_LEFT = 4.0, 0.005
-# A mean velocity to the side below this share of the speed is none that a vehicle travels by.
+# Smallest mean sideways velocity of a vehicle that travels sideways, as a share of the speed.
 SIDEWAYS = 0.5
-# Turn rates below this (rad/s) do not say which way a body's axes point.
+# Smallest RMS turn rate that determines the axes, rad/s.
 TURNS = 0.01
-# A mounting nearer than this (rad) to one that is drawn is that one.
+# Distance from a mounting as drawn (multiples of `DRAWN`) below which that mounting is meant, rad.
 MEANT_WITHIN = math.radians(8.0)
 
 
-# Frames of a reference: in the body, and by which matrix it is read.
+# Body frames of a reference, and the matrix from each frame to body or ENU axes.
 IN_BODY = (VelocityFrame.BODY.value, "frd")
 READ_BY: Mapping[str, Array] = {
     "body": np.eye(3), "frd": FLU_FROM_FRD, "enu": np.eye(3), "ned": ENU_FROM_NED, "nwu": ENU_FROM_NWU,
@@ -69,14 +69,17 @@ READ_BY: Mapping[str, Array] = {
 
 @dataclass(frozen=True, eq=False)
 class ImuFrame:
-    """How an IMU's data may be meant. rotation_body_from_imu (3, 3); world: as parameter imu_frame."""
+    """Hypothesis about the IMU's axes and world.
+
+    rotation_body_from_imu (3, 3); world: as parameter imu_frame; says: description.
+    """
 
     rotation_body_from_imu: Array
     world: str
     says: str
 
     def read(self, imu: ImuColumns) -> ImuColumns:
-        """An IMU's attitudes and rates, as they are meant."""
+        """Return attitudes and rates converted to body axes and ENU."""
         quaternions = quaternion_product(
             imu.orientation, np.array(quaternion_from_rotation(self.rotation_body_from_imu.T))
         )
@@ -86,10 +89,10 @@ class ImuFrame:
 
 @dataclass(frozen=True)
 class Reading:
-    """One reading of the data.
+    """One hypothesis about the frames of all data.
 
-    reference: frame of the reference, as parameter gnss_frame. turned: whether the DVL's data are turned about x by
-    180°, to the axes of the body.
+    reference: frame of the reference, as parameter gnss_frame. turned: the DVL data are rotated about x by 180° to body
+    axes.
     """
 
     reference: str
@@ -98,17 +101,16 @@ class Reading:
 
     @property
     def in_body(self) -> bool:
-        """Whether the reference is in the body."""
+        """True if the reference is in a body frame."""
         return self.reference in IN_BODY
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well one reading of the data fits.
+    """Agreement of DVL and reference under one reading.
 
-    left: root mean square of what is left of the difference of DVL and reference, as a share of the speed, at the
-    mounting that is given or, without one, at the best. rotation_dvl_from_body: (3, 3) the best; best_left: what that
-    leaves. is_ahead: whether the vehicle mostly goes ahead or astern under this reading, rather than sideways.
+    left: RMS residual as a share of the speed, with the given mounting or else the best one. rotation_dvl_from_body:
+    (3, 3) best rotation; best_left: its residual. is_ahead: the vehicle mostly moves ahead or astern, not sideways.
     """
 
     reading: Reading
@@ -124,10 +126,10 @@ class Agreement:
 
 
 class Registered(NamedTuple):
-    """A reading that is registered.
+    """Registration of a reading.
 
-    left: residual, as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, the lever arm less
-    the one that is known, and its σ.
+    left: residual as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, lever arm beyond the
+    configured one, and its σ.
     """
 
     left: float
@@ -140,10 +142,10 @@ NOT_REGISTERED = Registered(math.inf, np.eye(3), np.zeros(3), np.full(3, math.in
 
 
 class Readings:
-    """What a motion is, read in several ways.
+    """Comparison of one motion under several readings.
 
-    motion: velocities and attitudes as messages have them. position: (3,) m of the DVL in the body, from the point
-    whose velocity the reference is.
+    motion: velocities and attitudes as in the messages. position: (3,) m DVL position from the reference point, body
+    frame.
     """
 
     def __init__(self, motion: MotionStreams, position: Array) -> None:
@@ -158,30 +160,30 @@ class Readings:
         self._reference = velocity_at(motion.reference_times, motion.reference, self._at)
 
     def __len__(self) -> int:
-        """How many velocities of one time there are."""
+        """Return the number of simultaneous velocities."""
         return len(self._at)
 
     def beside_noise(self, left: float) -> float:
-        """Of a share of the speed that is left what is not the reference's own noise."""
+        """Return a residual share without the white noise of the reference."""
         square = float(squared(self._dvl).mean())
         return math.sqrt(max(left**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
 
     def log_likelihood(self, left: float) -> float:
-        """Return the tempered log likelihood of a residual, as a share of the speed, beside the reference's noise.
+        """Return the tempered log likelihood of a residual share, corrected for the reference noise.
 
-        What a comparison misses of arms, delays and waves is alike from sample to sample, so few of them count.
+        Errors by lever arms, delays and waves are correlated, so few samples count (`INDEPENDENT`).
         """
         return self.log_likelihood_registered(self.beside_noise(left))
 
     @staticmethod
     def log_likelihood_registered(left: float) -> float:
-        """Return the same of a registration, which is compared with its noise."""
+        """Return the tempered log likelihood of a registration residual, noise included."""
         return -3.0 * INDEPENDENT * math.log(max(left, LEAST_LEFT))
 
     def agreements(self, readings: Sequence[Reading], rotation_dvl_from_body: Array | None) -> list[Agreement]:
-        """All readings that can be tried, the best first, with clocks in time and no other lever arm.
+        """Compare all possible readings with synchronised clocks. Return the best first.
 
-        rotation_dvl_from_body: the mounting (3, 3), None if it is not known.
+        rotation_dvl_from_body: (3, 3) mounting, None if unknown.
         """
         if len(self) < ENOUGH_SAMPLES:
             return []
@@ -200,7 +202,7 @@ class Readings:
             dvl = self._dvl @ FLU_FROM_FRD if reading.turned else self._dvl
             speed = _rms(dvl)
             best = best_rotation(dvl, body, likely)
-            # a second time without the worst
+            # second pass without outliers
             errors = squared(dvl - body @ best.T)
             kept = errors <= np.sort(errors)[int(KEPT_SHARE * (len(errors) - 1))]
             best = best_rotation(dvl[kept], body[kept], likely)
@@ -209,18 +211,17 @@ class Readings:
             travel = np.abs(body.mean(axis=0) if known is None else (dvl @ known).mean(axis=0))
             is_ahead = bool(travel[1] < max(travel[0], SIDEWAYS * speed))
             found.append(Agreement(reading, left, best, best_left, is_ahead))
-        # of two that fit alike the one that asks for the smaller turn; rounding decides nothing: worlds that are both
-        # turned over fit the same
+        # a small penalty prefers the smaller rotation; rounding makes ties stable (two inverted worlds fit equally)
         return sorted(found, key=lambda each: round(each.left + (0.02 * each.angle if known is None else 0.0), 9))
 
     def registered(self, reading: Reading, rotation_dvl_from_body: Array | None) -> Registered:
-        """Register a reading with the lever arm and the DVL's delay that suit it best.
+        """Register a reading with free lever arm and DVL delay.
 
-        The reference is in time: late on a circle it is any yaw at all.
+        The reference is held synchronised: on a circle its delay looks like yaw.
 
-        rotation_dvl_from_body: the mounting, which is kept but for a small misalignment; None to find it. Of a rotation
-        that is found and the same turned about the direction of travel, which a lever arm makes alike, the upright one
-        is taken unless the other leaves clearly less.
+        rotation_dvl_from_body: prior mounting, None to estimate it. A lever arm makes a rotation and its inverted twin
+        (rotated about the direction of travel) look alike: the upright one is returned unless the other fits clearly
+        better.
         """
         turn = FLU_FROM_FRD if reading.turned else np.eye(3)
         motion = self._read(reading)
@@ -248,14 +249,14 @@ class Readings:
         return other if other.left < CLEARLY * upright.left else upright
 
     def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
-        """A rotation (3, 3) without what it turns about the direction of travel, unless the data need that."""
+        """Return a rotation (3, 3) without roll about the direction of travel, unless the data need it."""
         travel = (self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl).mean(axis=0)
         least = _least_turn(rotation_dvl_from_body.T @ travel, travel)
         is_needed = ROLLED * self.agreements([found.reading], least)[0].left > found.best_left
         return rotation_dvl_from_body if is_needed else least
 
     def is_in_body(self, found: Agreement) -> bool:
-        """Whether DVL and reference that agree as in the body are not both in the earth's frame."""
+        """Return whether DVL and reference that agree in the body are not both in the earth frame."""
         motion = self._read(replace(found.reading, reference=VelocityFrame.ENU.value))
         if motion is None:
             return True
@@ -265,7 +266,7 @@ class Readings:
         return directions.stay_in_the_body
 
     def _read(self, reading: Reading) -> MotionStreams | None:
-        """The motion as a reading has it but for the DVL; None if that needs an attitude that is not there."""
+        """Return the motion under a reading, except the DVL; None if a required attitude is missing."""
         key = replace(reading, turned=False)
         if key not in self._motions:
             m = self._motion
@@ -280,11 +281,9 @@ class Readings:
 
 
 def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> bool | None:
-    """Whether a velocity's own turn rates are forward-right-down, by those of an IMU; None if that does not show.
+    """Return whether turn rates of the reference are forward-right-down, by the IMU; None if unclear.
 
-    A vehicle that turns left has a positive rate about an axis up, and a negative one about an axis down.
-
-    times, own: (N,) s, (N, 3) rad/s.
+    times, own: (N,) s, (N, 3) rad/s. A left turn is positive about an axis up, negative about an axis down.
     """
     rates = angular_velocity_at(TurnRates.of(frame.read(imu)), times, GAP_S)
     use = np.isfinite(rates).all(axis=1) & np.isfinite(own).all(axis=1)
@@ -296,13 +295,13 @@ def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> b
 
 
 def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
-    """The rotation M (3, 3) that minimises mean |a - M b|² + AS_IT_IS |b|² |M - as_it_is|²; a, b: (N, 3)."""
+    """Return the rotation M (3, 3) from b (N, 3) to a (N, 3), with weight AS_IT_IS on the prior `as_it_is`."""
     square = float(squared(b).mean())
     return nearest_rotation(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
 
 
 def _least_turn(a: Array, b: Array) -> Array:
-    """The rotation (3, 3) by the smallest angle that turns one direction (3,) into another."""
+    """Return the rotation (3, 3) by the smallest angle from direction a (3,) to b."""
     axis = cross(a, b)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9 * max(float(a @ a), 1e-300):
@@ -311,7 +310,7 @@ def _least_turn(a: Array, b: Array) -> Array:
 
 
 def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:
-    """The mounting that somebody may have meant (rad): as mountings are drawn where it is close, else whole degrees."""
+    """Return the likely intended mounting (rad): the drawn angle if near (multiples of `DRAWN`), else whole degrees."""
     rpy = rpy_from_rotation(rotation_body_from_dvl)
     near = DRAWN * np.round(rpy / DRAWN)
     meant = np.where(np.abs(rpy - near) < MEANT_WITHIN, near, whole_degrees(rotation_body_from_dvl))
@@ -320,9 +319,10 @@ def nominal_rpy(rotation_body_from_dvl: Array) -> tuple[float, float, float]:
 
 
 def _rms(difference: Array) -> float:
+    """Return the RMS of the kept share of differences (N, 3)."""
     return math.sqrt(float(_better(squared(difference)).mean()))
 
 
 def _better(squares: Array) -> Array:
-    """Those of the better samples."""
+    """Return the smallest squares (M,), outliers removed."""
     return np.sort(squares)[: max(1, int(KEPT_SHARE * len(squares)))]

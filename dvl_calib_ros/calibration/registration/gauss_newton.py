@@ -1,11 +1,10 @@
-"""About a place of the clocks: both clocks, rotation, lever arm and scale together, by robust least squares.
+"""Least-squares registration: both delays, rotation, lever arm and scale from one start, with robust weights.
 
-With s the stamp of a reference sample, ρ and τ the delays of reference and DVL and δ = τ - ρ, what is compared is
+With s the stamp of a reference sample, ρ and τ the delays of reference and DVL and δ = τ - ρ, the residual is
 
-    B(s - ρ) + ω(s - ρ) × l - (1 + k) C v(s + δ),   B(s - ρ) = R(s - ρ)ᵀ g(s)
+    B(s - ρ) + ω(s - ρ) × l - (1 + k) C v(s + δ),   B(s - ρ) = R(s - ρ)ᵀ g(s).
 
-in which C, k and l are linear about the last round, and so is δ by the slope of v and ρ by ω × B: where the reference
-is turned into the body by an attitude of another time, its velocity turns as the vehicle does.
+It is linearised about the last round: δ by the slope of v, ρ by ω × B, because another attitude rotates the reference.
 """
 
 from __future__ import annotations
@@ -27,44 +26,45 @@ from .motion_streams import GAP_S, Curves, MotionStreams
 # States: turn (rad, body), scale, lever arm (m), δ (s), ρ (s).
 TURN, SCALE, ARM, APART, LATE = slice(0, 3), 3, slice(4, 7), 7, 8
 N = 9
-# Whose product with the states is how late a clock is.
+# Rows whose product with the state is the delay of DVL or reference,
 DVL: Array = np.array([0.0] * 7 + [1.0, 1.0])
 REFERENCE: Array = np.array([0.0] * 8 + [1.0])
-# ... and by how much the DVL's is later than the reference's: where it is none, it is the IMU's that is off.
+# or the DVL delay relative to the reference; zero if only the IMU is delayed.
 BOTH_ALIKE: Array = np.array([0.0] * 7 + [1.0, 0.0])
-# A clock that is in time is so to this, s.
+# σ of the constraint on a synchronised clock, s.
 HELD_STD_S = 1e-4
-# What is likely of each. A lever arm decides what the motion does not: at one speed a clock looks like one.
+# Prior σ of the states; it decides what the motion does not: at one speed a delay looks like a lever arm.
 LIKELY: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
-# References that are looked at, evenly spread: more tell little more, and take longer; fewer tell places apart.
+# Most references in a full and in a quick fit, evenly spread.
 MOST_ROWS, FEW_ROWS = 4000, 800
-# Rounds at most, and the step (s, m, rad) from which on another one changes nothing.
+# Most rounds, and the largest step (s, m, rad) of a converged fit.
 ROUNDS, SETTLED_S = 12, 5e-4
-# A delay moves no further in one round, s: slopes hold that far.
+# Largest delay step per round, s: the slopes are valid this far.
 FARTHEST_S = 0.7
-# After so many rounds, what leaves so many times the most that is of use, and hardly less than the round before, is
-# given up.
+# Round from which a fit is given up if its residual exceeds this multiple of `most` and this share of the last one.
 ROUNDS_TO_FALL, FAR_ABOVE, HARDLY_LESS = 3, 2.0, 0.9
-# Samples so many times further off than usual count by half.
+# Residual in σ at which a sample has half the weight.
 HALF_AT = 3.0
-# Slower, nothing is compared, m/s. Fewer rows tell nothing.
+# Lowest compared reference speed, m/s, and fewest rows of a fit.
 SLOW_MPS, ENOUGH = 0.1, 20
-# A factor of an axis is within this of 1 (1 σ): ill-conditioned ones stay near it.
+# Prior σ of an axis factor about 1, for factors that are not observable.
 WIDEST_FACTOR = 3.0
-# No more of what is known of δ is taken for noise.
+# Largest share of the information on δ that is attributed to DVL noise.
 MOST_OF_NOISE = 0.95
-# Blocks of time by whose scatter σ is found. That noise lasts has to be beyond doubt (`time_blocks.LASTS`): where it is
-# taken for what a clock that moves leaves, none is found.
+# Time blocks that σ is estimated from, and the threshold for correlated noise (`block_covariance.LASTS`): high, so that
+# the residual of a clock change does not count as noise.
 BLOCKS, LASTS_BEYOND_DOUBT = 48, 2.5
-# Median of chi-square of 1, 2, 3 degrees of freedom.
+# Median of chi-square with 1, 2, 3 degrees of freedom.
 _MEDIAN_CHI2 = (0.455, 1.386, 2.366)
 _Compared = tuple[Index, tuple[Array, ...]]
 
 
 class Claimed(NamedTuple):
-    """Covariance p (9, 9) of the states, σ of it as blocks of time show. raised: (9,) by how much σ of each was, above
-    that of white noise. inflation: by how much σ of the clocks is more than white noise makes it, by blocks of time and
-    by how long what is left lasts."""
+    """Covariance of the states with σ from the scatter of time blocks.
+
+    p: (9, 9). raised: (9,) factor of each σ over white noise. inflation: factor of the clocks' σ over white noise, by
+    time blocks and by the autocorrelation of the residuals.
+    """
 
     p: Array
     inflation: float
@@ -72,11 +72,11 @@ class Claimed(NamedTuple):
 
 
 class Fitted(NamedTuple):
-    """x (9,); rotation_body_from_dvl (3, 3).
+    """State of a fit.
 
-    squares (J,) (m/s)²: of what is left of each reference. level: m/s per axis, robust, of what is left of `rows`
-    references. speed: RMS of what was compared, m/s. at: (J,) which references these are, of those that are looked at.
-    claims: how well x is known, which is asked of few: it takes as long as three rounds.
+    x (9,); rotation_body_from_dvl (3, 3). squares: (J,) squared residual of each reference, (m/s)². level: robust
+    residual per axis, m/s, of `rows` references. speed: RMS of the compared references, m/s. at: (J,) indices of these
+    references. claims: covariance, computed on demand because it takes as long as three rounds.
     """
 
     x: Array
@@ -91,59 +91,61 @@ class Fitted(NamedTuple):
 
     @property
     def p(self) -> Array:
-        """As `Claimed.p`."""
+        """Covariance (9, 9), see `Claimed.p`."""
         return self.claims().p
 
     @property
     def inflation(self) -> float:
-        """As `Claimed.inflation`."""
+        """σ factor of the clocks, see `Claimed.inflation`."""
         return self.claims().inflation
 
     @property
     def raised(self) -> Array:
-        """As `Claimed.raised`."""
+        """σ factors (9,), see `Claimed.raised`."""
         return self.claims().raised
 
     def cost(self, level: float, among: Index) -> float:
-        """What is left of these references, in chi-square by a level of noise (m/s), robust."""
+        """Return the robust chi-square of these references at a noise level (m/s)."""
         return float(_robust(self.squares[np.searchsorted(self.at, among)], self.axes, level).sum())
 
     @property
     def left(self) -> float:
-        """What is not explained, as a share of the speed."""
+        """Residual as a share of the speed."""
         return self.level * math.sqrt(3.0) / max(self.speed, 1e-9)
 
     @property
     def std(self) -> Array:
-        """(9,)."""
+        """σ (9,) of the states."""
         return np.sqrt(np.maximum(np.diag(self.p), 0.0))
 
     def by(self, state: int) -> Array:
-        """(9,) by how much all are others for each unit of one: as the motion has it, whatever the noise is."""
+        """Return derivatives (9,) of all states with respect to one, from the white-noise covariance."""
         of_white = self.p[:, state] / self.raised
         return np.asarray(of_white / of_white[state])
 
     @property
     def dvl_late(self) -> float:
-        """τ, s."""
+        """DVL delay τ, s."""
         return float(self.x[APART] + self.x[LATE])
 
     @property
     def dvl_std(self) -> float:
-        """σ of τ, s."""
+        """σ of the DVL delay τ, s."""
         return float(np.sqrt(max(self.p[[APART, APART, LATE, LATE], [APART, LATE, APART, LATE]].sum(), 0.0)))
 
 
 class AxisFactors(NamedTuple):
-    """factors, std: (3,) of the DVL's axes; 1 is right, with the scale of the fit."""
+    """Scale factors (3,) of the DVL's axes relative to the fit, and their σ (3,); 1 is right."""
 
     factors: Array
     std: Array
 
 
 class _Rows(NamedTuple):
-    """residual (J, A), jacobian (J, A, 9) of it, of references `at` (J,); of_noise (J,): how much of the square of the
-    column of δ is expected of noise alone; speed: RMS, m/s."""
+    """Linearised rows: residual (J, A) m/s, jacobian (J, A, 9), reference indices `at` (J,), RMS speed (m/s).
+
+    of_noise (J,): expected squared δ column by DVL noise alone.
+    """
 
     residual: Array
     jacobian: Array
@@ -153,14 +155,14 @@ class _Rows(NamedTuple):
 
 
 class MotionFit:
-    """Least squares of one motion from one place of the clocks. is_turned: whether an attitude turns the reference.
+    """Least squares of one motion.
 
-    times: (J,) s of the references that are looked at; speed: their RMS, m/s. dvl_noise: variance of the DVL's white
-    noise, (m/s)².
+    is_turned: an attitude rotates the reference. times: (J,) s of the used references; speed: their RMS, m/s.
+    dvl_noise: variance of the DVL's white noise, (m/s)².
     """
 
     def __init__(self, motion: MotionStreams, lever_arm: Array, curves: Curves, most: int = MOST_ROWS) -> None:
-        """lever_arm: (3,) m, that is known. curves: of the motion. most: references that are looked at."""
+        """Prepare a fit. lever_arm: (3,) m configured. curves: smoothed motion. most: most references used."""
         self._motion, self._lever_arm, self._curves = motion, lever_arm, curves
         self.is_turned = motion.in_earth and motion.has_attitude
         m = motion
@@ -169,7 +171,7 @@ class MotionFit:
             moving = moving[np.linspace(0, len(moving) - 1, most).astype(int)]
         self.times, self._velocity = m.reference_times[moving], m.reference[moving]
         self.speed = math.sqrt(float((self._velocity**2).sum()) / max(len(moving), 1))
-        # where hardly anything changes, what seems to is its noise
+        # at slow changes, the slope of the velocity is mostly its noise
         self.dvl_noise = float(white_noise(m.dvl.velocity))
 
     def __call__(
@@ -181,11 +183,15 @@ class MotionFit:
         among: Fitted | None = None,
         most: float = math.inf,
     ) -> Fitted | None:
-        """From ρ and δ (s) on; None where too little can be compared, or more is left than the most (m/s) of use.
+        """Fit from initial delays ρ and δ (s). Return None if too little overlaps or the residual exceeds `most`.
 
-        rotation_body_from_dvl: (3, 3), about which turns are likely; None to find it. in_time: clocks that are in time,
-        `DVL` and `REFERENCE`, or `BOTH_ALIKE`; without an attitude that turns it, the reference's is.
-        among: another place that is weighed against this one: of its references, DVL and attitudes alone.
+        Parameters
+        ----------
+        reference, apart: Initial ρ and δ, s.
+        rotation_body_from_dvl: (3, 3) prior mounting; None to estimate it.
+        in_time: Rows of synchronised clocks (`DVL`, `REFERENCE`, `BOTH_ALIKE`); REFERENCE is added without an attitude.
+        among: Another fit, to compare only its references, DVL samples and attitudes.
+        most: Largest useful residual per axis, m/s.
         """
         rotation = self._best_rotation(reference, apart) if rotation_body_from_dvl is None else rotation_body_from_dvl
         if rotation is None:
@@ -222,23 +228,22 @@ class MotionFit:
         return Fitted(x, rotation, level, len(rows.at), rows.speed, squares, axes, rows.at, claims)
 
     def costs(self, x: Array, rotation: Array, level: float) -> tuple[Index, Array]:
-        """Which references (J,) are compared at a state, and what is left of each (J,), as in `Fitted.cost`."""
+        """Return compared references (J,) at a state, and the robust chi-square (J,) of each (`Fitted.cost`)."""
         rows = self._rows(x, rotation, None)
         if rows is None:
             return np.zeros(0, dtype=np.intp), np.zeros(0)
         return rows.at, _robust(squared(rows.residual), rows.residual.shape[1], level)
 
     def axis_factors(self, fitted: Fitted, nominal: Array) -> AxisFactors:
-        """Return by what factors the DVL's axes would fit better, and their standard deviations.
+        """Estimate the scale factor of each DVL axis by least squares about a fit.
 
-        By least squares about a fit, with turn, lever arm and the DVL's delay as nuisance parameters. A factor of -1 is
-        an axis that points the other way. Noise of the DVL makes a factor smaller, never negative.
+        Rotation, lever arm and DVL delay are nuisance parameters. A factor of -1 is a reversed axis. DVL noise lowers a
+        factor, but never below zero.
 
         Parameters
         ----------
-        fitted: A fit, with its robust weights.
-        nominal: rotation_body_from_dvl (3, 3), about which turns are likely.
-
+        fitted: Fit with its robust weights.
+        nominal: (3, 3) rotation_body_from_dvl of the prior.
         """
         rows, rotation = self._rows(fitted.x, fitted.rotation_body_from_dvl, None), fitted.rotation_body_from_dvl
         if rows is None:
@@ -256,13 +261,13 @@ class MotionFit:
         vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), away[kept]])
         found = np.linalg.solve(information, vector)
         left = rows.residual.ravel() + h @ found
-        # what the factors explain is no noise
+        # residuals that the factors explain are no noise
         share = float((w * left**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
         std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
         return AxisFactors(1.0 + found[:3], std)
 
     def _axes_of_dvl(self, fitted: Fitted, rows: _Rows, rotation: Array) -> Array:
-        """What each axis of the DVL adds to the residuals, (J, A, 3) m/s."""
+        """Return the derivative (J, A, 3) m/s of the residuals with respect to the axis factors."""
         streams = self._streams(float(fitted.x[LATE]), float(fitted.x[APART]))
         assert streams is not None
         _, (_, _, velocity, _, attitude, _) = streams
@@ -273,8 +278,10 @@ class MotionFit:
         return np.asarray((attitude @ own if self._motion.in_earth else own)[:, measured])
 
     def _streams(self, reference: float, apart: float, among: Fitted | None = None) -> _Compared | None:
-        """Which references (J,), and B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), noise gain of
-        the slope (J,)."""
+        """Return the compared references (J,) and their streams at delays ρ and δ, or None for too few.
+
+        Streams: B (J, 3), ω (J, 3), v (J, 3), slope of v (J, 3), R (J, 3, 3), slope noise gain (J,).
+        """
         m = self._motion
         own = self.times - reference
         if m.in_earth and not m.has_attitude:
@@ -294,7 +301,7 @@ class MotionFit:
         return at, (body, self._curves.rates(own[at]), velocity[at], slope[at], rotation, gain[at])
 
     def _shared(self, other: Fitted, reference: float, apart: float) -> Mask:
-        """Which references (J,) are compared at another place, with DVL and attitudes that are compared there."""
+        """Return a mask (J,) of references whose DVL samples and attitudes another fit compares, too."""
         there, shared = self.times[other.at], np.zeros(len(self.times), dtype=bool)
         shared[other.at] = True
         for here, elsewhere in ((apart, float(other.x[APART])), (-reference, -float(other.x[LATE]))):
@@ -303,7 +310,7 @@ class MotionFit:
         return shared
 
     def _best_rotation(self, reference: float, apart: float) -> Array | None:
-        """C (3, 3) that fits best without a lever arm, by singular values."""
+        """Return the best rotation C (3, 3) without lever arm, by singular values."""
         streams = self._streams(reference, apart)
         if streams is None:
             return None
@@ -312,6 +319,7 @@ class MotionFit:
         return nearest_rotation(body.T @ velocity + 1e-3 * square * np.eye(3))
 
     def _rows(self, x: Array, rotation: Array, among: Fitted | None) -> _Rows | None:
+        """Linearise the residuals about a state, in the measured axes; None if too few overlap."""
         streams = self._streams(float(x[LATE]), float(x[APART]), among)
         if streams is None:
             return None
@@ -336,7 +344,7 @@ class MotionFit:
     def _solved(
         self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]
     ) -> tuple[Array, Array, float, Array]:
-        """The step (9,), its information (9, 9), the level of noise (m/s), and the weight of each row (J,)."""
+        """Return step (9,), information (9, 9), noise level (m/s) and robust weight of each row (J,)."""
         axes = rows.residual.shape[1]
         squares = squared(rows.residual)
         level2 = max(float(median(squares)) / _MEDIAN_CHI2[axes - 1], 1e-8)
@@ -346,7 +354,7 @@ class MotionFit:
         prior = LIKELY**-2.0
         weighted = (h * w[:, None]).T
         information = weighted @ h + np.diag(prior)
-        # what is known of δ beside all else: more than that taken off, and it would be less than nothing
+        # limit: the subtracted noise must not exceed the marginal information on δ
         told = 1.0 / float(np.linalg.inv(information)[APART, APART])
         information[APART, APART] -= min(float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * told)
         away = x.copy()
@@ -372,13 +380,13 @@ def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Cl
 
 
 def _robust(squares: Array, axes: int, level: float) -> Array:
-    """Squares (J,) (m/s)² of so many axes in chi-square by a level of noise (m/s), far ones by their logarithm."""
+    """Return squares (J,) (m/s)² over `axes` axes as chi-square at a noise level (m/s), logarithmic for outliers."""
     scale = HALF_AT**2 * axes
     return np.asarray(scale * np.log1p(squares / (scale * level**2)))
 
 
 def white_noise(velocity: Array) -> float:
-    """Variance (m/s)² of white noise on a stream (N, 3), by its second differences."""
+    """Return the white-noise variance (m/s)² of a stream (N, 3) from its second differences."""
     if len(velocity) < 3:
         return 0.0
     bent = median(np.diff(velocity, 2, axis=0) ** 2) / (6.0 * _MEDIAN_CHI2[0])
@@ -386,12 +394,12 @@ def white_noise(velocity: Array) -> float:
 
 
 def _lasting(residual: Array) -> float:
-    """By how much σ of a mean of residuals (J, A) is more than that of white ones, by their autocorrelation."""
+    """Return the σ factor of the mean of residuals (J, A) over white noise, by their autocorrelation."""
     n = len(residual)
     size = 1 << (2 * n - 1).bit_length()
     power = (np.abs(np.fft.rfft(residual, size, axis=0)) ** 2).sum(axis=1)
     alike = np.fft.irfft(power, size)[: max(2, n // 8)]
     alike = alike / max(float(alike[0]), 1e-30)
-    # up to where it is lost in chance
+    # up to where the autocorrelation is insignificant
     until = int(np.argmax(alike < 2.0 / np.sqrt(n))) or len(alike)
     return float(np.sqrt(1.0 + 2.0 * alike[1:until].sum()))

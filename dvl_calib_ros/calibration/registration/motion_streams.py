@@ -1,4 +1,4 @@
-"""The three streams that are registered, as columns and smoothed, in s since a common epoch."""
+"""Motion: DVL, reference and IMU streams as smoothed columns, in s since a common epoch."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ from ..streams.stream_order import strays
 
 @dataclass(frozen=True)
 class MotionStreams:
-    """Streams of one vehicle. Stamps that go back are left out.
+    """Streams of one vehicle with increasing stamps.
 
-    dvl: velocity in the DVL's frame. reference_times (M,) s, reference (M, 3) m/s: in the earth (ENU) if in_earth, else
-    in the body. measured: (3,) which of its axes are measured. imu: attitudes; without any none is known. turns: rates.
-    epoch_ns: stamp of time 0, but for what was taken off.
+    dvl: velocity in the DVL frame. reference_times (M,) s, reference (M, 3) m/s: ENU if in_earth, else body frame.
+    measured: (3,) measured axes of the reference. imu: attitudes, may be missing. turns: angular rates. epoch_ns: stamp
+    of time 0, before corrections.
     """
 
     dvl: DvlColumns
@@ -53,11 +53,11 @@ class MotionStreams:
 
     @cached_property
     def has_attitude(self) -> bool:
-        """Whether there are attitudes to interpolate between."""
+        """True if there are attitudes to interpolate between."""
         return int(np.count_nonzero(~np.isnan(self.imu.orientation[:, 0]))) > 1
 
     def part(self, at: Index, margin_s: float) -> MotionStreams:
-        """Some of the references, one after the other, and of the others what is so near to them."""
+        """Return consecutive references, with DVL and IMU samples within a margin (s) around them."""
         times = self.reference_times[at]
         near = (self.dvl.times >= times[0] - margin_s) & (self.dvl.times <= times[-1] + margin_s)
         dvl = DvlColumns(self.dvl.times[near], self.dvl.velocity[near])
@@ -67,7 +67,7 @@ class MotionStreams:
 
 
 def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
-    """What samples say, each stream's clock corrected as the parameters have it; None where two have too little."""
+    """Return the motion in samples after the configured clock corrections, or None if there are too few samples."""
     jump_ns = round(parameters.max_time_jump * 1e9)
     streams = Streams(*(block.part(~strays(block.stamps_ns, jump_ns)) for block in streams))
     dvl, reference = (_valid(block, parameters) for block in (streams.dvl, streams.reference))
@@ -97,7 +97,7 @@ def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
         (reference_times, seen),
         code != FRAME_CODES[VelocityFrame.BODY],
         measured,
-        # what is taken from columns of wider rows costs a copy of all of them each time
+        # contiguous, because each use of a slice of wider rows would copy it
         ImuColumns(imu_times, *map(np.ascontiguousarray, np.split(numbers, [4], axis=1))),
     )
     return None if made is None else replace(made, epoch_ns=first_ns)
@@ -110,9 +110,9 @@ def make_motion(
     measured: tuple[bool, bool, bool],
     imu: ImuColumns,
 ) -> MotionStreams | None:
-    """A motion without the spikes of its velocities; None where too little is left. Times increase.
+    """Return a motion without velocity spikes, or None if too few samples remain.
 
-    dvl, reference: times (N,) s and velocities (N, 3) m/s.
+    dvl, reference: increasing times (N,) s and velocities (N, 3) m/s.
     """
     times, velocity = _cleaned(*dvl)
     reference_times, seen = _cleaned(*reference)
@@ -122,7 +122,7 @@ def make_motion(
 
 
 def _cleaned(times: Array, velocity: Array) -> tuple[Array, Array]:
-    """Without spikes, and no faster than needed."""
+    """Return finite velocities without spikes, binned to the rate that is needed."""
     finite = np.isfinite(velocity).all(axis=1)
     times, velocity = times[finite], velocity[finite]
     good = without_spikes(velocity, smallest=0.1, also_at_ends=True)
@@ -131,7 +131,7 @@ def _cleaned(times: Array, velocity: Array) -> tuple[Array, Array]:
 
 
 def in_order(times: Array, values: Array) -> tuple[Array, Array]:
-    """Without samples (N, k) whose times (N,) go back."""
+    """Return times (N,) and samples (N, k) without those whose stamps go backward."""
     later = np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0
     return times[later], values[later]
 
@@ -141,19 +141,19 @@ def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
     return block.part((block.refused == 0) & (speed <= parameters.max_speed) & (speed > 0.0))
 
 
-# Curves are smoothed on a grid of this step, s, and of a long recording of so many times; of so many at once.
+# Grid step of smoothed curves (s), most grid points of a long recording, and points per pass.
 GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
-# So long before and after the DVL turn rates are of use, s: no clock is searched for as far away.
+# Turn rates farther from the DVL data are not used, s: larger than any searched delay.
 TURNS_BEYOND_S = 3600.0
-# Attitudes and rates further apart than this tell nothing between, s.
+# Longest gap between attitudes or rates that is interpolated, s.
 GAP_S = 2.0
 
 
 class Curves:
-    """Velocity and slope of the DVL, and turn rates, on a fine grid of time, each smoothed once for all places."""
+    """Smoothed DVL velocity, its slope and turn rates on a fine grid, computed once for all delays."""
 
     def __init__(self, motion: MotionStreams) -> None:
-        """Of all streams of a motion."""
+        """Smooth the streams of a motion."""
         times = motion.dvl.times
         length = float(times[-1] - times[0])
         self._step, self._start = max(GRID_S, length / MOST_GRID), float(times[0])
@@ -166,7 +166,7 @@ class Curves:
         self._velocity = np.concatenate([np.hstack([fit.value, fit.slope, fit.slope_gain[:, None]]) for fit in fits])
         self._found = np.concatenate([fit.found for fit in fits])
         self._turns, self._turns_start = np.zeros((2, 3)), 0.0
-        # only where there is a DVL as well: else the grid would be as long as the IMU's stamps are apart
+        # near the DVL data only: the grid must not span an arbitrary IMU clock offset
         own = motion.turns.times
         own = own[(own >= times[0] - TURNS_BEYOND_S) & (own <= times[-1] + TURNS_BEYOND_S)]
         if len(own) > 1:
@@ -176,19 +176,19 @@ class Curves:
             self._turns = np.nan_to_num(np.concatenate(rates))
 
     def signed(self, signs: Array) -> Curves:
-        """Return the same of a DVL whose axes have these signs (3,)."""
+        """Return the curves of a DVL with these axis signs (3,)."""
         made = copy(self)
         made._velocity = self._velocity * np.concatenate([signs, signs, [1.0]])
         return made
 
     def velocity(self, at: Array) -> tuple[Array, Array, Array, Mask]:
-        """At times (J,) s: velocity (J, 3), slope (J, 3), noise gain of the slope (J,), and whether there is one."""
+        """Return velocity (J, 3) m/s, slope (J, 3) m/s², slope noise gain (J,) and validity at times (J,) s."""
         before, share, inside = self._places(at, self._start, len(self._grid))
         both = _between(self._velocity, before, share)
         return both[:, :3], both[:, 3:6], both[:, 6], inside & self._found[before] & self._found[before + 1]
 
     def rates(self, at: Array) -> Array:
-        """(J, 3) rad/s, zero where they are not known."""
+        """Return angular rates (J, 3) rad/s at times (J,) s, zero where unknown."""
         before, share, inside = self._places(at, self._turns_start, len(self._turns))
         return np.where(inside[:, None], _between(self._turns, before, share), 0.0)
 
@@ -199,7 +199,7 @@ class Curves:
 
 
 def _parts(n: int) -> list[slice]:
-    """N places in parts: windows about all of them at once would take more memory than a node should."""
+    """Return slices of n points, small enough for the memory of a node."""
     return [slice(first, first + AT_ONCE) for first in range(0, n, AT_ONCE)]
 
 

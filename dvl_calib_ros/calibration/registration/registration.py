@@ -1,7 +1,7 @@
-"""The one answer to how DVL, reference and IMU stand to each other, from their data alone.
+"""Registration of DVL, reference and IMU: delays, mounting, lever arm and scale (docs/models.md, "Registration").
 
-From all delays within a minute (`coarse`), by least squares about the likeliest (`fine`). The IMU's clock is the time
-base: whose attitude turns the reference into the body. Who starts from an answer, who warns and who corrects asks here.
+Correlation over all delays within a minute selects candidates (`delay_search`), least squares refines them
+(`gauss_newton`). The IMU's clock is the time base, because its attitude rotates the reference into the body.
 """
 
 from __future__ import annotations
@@ -36,52 +36,51 @@ from .gauss_newton import (  # fmt: skip
 )
 from .motion_streams import Curves, MotionStreams
 
-# Said from here on: a lever arm is then a tenth of a second times the speed off, and interpolated attitudes and filters
-# of an inertial navigation are late by less (five real recordings: 0.03 to 0.07 s).
+# Smallest delay that is reported, s. It shifts a lever arm by a tenth of a second times the speed. Interpolated
+# attitudes and the filters of an INS have smaller delays (five real recordings: 0.03 to 0.07 s).
 SAID_FROM_S = 0.1
-# So many σ from which a clock is said to be off. In chi-square: what one more clock that is off has to gain, and by how
-# much the next explanation has to be worse to be ruled out.
+# Delay in σ from which it is reported; chi-square that each additional delayed clock must gain; chi-square by which the
+# next explanation must be worse to be ruled out.
 SIGMAS, ONE_MORE, TOLD_APART = 4.0, 12.0, 8.0
-# ... and for a calibration to be refused that has it in time, where σ holds as much: the same streams, cut and thinned
-# otherwise, differ by so much that what was not taken off of all of them may be told apart in what was calibrated with.
+# Chi-square by which the next explanation must be worse for a refusal, if the σ of the calibration cover the delay. The
+# chi-square of the same streams varies this much with the selected samples.
 REFUSED_FROM = 16.0
-# In chi-square: what clocks in time may cost for no other explanation to be tried.
+# Chi-square that synchronised clocks may cost without a test of other explanations.
 NO_DOUBT = 3.0
-# Places whose misfit is so much more than the best one's are none: of it, and a share of the squares.
+# Largest misfit of a candidate: this multiple of the smallest misfit, plus this share of the squares.
 WORSE = 3.0, 0.02
-# Stamps are late where something takes time; that they are early, by a clock that is ahead, is less likely by as much.
+# Chi-square penalty of early stamps: processing makes stamps late, only a wrong clock makes them early.
 EARLY = 6.0
-# Of places that explain the data about as well the nearest is taken: log evidence, of samples so far apart (s).
+# Spacing of independent samples (s), and log evidence that a larger delay must gain over a smaller one.
 INDEPENDENT_S, GAIN = 1.0, 8.0
-# Against a place that compares fewer references than this share of its own another is weighed on what both compare.
+# If the best candidate compares fewer references than this share of another one, they are compared on shared ones.
 AS_MANY = 0.95
-# What is left lasts by so much longer than noise where a clock moves, which is then looked for by so many references of
-# each stretch.
+# σ inflation by correlated residuals from which a clock change is searched, and references per stretch of that search.
 STEADY, ROWS_OF_STRETCH = 1.05, 400
-# The place of the clocks is known where it is to this, s (σ); of one that is far off to a share of it, and to no more
-# than this: a short run finds some place for any clock, to half a second.
+# Largest σ of a known delay, s: the larger of a constant and a share of the delay, up to a maximum. A short recording
+# fits some delay of any clock to half a second.
 KNOWN_STD_S, KNOWN_SHARE, KNOWN_AT_MOST_S = 0.25, 0.12, 0.35
 
 
 OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
-# A DVL that is late by less is found by the calibration itself (full), at whatever its stamps say, s.
+# Smaller DVL delays are left to the calibration (full), which estimates them at any stamps, s.
 LEFT_TO_CALIBRATION_S = 2.5
-# Clocks that are found twice are one clock if they agree to this, s.
+# Largest difference of two estimates of the same delay, s.
 ALIKE_S = 0.1
-# A reference's clock of which nobody says anything is in time to this, s (σ): receivers and filters are late by tenths.
+# Prior σ of the reference delay, s: receivers and filters have delays of tenths of a second.
 IN_TIME_STD_S = 0.5
-# A clock that stays in time, though the data have it farther off than so many σ, is open by that. Farther off than so
-# many times what is known of one in time no place of the data says what that leaves open.
+# From this many σ on, the fitted delay of a clock assumed synchronised becomes its σ. From this multiple of the prior σ
+# on, the sensitivities are those at zero delay.
 FAR_OPEN = 2.0
-# What it leaves open of a lever arm is none to speak of below this, m (σ).
+# Smallest relevant lever arm uncertainty due to the reference clock, m (σ).
 OPEN_FROM_M = 0.03
-# ... and of the DVL's yaw, rad (σ).
+# Smallest relevant DVL rotation uncertainty due to the reference clock, rad (σ).
 OPEN_FROM_RAD = math.radians(0.1)
 
 
 @dataclass(frozen=True)
 class Clock:
-    """late: by how much stamps are late beside the IMU's, s. std: σ. is_shown: that they are is beyond doubt."""
+    """Delay (s) of stamps relative to the IMU, positive if late; its σ (s); whether it is significant."""
 
     late: float
     std: float
@@ -90,18 +89,18 @@ class Clock:
 
 @dataclass(frozen=True)
 class Registration:
-    """dvl, reference: their clocks beside the IMU's. imu: its own, where it alone is off.
+    """Delays, mounting, lever arm and scale of one motion.
 
-    Without a reference that an attitude turns, which clock it is does not show: then the reference is in time. apart:
-    by how much the DVL's stamps are later than the reference's. is_turned: whether an attitude turns the reference.
-    are_known: whether the data show how the clocks stand, in time or not.
-    rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: of the DVL from the reference
-    point. scale, scale_std: error of the DVL's, dimensionless. left: what no registration explains, as a share of the
-    speed; spread: the same, m/s per axis; speed: RMS, m/s.
-    unsteady: a clock that drifts or leaps beside the others; all else is what holds with that taken off.
-    open_late: σ (s) of the reference's clock by the data alone; open_by: (7,) by how much the DVL's turn (rad, body),
-    the lever arm (m) and the DVL's delay (s) are others for each second of it. next_worse: by how
-    much (chi-square) the next explanation is worse than the one that is taken.
+    dvl, reference: clocks relative to the IMU. imu: its own clock, if it alone is off. apart: delay of the DVL relative
+    to the reference. is_turned: an attitude rotates the reference; without it the delayed clock is not identifiable,
+    and the reference is assumed synchronised. are_known: the data determine the delays.
+
+    rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: DVL from the reference point,
+    body frame. scale, scale_std: DVL scale error, dimensionless. left: residual as a share of the speed; spread:
+    residual per axis, m/s; speed: RMS, m/s. unsteady: clock drift or step; all other fields hold after its correction.
+
+    open_late: σ (s) of the reference delay from the data alone. open_by: (7,) derivatives of the DVL's rotation (rad,
+    body), lever arm (m) and DVL delay (s) with respect to it. next_worse: chi-square margin to the next explanation.
     """
 
     dvl: Clock
@@ -126,10 +125,9 @@ class Registration:
 
     @property
     def left_open(self) -> Array:
-        """Covariance (7, 7) of what its clock leaves open of turn (rad, body), lever arm (m) and the DVL's delay (s).
+        """Covariance (7, 7) of rotation (rad, body), lever arm (m) and DVL delay (s) due to the reference clock.
 
-        At one speed a clock looks like a lever arm, at one rate of turn like a yaw, and then none is known. Zero where
-        that is nothing to speak of.
+        Zero if negligible. At one speed a delay looks like a lever arm, at one turn rate like a yaw.
         """
         open_by = self.open_by * _with_prior(self.open_late)
         turn, arm = (float(np.linalg.norm(part)) for part in (open_by[:3], open_by[3:6]))
@@ -138,24 +136,24 @@ class Registration:
 
     @property
     def offsets(self) -> dict[str, float]:
-        """By parameter, how late (s) the stamps are of the clocks that are shown to be off, beyond what it says."""
+        """Significant delays (s) beyond the configured ones, by parameter name."""
         if self.imu.is_shown:
             return {"imu_time_offset": self.imu.late}
         if not self.is_turned and self.apart.is_shown and self.apart.late < 0.0:
-            # which of the two it is does not show, but stamps are late more often than early
+            # the delayed clock is not identifiable; late stamps are likelier than early ones
             return {"reference_time_offset": -self.apart.late}
         clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference}
         return {name: clock.late for name, clock in clocks.items() if clock.is_shown}
 
     @property
     def taken_off(self) -> dict[str, float]:
-        """Those that a calibration takes off, s: a DVL that is late by little it finds itself, at whatever stamps."""
+        """Delays (s) that a calibration corrects, by parameter; it estimates a small DVL delay itself."""
         found = {name: round(late, 3) for name, late in self.offsets.items()}
         is_little = found.keys() == {"dvl_time_offset"} and abs(found["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S
         return {} if is_little else found
 
     def told(self, name: str) -> Reason:
-        """Whose stamps are how late, by the parameter that takes it off."""
+        """Return the finding of the delay that a parameter corrects."""
         clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference, "imu_time_offset": self.imu}
         if not self.is_turned and name == "reference_time_offset":
             clocks[name] = replace(self.apart, late=-self.apart.late)
@@ -163,7 +161,7 @@ class Registration:
         return finding("CLOCK_OFF", whose=OFFSETS[name], seconds=abs(clock.late), std=clock.std, way=_way(clock))
 
     def contradiction(self, parameters: Parameters) -> Reason | None:
-        """What the data fit, where a clock beside the DVL's is off beyond doubt."""
+        """Return the finding of a significant delay of reference or IMU, or of a clock change; else None."""
         if self.unsteady is not None:
             return self.unsteady.reason
         name, clock = ("imu_time_offset", self.imu) if self.imu.is_shown else ("reference_time_offset", self.reference)
@@ -176,21 +174,25 @@ class Registration:
         return finding("CLOCK_LATE", whose=OFFSETS[name], **off)
 
     def _holds(self, clock: Clock) -> bool:
-        """Whether σ of a calibration with a clock in time holds that it is late by so much."""
+        """Return whether the σ of a calibration that assumes synchronisation cover the delay of a clock."""
         return bool(self.left_open.any()) and abs(clock.late) < FAR_OPEN * _with_prior(self.open_late)
 
     @property
     def not_told_apart(self) -> Reason | None:
-        """Clocks that are further apart than a calibration finds, where whose is off does not show."""
+        """Finding of a large relative delay whose clock is not identifiable, or None."""
         if self.offsets or not self.apart.is_shown or abs(self.apart.late) < LEFT_TO_CALIBRATION_S:
             return None
         return finding("CLOCKS_NOT_TOLD_APART", seconds=abs(self.apart.late), std=self.apart.std)
 
 
 def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array) -> Registration | None:
-    """Register the streams of a motion; None where they have too little in common.
+    """Register the streams of a motion. Return None if they have too little in common.
 
-    rotation_body_from_dvl: (3, 3) the mounting, None where it is not known. lever_arm: (3,) m, what is known of it.
+    Parameters
+    ----------
+    motion: Streams, clock corrections of the parameters applied.
+    rotation_body_from_dvl: (3, 3) nominal mounting; None to estimate it.
+    lever_arm: (3,) m configured DVL position from the reference point, body frame.
     """
     return _registered(motion, rotation_body_from_dvl, lever_arm, None)
 
@@ -198,7 +200,7 @@ def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_
 def _registered(
     motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array, moves: ClockChange | None
 ) -> Registration | None:
-    """moves: what has been taken off a clock; None to look whether one moves."""
+    """Register a motion. moves: clock change that is already corrected; None to search for one."""
     curves = Curves(motion)
     fit, quick = (MotionFit(motion, lever_arm, curves, most) for most in (MOST_ROWS, FEW_ROWS))
     best = _placed(motion, quick, rotation_body_from_dvl)
@@ -208,18 +210,18 @@ def _registered(
         moves = _unsteady(motion, curves, lever_arm, rotation_body_from_dvl)
         if moves is not None:
             found = _registered(moves.steadied(motion), rotation_body_from_dvl, lever_arm, moves)
-            # in stretches without manoeuvres waves agree at several delays; without a clock that moves they all agree
+            # several delays fit each stretch in waves; a real clock change lowers the total residual
             if found is not None and found.spread < best.level:
                 x = np.zeros(N)
                 x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
                 x[APART], x[LATE] = found.dvl.late - found.reference.late, found.reference.late
                 return replace(found, unsteady=moves.timed(motion, fit, x, found.rotation_body_from_dvl, found.spread))
     in_time = _held(quick, best, rotation_body_from_dvl, 0.0, 0.0, (DVL, REFERENCE))
-    if in_time[1] < NO_DOUBT:  # all that there is would show nothing more
+    if in_time[1] < NO_DOUBT:  # the full fit would add no evidence
         seen = _explained(quick, best, rotation_body_from_dvl, lever_arm)
         if not seen.left_open.any():
             return seen
-        # fewer references show less of a clock
+        # more references determine the reference clock better
         free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
         if free is None or not _is_possible(free):
             return seen
@@ -231,7 +233,7 @@ def _registered(
 
 
 def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> Fitted | None:
-    """The likeliest place of the clocks of a motion."""
+    """Return the fit at the likeliest delays of a motion."""
     likely = places(motion, rotation)
     enough = WORSE[0] * likely[0].misfit + WORSE[1] if likely else 0.0
     tried = [(place.reference, place.dvl - place.reference) for place in likely if place.misfit <= enough]
@@ -240,13 +242,13 @@ def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> 
     if not fitted:
         return None
     closest = min(fitted, key=lambda each: each.level)
-    # legs that repeat agree at more than one delay
+    # repeated legs agree at several delays
     as_good = [each for each in fitted if _is_as_good(motion, quick, each, closest, rotation)]
     return min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
 
 
 def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
-    """A clock that moves, by the places of all of them in stretches of a motion."""
+    """Return the clock drift or step between the stretches of a motion, or None."""
     times = motion.reference_times
     number = min(int((times[-1] - times[0]) / STRETCH_S), MOST_STRETCHES)
     found = []
@@ -260,7 +262,7 @@ def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation:
 
 
 def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: Array) -> Registration:
-    """By the fewest clocks that are off: none, one of the three, or both of DVL and reference."""
+    """Explain a fit by the fewest delayed clocks: none, one of the three, or both DVL and reference."""
     apart = float(free.x[APART])
     early, too_early = (EARLY, 0.0) if apart < 0.0 else (0.0, EARLY)
     tried = {_Off.NONE: _held(fit, free, rotation, 0.0, 0.0, (DVL, REFERENCE))}
@@ -271,13 +273,13 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
             _Off.IMU: _held(fit, free, rotation, float(free.x[LATE]), 0.0, (BOTH_ALIKE,), ONE_MORE),
         }
     likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
-    # that both are off holds either one, and is no other cause
+    # BOTH includes every other explanation, so it is no alternative
     next_worse = min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost
     if best is None or cost > 2.0 * ONE_MORE:
         likeliest, best, next_worse = _Off.BOTH, free, math.inf
     is_told_apart = next_worse > TOLD_APART
     x, p = best.x, best.p
-    # what is not shown stays in time, and σ has to hold it
+    # an insignificant delay is set to zero, and σ must cover it
     stays = likeliest in (_Off.NONE, _Off.DVL) or not (is_told_apart and _is_off(best, LATE))
     late = 0.0 if stays else float(x[LATE])
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
@@ -303,26 +305,26 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
 
 
 def _open(fit: MotionFit, free: Fitted, late: float, rotation: Array | None) -> dict[str, Any]:
-    """open_late and open_by of a fit with all clocks free. late: s, where the reference's is said to be."""
+    """Return open_late and open_by of a fit with free clocks. late: adopted reference delay, s."""
     if not fit.is_turned:
         return {"open_late": 0.0, "open_by": np.zeros(7)}
     std, by, off = float(free.std[LATE]), free.by(LATE), abs(float(free.x[LATE]) - late)
     if off > FAR_OPEN * std and late == 0.0:
         std = off
     if off > FAR_OPEN * IN_TIME_STD_S and late == 0.0:
-        # as good as in time, and so far away that it turns another arm there
+        # the free delay is so large that its sensitivities do not hold at zero delay
         near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))
         std, by = max(std, off), by if near is None else near.by(LATE)
     return {"open_late": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[APART]]])}
 
 
 def _with_prior(std: float) -> float:
-    """Of a reference's clock that is known to so much (σ, s) by the data alone."""
+    """Return σ (s) of the reference delay, prior included, from its σ by the data alone."""
     return 1.0 / math.hypot(1.0 / max(std, 1e-9), 1.0 / IN_TIME_STD_S)
 
 
 class _Off(Enum):
-    """Which clock is off."""
+    """Delayed clock."""
 
     NONE, DVL, REFERENCE, IMU, BOTH = range(5)
 
@@ -336,11 +338,14 @@ def _held(
     in_time: tuple[Array, ...],
     costs: float = 0.0,
 ) -> tuple[Fitted | None, float]:
-    """The fit with some clocks in time, and by how much chi-square grows, and what it costs beside; None: nothing."""
+    """Fit with some clocks synchronised. Return the fit and its chi-square growth plus `costs`.
+
+    in_time: rows that select the synchronised clocks. Without a possible fit: None and infinity.
+    """
     held = fit(reference, apart, rotation, in_time)
     if held is None or not _is_possible(held):
         return None, math.inf
-    # at other delays a sample more or less is within both streams
+    # the number of compared samples depends on the delays
     grown = held.cost(free.level, held.at) * free.rows / held.rows - free.cost(free.level, free.at)
     grown /= free.inflation**2
     return held, grown + costs if math.isfinite(grown) else math.inf
@@ -351,13 +356,13 @@ def _is_off(fitted: Fitted, index: int) -> bool:
 
 
 def is_beyond_doubt(seconds: float, std: float) -> bool:
-    """Whether a clock is off that is late by so much: from here on it is said."""
+    """Return whether a delay (s) with this σ (s) is significant and large enough to report."""
     is_known = std < min(max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds)), KNOWN_AT_MOST_S)
     return is_known and abs(seconds) > max(SAID_FROM_S, SIGMAS * std)
 
 
 def _is_possible(fitted: Fitted) -> bool:
-    """Whether its clocks stand where they are looked for: what is found beyond, on the way there, is unknown."""
+    """Return whether the fitted delays are finite and within the search range."""
     late = [fitted.x[LATE], fitted.dvl_late]
     return bool(np.isfinite(fitted.x).all() and np.abs(late).max() <= LONGEST_S)
 
@@ -367,10 +372,10 @@ def _way(clock: Clock) -> str:
 
 
 def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:
-    """Whether a place explains the data about as well as the one that leaves least, and the same data.
+    """Return whether a candidate fits about as well as the one with the smallest residual, on the same data.
 
-    A delay that pushes a bad stretch of the DVL out of the overlap leaves less of the rest, as any other place does.
-    Read at other times, the DVL's noise is another one: in waves that repeat, that alone tells two places apart.
+    A delay may lower the residual by moving a bad DVL stretch out of the overlap. Candidates with other DVL delays also
+    sample other DVL noise; in periodic waves this alone makes a difference.
     """
     is_read_elsewhere = abs(float(one.x[APART]) - float(closest.x[APART])) > ALIKE_S
     enough = GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
@@ -386,20 +391,20 @@ def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fit
 
 
 def _by_chance(motion: MotionStreams, fitted: Fitted, dvl_noise: float) -> float:
-    """σ of the difference in log evidence of two places at which the DVL's noise is not the same."""
-    share = min(dvl_noise / max(fitted.level**2, 1e-12), 1.0)  # of what is left
-    # variance of (g + a)² - (g + b)², in squares of what is left: g the reference's noise, a and b the DVL's
+    """Return σ of the log-evidence difference of two candidates that sample different DVL noise."""
+    share = min(dvl_noise / max(fitted.level**2, 1e-12), 1.0)  # of the residual variance
+    # variance of (g + a)² - (g + b)² in units of the residual variance: g reference noise, a and b DVL noise
     each = 8.0 * share * (1.0 - share) + 4.0 * share**2
     samples = fitted.rows * fitted.axes
     return 0.5 * math.sqrt(each * samples) * min(1.0, _independent(motion, fitted) / fitted.rows)
 
 
 def _gain(motion: MotionStreams, one: Fitted, other: Fitted) -> float:
-    """By how much the log evidence of the other is larger, of samples that are so far apart as to be independent."""
+    """Return the log-evidence gain of the second fit over the first, counting independent samples."""
     return 3.0 * _independent(motion, other) * math.log(max(one.level, 1e-6) / max(other.level, 1e-6))
 
 
 def _independent(motion: MotionStreams, fitted: Fitted) -> float:
-    """How many of the references that are compared are so far apart as to be independent."""
+    """Return the number of independent references among the compared ones."""
     times = motion.reference_times
     return min(float(fitted.rows), float(times[-1] - times[0]) / INDEPENDENT_S)

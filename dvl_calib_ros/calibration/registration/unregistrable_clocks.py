@@ -1,7 +1,6 @@
-"""Clocks so far apart that nothing can be compared: found by correlation over the whole run, and refused.
+"""Detection of clock offsets beyond the search range, by correlation over the whole recording.
 
-Clocks up to `LONGEST_S` apart are registered. Beyond that a registration would settle in the best of its wrong places,
-and what it finds there would be believed.
+Offsets up to `LONGEST_S` are registered. Beyond, a registration would settle at a wrong delay, so the data are refused.
 """
 
 from __future__ import annotations
@@ -19,22 +18,22 @@ from ..streams.interpolation import attitude_at, shortened
 from .delay_search import HOLE_S, LONGEST_S
 from .motion_streams import MotionStreams
 
-# A delay beyond what is registered is believed if it leaves no more than this share of the squares that the best of the
-# others leaves: repeated legs are alike to a half, an effect is no reason for two series to agree elsewhere
+# Largest share of the squared residual at the best near delay that a far delay may leave. Repeated legs agree to a
+# half.
 BELIEVED = 0.25
-# Time step of the series, s; and the share of the shorter one that must overlap, and so many seconds of it
+# Time step of the series, s; smallest overlap as a share of the shorter series, and in seconds.
 STEP_S, OVERLAP, FEWEST_S = 0.5, 0.4, 60.0
-# Series last a day, or so many steps for each sample: else memory would grow with pauses, s and 1
+# Longest series, s, or steps per sample: memory must not grow with pauses.
 LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE = 86_400.0, 16
-# Steps of the running median that takes spikes out of a speed
+# Width of the running median that removes spikes of the speed, steps.
 SPIKE_STEPS = 9
-# Slower, a course says nothing of the heading
+# Lowest speed whose course is compared with the heading.
 MOVING_MPS = 0.2
-Series = NDArray[Any]  # of complex numbers
+Series = NDArray[Any]  # complex
 
 
 class UnregistrableClocks(NamedTuple):
-    """whose: of the clock that is off. others: beside which. late: by about so many s, more than is registered."""
+    """Clock `whose` with a delay of about `late` s relative to `others`, beyond the search range."""
 
     whose: str
     others: str
@@ -42,7 +41,7 @@ class UnregistrableClocks(NamedTuple):
 
     @property
     def reason(self) -> Reason:
-        """What is said of it."""
+        """Finding that names the clock."""
         way = "later" if self.late > 0.0 else "earlier"
         return finding(
             "CLOCK_FAR", whose=self.whose, seconds=abs(self.late), way=way, others=self.others, limit=LONGEST_S
@@ -50,9 +49,9 @@ class UnregistrableClocks(NamedTuple):
 
 
 def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> UnregistrableClocks | None:
-    """Which stamps are too far from the others to be registered; None if that is not beyond doubt.
+    """Return the clock with an offset beyond the search range, or None if there is no significant one.
 
-    rotation_dvl_from_body: (3, 3), the nominal mounting.
+    rotation_dvl_from_body: (3, 3) nominal mounting.
     """
     motion = _without_long_pauses(motion)
     dvl_times, velocity = motion.dvl
@@ -82,14 +81,14 @@ def far_clocks(motion: MotionStreams, rotation_dvl_from_body: Array) -> Unregist
 
 
 def _without_long_pauses(motion: MotionStreams) -> MotionStreams:
-    """Return a motion whose streams last no longer than their samples are worth, pauses that they share cut alike."""
+    """Return the motion with shared pauses shortened, so that the length is limited by the number of samples."""
     streams = motion.dvl.times, motion.reference_times, motion.imu.times
     every = np.sort(np.concatenate(streams))
     most = max(LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE * STEP_S * len(every))
     if not len(every) or max(own[-1] - own[0] for own in streams if len(own)) <= most:
         return motion
     gaps = np.diff(every)
-    # what lies between one clock and another is what is looked for
+    # only pauses within all streams: the offset between two clocks must remain
     is_pause = np.any([(own[0] <= every[:-1]) & (own[-1] >= every[1:]) for own in streams if len(own)], axis=0)
     cut = np.zeros(len(gaps))
     cut[is_pause] = gaps[is_pause] - shortened(gaps[is_pause], most)
@@ -112,19 +111,19 @@ def _steps(times: Array) -> Array:
 
 
 def covered(times: Array, at: Array) -> NDArray[np.bool_]:
-    """Whether (M,) is within samples that are near each other: across an outage a velocity is anything."""
+    """Return a mask (M,) of times within samples that are near each other, not across an outage."""
     after = np.clip(np.searchsorted(times, at), 1, len(times) - 1)
     is_near = times[after] - times[after - 1] <= max(HOLE_S, 3.0 * float(median(np.diff(times))))
     return np.asarray(is_near & (at >= times[0]) & (at <= times[-1]))
 
 
 def velocity_at(times: Array, values: Array, at: Array) -> Array:
-    """(M, 3) of a stream of (N, 3) at times (M,), on straight lines."""
+    """Interpolate a stream (N, 3) linearly at times (M,). Return (M, 3)."""
     return np.column_stack([np.interp(at, times, column) for column in values.T])
 
 
 def _speed(times: Array, velocity: Array) -> Series:
-    """(N,) horizontal speed, m/s, every STEP_S from the first sample on."""
+    """Return the median-filtered horizontal speed (N,) m/s, every STEP_S from the first sample on."""
     values = velocity_at(times, velocity, _steps(times))
     around = np.pad(np.hypot(values[:, 0], values[:, 1]), SPIKE_STEPS // 2)
     windows = np.lib.stride_tricks.sliding_window_view(around, SPIKE_STEPS)
@@ -139,16 +138,15 @@ def lag(
     weight: Array | None = None,
     own: Array | None = None,
 ) -> tuple[float, bool]:
-    """By how many s a series is later than another, and whether that is surely more than LONGEST_S.
+    """Return the delay (s) of a series relative to another, and whether it surely exceeds LONGEST_S.
 
-    That of all lags at which the squares of the difference are least; far ones only if they are so clearly.
+    The delay minimises the mean squared difference; a far delay must be clearly better than all near ones.
 
     Parameters
     ----------
     one, other: (N,), (M,), every STEP_S.
     one_start, other_start: Times of their first samples, s.
-    weight, own: (M,) of samples of the other, (N,) of the one; by default all alike.
-
+    weight, own: (M,) weights of `other`, (N,) of `one`; default 1.
     """
     n, m = len(one), len(other)
     weight = np.ones(m) if weight is None else weight
@@ -156,12 +154,12 @@ def lag(
     size = n + m
 
     def correlated(a: Series | Array, b: Series | Array) -> Array:
-        """Σ Re(a(i + lag) conj(b(i))) for lags -(m - 1) .. n - 1."""
+        """Return Σ Re(a(i + lag) conj(b(i))) for lags -(m - 1) .. n - 1."""
         sums = np.real(np.fft.ifft(np.fft.fft(a, size) * np.conj(np.fft.fft(b, size))))
         return np.concatenate([sums[size - (m - 1) :], sums[:n]])
 
     def means(weight: Array) -> Array:
-        """Mean square of the difference at each lag, infinite where too little overlaps."""
+        """Return the mean squared difference at each lag, infinite where the overlap is too short."""
         count = correlated(own, weight)
         squares = correlated(own * np.abs(one) ** 2, weight) + correlated(own, weight * np.abs(other) ** 2)
         squares -= 2.0 * correlated(own * one, weight * other)
@@ -174,16 +172,15 @@ def lag(
     best = int(np.argmin(mean))
     nearest = float(mean[near].min()) if near.any() else np.inf
     if not near[best] and mean[best] < BELIEVED * nearest:
-        # on the same samples as well: a stretch that is noisy may be out of the far one's overlap
+        # compare on the same samples: a noisy stretch may be outside the overlap of the far delay
         index = np.arange(m) + best - (m - 1)
         overlap = np.where((index >= 0) & (index < n), weight, 0.0)
         nearest = min(nearest, float(means(overlap)[near].min(initial=np.inf)))
-        # motion that repeats agrees at far lags as well, by chance better than at the near ones on this grid; but then
-        # it agrees there, too, to what one step of the grid makes
+        # periodic motion may agree at far lags, but it then agrees at near lags, too, to the change within one step
         both = weight[1:] * weight[:-1]
         of_a_step = float((both * np.abs(np.diff(other)) ** 2).sum() / max(both.sum(), 1.0))
         if mean[best] < BELIEVED * nearest and nearest > of_a_step:
-            # legs that repeat agree at more than one lag
+            # repeated legs agree at several lags: take the smallest
             as_good = np.where(mean <= 1.5 * mean[best], np.abs(late), np.inf)
             return float(late[int(np.argmin(as_good))]), True
     if not np.isfinite(mean[near].min(initial=np.inf)):

@@ -1,4 +1,4 @@
-"""What a bias of the DVL makes of states and their covariance: two estimates of one DVL share it."""
+"""Effect of a DVL bias on states and covariance, common to all estimates of the same DVL."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from ..numerics.samples import Mask
 
 
 class BiasCovariance(NamedTuple):
-    """Of states (n,).
+    """Effect of the DVL bias on states (n,).
 
-    columns: (n, 3), by how much states are off where the DVL is off by one σ along each of its axes: of its prior
-    (`dvl_bias_std`) at one speed, of what is left of it where speeds show it.
+    columns: (n, 3), change of the states per σ of the bias along each DVL axis: its prior σ (`dvl_bias_std`) at one
+    speed, its estimated σ if several speeds make it observable.
     """
 
     columns: Array
 
     @property
     def covariance(self) -> Array:
-        """(n, n), the part of P that would not be, were there no bias."""
+        """Contribution (n, n) of the bias to P."""
         return np.asarray(self.columns @ self.columns.swapaxes(-1, -2))
 
     @staticmethod
     def none(n: int) -> BiasCovariance:
-        """Of states (n,) that no bias reaches."""
+        """Return the effect on states (n,) that are independent of the bias."""
         return BiasCovariance(np.zeros((n, 3)))
 
     def where(self, known: Mask) -> BiasCovariance:
-        """Of those states (n,) alone that are known from data."""
+        """Return the effect on the states (n,) that are known from data."""
         return BiasCovariance(np.where(known[:, None], self.columns, 0.0))

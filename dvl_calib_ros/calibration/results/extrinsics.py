@@ -1,8 +1,7 @@
-"""Mounting, scale and delay of one calibration in terms that calibrations of any model share.
+"""Mounting, lever arm, scale and delay of a calibration, comparable between models.
 
-A model's angles are relative to the configured mounting, and its states are its own. Two calibrations can be compared
-in the whole: the corrected mounting in the axes of a URDF, lever arm, scale of motion ahead and delay, with σ of the
-next recording (`day_covariance`), as `replay` prints them.
+Angles are of the corrected mounting in URDF axes, not relative to the configured one. The scale is for motion ahead,
+and σ is for the next recording (`day_covariance`), as `replay` prints them.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from .velocity_correction import lever_arm
 COMPONENTS = ("roll", "pitch", "yaw", "lever_arm_x", "lever_arm_y", "lever_arm_z", "scale", "time_offset")
 N_COMPONENTS, N_AXES = len(COMPONENTS), 3
 ANGLES, LEVER_ARM, SCALE, TIME_OFFSET = slice(0, 3), slice(3, 6), 6, 7
-# Averaged each by its marginal covariance: mounting, scale, delay
+# Groups that are averaged separately by their marginal covariance: mounting, scale, delay
 MOUNTING, ONLY_SCALE, ONLY_CLOCK = GROUPS = np.arange(SCALE), np.array([SCALE]), np.array([TIME_OFFSET])
 
 _OF_SIZE = "MISALIGNMENT_LARGE"
@@ -35,35 +34,35 @@ _OF_SIZE = "MISALIGNMENT_LARGE"
 
 @dataclass(frozen=True, eq=False)
 class Extrinsics:
-    """One calibration of a DVL.
+    """Calibration of one DVL.
 
     Parameters
     ----------
     name
-        What people know it by: a file, a bag.
+        Name for the user: a file, a bag.
     model
-        Name of the model that found it.
+        Name of its model.
     first_ns, last_ns
-        Stamps of the data that it was found from.
+        First and last stamp of its data.
     value
         (8,) of `COMPONENTS`: roll, pitch, yaw (rad) of the corrected mounting, within half a turn of the configured
-        ones; lever arm (m, body frame), scale-factor error of motion ahead and delay of the DVL's stamps (s, positive
-        late), each estimated, else configured.
+        ones; lever arm (m, body frame), scale-factor error of motion ahead and DVL delay (s, positive late); estimated
+        or else configured.
     covariance
-        (8, 8) of the next recording; zero where `shown` is not.
+        (8, 8) for the next recording; zero where `shown` is False.
     shown
-        (8,) which of them the data showed.
+        (8,) components that the data make observable.
     used
-        Samples.
+        Number of samples.
     remarks
-        What to know when it is believed, in sentences.
+        Caveats for the user, in sentences.
     dvl
-        Which DVL, by the frame and the axes of its data; '' where that is not known, which is another each time.
+        The DVL, by frame and axes of its data; '' if unknown, which never equals another.
     by_bias
-        (8, 3) by how much `COMPONENTS` are off where that DVL is off by one σ of its bias along each of its axes; zero
-        where `shown` is not. It is in the covariance, and common to all calibrations of that DVL.
+        (8, 3) change of `COMPONENTS` per σ of the DVL bias along each axis; zero where `shown` is False. Included in
+        the covariance, and common to all calibrations of that DVL.
     rejected
-        Why its numbers and σ are not to be believed, in a sentence; '' if they are, or nobody has judged them.
+        Reason to reject its numbers and σ, in a sentence; '' if there is none, or it was not verified.
     """
 
     name: str
@@ -81,7 +80,7 @@ class Extrinsics:
 
     @cached_property
     def information(self) -> Array:
-        """(8, 8) inverse of the covariance if the bias were known: of mounting, scale and delay, each for itself."""
+        """Inverse (8, 8) of the covariance for a known bias, separately for mounting, scale and delay."""
         found, covariance = np.zeros((N_COMPONENTS, N_COMPONENTS)), self.covariance - self.by_bias @ self.by_bias.T
         for group in GROUPS:
             at = np.ix_(group[self.shown[group]], group[self.shown[group]])
@@ -90,7 +89,7 @@ class Extrinsics:
 
     @property
     def std(self) -> Array:
-        """(8,) standard deviations, nan for what was not shown."""
+        """Standard deviations (8,), nan for components that are not observable."""
         return np.where(self.shown, np.sqrt(np.diag(self.covariance)), np.nan)
 
 
@@ -106,11 +105,10 @@ def extrinsics_of(
     by_bias: Array | None = None,
     rejected: str = "",
 ) -> Extrinsics:
-    """Return what a state (n,) of a model says of the DVL, with the parameters that it was estimated with.
+    """Return the extrinsics of a model state (n,), estimated with these parameters.
 
-    state: with σ of its recording, by which a component is shown: if that without the bias is at most half of what the
-    parameters say is known without data, as for observability. span_ns: stamps of the first and last sample.
-    by_bias: (n, 3), `OfBias.columns` of the state.
+    state: with the σ of its recording. A component is observable if its σ without bias is at most half of its prior σ.
+    span_ns: stamps of the first and last sample. by_bias: (n, 3), `BiasCovariance.columns` of the state.
     """
     beside = scale_and_delay(model, state, parameters)
     value = np.array(
@@ -133,21 +131,21 @@ def extrinsics_of(
 
 
 def rejection(findings: Iterable[Mapping[str, Any]]) -> str:
-    """Return why a calibration is not to be believed, by its findings as plain data; '' if it is.
+    """Return the reason to reject a calibration from its findings as plain data; '' if there is none.
 
-    A large misalignment alone leaves numbers and σ as they are: a mounting that moved has one.
+    A large misalignment alone does not invalidate the numbers: a mounting may have moved.
     """
     against = (each["says"] for each in findings if each["severity"] == "reject" and each["code"] != _OF_SIZE)
     return str(next(against, ""))
 
 
 def dvl_in_words(frame: str, turned: bool) -> str:
-    """Which DVL: two of a vehicle have frames of their own. turned: from forward-right-down, whose bias is another."""
+    """Return the identity of a DVL by frame and axes. turned: the data were forward-right-down."""
     return f"{frame}, {FRD if turned else FLU}"
 
 
 def _jacobian(model: Model, state: GaussianState, p: Parameters) -> Array:
-    """Differentiate the components by a model's state: (8, n)."""
+    """Return the derivative (8, n) of the components with respect to the state."""
     errors = model.error_terms_from_state
     found = np.zeros((N_COMPONENTS, model.n_state))
     found[ANGLES] = rpy_jacobian(errors[:3] @ state.x, p) @ errors[:3]
@@ -159,6 +157,6 @@ def _jacobian(model: Model, state: GaussianState, p: Parameters) -> Array:
 
 
 def _unknown(p: Parameters) -> Array:
-    """(8,) standard deviations without data."""
+    """Return the prior standard deviations (8,)."""
     angle, scale = p.initial_std_misalignment, p.initial_std_scale
     return np.array([*[angle] * 3, *[p.initial_std_lever_arm] * 3, scale, p.initial_std_time_offset])

@@ -1,9 +1,8 @@
-"""Hold-out verification: a calibration is judged on samples that it did not use.
+"""Hold-out verification of a calibration, on samples that it did not use.
 
-For each fold of a run (filters/cross_validation.py) the models are solved again without it, and their correction is
-tried on it against the reference velocity, so that every sample with a reference is judged once, by an estimate that
-has not seen it. Two things are those of the whole run: which samples the gate lets pass, and the random walk,
-which is taken as none.
+For each fold (filters/cross_validation.py) the models are solved without it, and their correction is compared with the
+reference velocity on it. So every sample with a reference is judged once. The gate decisions are those of the whole
+run, and the random walk is neglected.
 """
 
 from __future__ import annotations
@@ -24,20 +23,20 @@ from ..numerics.kalman import GaussianState
 from ..numerics.tests import chi2_isf
 from .results import Verification
 
-# A squared error that grows by more than so many times the estimate's variance is no chance (99 % of chi-square with
-# three degrees of freedom and more).
+# Significant growth of the squared error in variances of the estimate: above 99 % of chi-square per degree of freedom,
+# with three and more.
 WORSE_FROM = 4.0
-# A held-out error of so many times what is predicted is no noise that was claimed a little too small.
+# Held-out error in predicted errors that slightly small claims of noise do not explain.
 SEVERAL = 3.0
-# One below this share of what the instruments claim is less than their noise: they then share it.
+# Smallest plausible held-out error as a share of the claimed noise: below, reference and DVL share their noise.
 IMPLAUSIBLE = 0.2
-# If more than this share of the samples is gated, the estimate is that of a minority.
+# Largest share of gated samples: above, the estimate is that of a minority.
 MOST_GATED = 0.5
-# An error of so many σ is one, however little the data show of it.
+# σ from which an error is significant even if it is not observable.
 SURELY = 3.0
-# Without outliers an error is as predicted up to so many times; one of so many times that without is made by them.
+# Largest error without outliers in predicted errors; smallest error with outliers in errors without.
 AS_PREDICTED, MADE_BY_OUTLIERS = 1.25, 1.5
-# Share of runs whose held-out error may by chance exceed what a true covariance predicts.
+# False-alarm rate of a held-out error above the prediction of a true covariance.
 CHANCE = 0.01
 
 
@@ -55,27 +54,26 @@ def verify(
     typical_error: float | None = None,
     own_error: float = 0.0,
 ) -> Verification:
-    """Judge an estimate of all the data by its size, by what it used, and by what it did on held-out samples.
+    """Judge an estimate of all data by its size, its used samples, and its held-out error.
 
     Parameters
     ----------
-    model: Whose estimate it is.
-    state: Its state, x (n,) and P (n, n).
-    convergence: How far it is.
-    held_out: What it did on samples that it had not seen; None for too few.
-    parameters: The thresholds.
-    used_and_gated: How many samples it used, and threw out; None where that is not known.
-    suggestion: What configuration would fit, if the one given does not.
-    reference_claims: Whether the reference's messages claim the noise that is predicted; a parameter proves nothing.
-    lever_arm_turns: How much of an angle is the lever arm's, if the motion does not tell them apart.
-    finds_lever_arm: Whether it is in σ of the angles, and not taken as known.
-    typical_error: Velocity error without outliers, m/s rms, where that on held-out samples is large.
-    own_error: Velocity error that its σ by blocks of time leads one to expect, m/s rms, as of `calibration_error`.
-
+    model: Model of the estimate.
+    state: x (n,) and P (n, n).
+    convergence: Convergence of the estimate.
+    held_out: Held-out error; None for too few samples.
+    parameters: Thresholds.
+    used_and_gated: Numbers of samples used and gated; None if unknown.
+    suggestion: Configuration that fits better than the configured one.
+    reference_claims: True if the messages of the reference claim the predicted noise, False if a parameter does.
+    lever_arm_turns: Angle error due to the lever arm, if the motion does not separate the two.
+    finds_lever_arm: True if the σ of the angles include the lever arm.
+    typical_error: Velocity error without outliers, m/s rms, if the held-out one is large.
+    own_error: Velocity error predicted by σ of time blocks, m/s rms (`calibration_error`).
     """
     reasons = by_severity(
         [
-            # the cause before what it makes of the samples
+            # the cause before its effects on the samples
             *([finding("CONFIGURATION_WRONG", says=suggestion).weighed(Severity.REJECT)] if suggestion else []),
             *use_findings(used_and_gated),
             *_lever_arm_findings(lever_arm_turns, finds_lever_arm, parameters),
@@ -89,7 +87,7 @@ def verify(
 
 
 def use_findings(used_and_gated: tuple[int, int] | None) -> list[Reason]:
-    """What it says of an estimate how many samples it used, and threw out."""
+    """Return findings on the numbers of samples used and gated."""
     if used_and_gated is None:
         return []
     used, gated = used_and_gated
@@ -109,7 +107,7 @@ def _lever_arm_findings(turns: Reason | None, is_found: bool, parameters: Parame
 
 
 def shown_misalignment(model: Model, state: GaussianState, parameters: Parameters) -> Array:
-    """By what the DVL is turned (3,) about the body's axes, as φ is; 0 about those that the data do not show."""
+    """Return the misalignment (3,) about body axes, as φ is; 0 about axes that are not observable."""
     t = parameters.rotation_dvl_from_body
     about = t.T @ (model.error_terms_from_state @ state.x)[:3]
     std = body_angle_std(state.p, parameters)
@@ -118,7 +116,7 @@ def shown_misalignment(model: Model, state: GaussianState, parameters: Parameter
 
 
 def _angle_deg(model: Model, state: GaussianState, parameters: Parameters) -> float:
-    """How far the DVL is turned, degrees, about the body's axes that are known: what is not shown proves nothing."""
+    """Return the misalignment angle, degrees, about the observable body axes."""
     return math.degrees(math.atan(float(np.linalg.norm(shown_misalignment(model, state, parameters)))))
 
 
@@ -151,6 +149,7 @@ def _error_finding(
     typical_error: float | None,
     own_error: float,
 ) -> Reason:
+    """Return the finding on the held-out error: outliers, worse, too large, implausible, noisier or as predicted."""
     if held_out is None:
         return finding("HELD_OUT_TOO_FEW")
     uncorrected, corrected, predicted = held_out.uncorrected, held_out.corrected, held_out.predicted
@@ -160,13 +159,13 @@ def _error_finding(
         "corrected": corrected,
         "predicted": predicted,
     }
-    # where there is nothing to correct, correcting adds the estimate's own variance, give or take; where noise lasts
-    # that is more than the filter says, and being worse is no contradiction
+    # if there is nothing to correct, a correction adds about the variance of the estimate; correlated noise makes this
+    # more than the filter predicts, so a larger error is no contradiction
     worse = corrected**2 - uncorrected**2
     is_large = corrected > SEVERAL * predicted
     is_worse = worse - held_out.interpolated**2 > WORSE_FROM * max(held_out.calibration, own_error) ** 2
     if typical_error is not None and (is_large or is_worse):
-        # nor do they say which is the worse
+        # outliers make this comparison meaningless
         as_usual = typical_error < (SEVERAL if is_large else AS_PREDICTED) * predicted
         if as_usual and corrected > MADE_BY_OUTLIERS * typical_error:
             return finding("HELD_OUT_OUTLIERS", **said, typical=typical_error)
@@ -190,7 +189,7 @@ def _convergence_findings(convergence: Convergence) -> list[Reason]:
 
 
 def verification_document(verification: Verification) -> dict[str, Any]:
-    """Plain data, for JSON and YAML."""
+    """Return a verification as plain data, for JSON and YAML."""
     held_out = verification.held_out
     return {
         "verdict": verification.verdict.value,

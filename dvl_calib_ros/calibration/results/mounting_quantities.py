@@ -1,4 +1,4 @@
-"""What a calibration found, quantity by quantity, in the units and signs by which a DVL is mounted."""
+"""Quantities of a calibration in the units and signs used to mount a DVL."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..models.parameters import Parameters
 from ..numerics.kalman import GaussianState
 from .results import Result, corrected_rpy, rpy_std, scale_and_delay
 
-# Axes of `observability` that only a recording with angular velocities can show.
+# Axes of `observability` that need angular velocities.
 _NEED_IMU = ("lever arm x", "lever arm y", "lever arm z", "time offset")
 
 
 class Quantity(NamedTuple):
-    """nominal, value, std: as configured, as found, and its σ, in this unit. shown: whether the recording shows it."""
+    """Configured (nominal) and estimated value, its σ, the unit, and whether the quantity is observable (shown)."""
 
     name: str
     nominal: float
@@ -28,15 +28,15 @@ class Quantity(NamedTuple):
     shown: bool
 
     def in_unit(self, number: float, signed: bool = False) -> str:
-        """A number of this quantity as people read it, such as ``+0.27 %``."""
-        return f"{round(number, 2) + 0.0:{'+' if signed else ''}.2f}{self.unit}"  # + 0.0: no minus before zero
+        """Return a number of this quantity for display, such as ``+0.27 %``."""
+        return f"{round(number, 2) + 0.0:{'+' if signed else ''}.2f}{self.unit}"  # + 0.0 avoids -0.00
 
 
 def quantities(result: Result) -> list[Quantity]:
-    """Roll, pitch, yaw of the DVL (°); of models that have them scale of motion ahead (%), lever arm (m), delay (s).
+    """Return roll, pitch, yaw of the DVL (°), and by model scale of motion ahead (%), lever arm (m), delay (s).
 
-    Angles are those of a URDF's origin, within half a turn of the configured ones. One that no motion has told from
-    what is known without data is not shown. Without an IMU there is neither lever arm nor delay.
+    Angles are those of a URDF origin, within half a turn of the configured ones. An angle is not shown if its σ is near
+    the prior. Lever arm and delay need an IMU.
     """
     estimate, parameters = result.estimate, Parameters.from_mapping(result.parameters)
     nominal = np.degrees(parameters.mounting_rpy)
@@ -70,11 +70,11 @@ def quantities(result: Result) -> list[Quantity]:
 
 
 def not_shown(result: Result) -> dict[str, str]:
-    """The axes that the data do not show, by what they lack.
+    """Return the axes that are not observable, by the missing motion or sensor.
 
-    An angle is that about an axis of the vehicle, and says so where the DVL's own angle of the same name is shown: of a
-    DVL that is mounted across, the vehicle's roll is the DVL's pitch. A scale across is none of the quantities, and
-    few vehicles can show it.
+    Angles are about axes of the vehicle. The text says so if the DVL angle of the same name is observable: with a DVL
+    mounted across, roll of the vehicle is pitch of the DVL. The scale across is omitted, because few vehicles can
+    observe it.
     """
     shown = {each.name for each in quantities(result) if each.shown}
     causes: dict[str, dict[str, None]] = {}
@@ -92,7 +92,7 @@ def _has_imu(result: Result) -> bool:
 
 
 def date(stamp_ns: int) -> str:
-    """A stamp as people read it, UTC."""
+    """Return a stamp as date and time for display, UTC."""
     try:
         return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).strftime("%Y-%m-%d %H:%M")
     except (ValueError, OverflowError, OSError):

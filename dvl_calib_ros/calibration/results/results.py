@@ -1,4 +1,4 @@
-"""Results of a calibration as immutable data, and the pose of the DVL in the body frame."""
+"""Immutable results of a calibration, and the pose of the DVL in the body frame."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from .velocity_correction import NOT_ESTIMATED, lever_arm
 class Estimate:
     """State of one model.
 
-    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors. covariance: (n, n), of the next
-    recording, on another day (`days`). recording_covariance: (n, n), of this one: as blocks of time show, where that is
-    more than the filter claims. filter_covariance: (n, n), what the filter alone claims. left_open: (n, n), the part of
-    both covariances that the clock of the reference leaves open, which at one speed looks like a lever arm. of_bias:
-    what a bias of the DVL makes of state and both: of the mounting, not of velocities at the speeds driven.
-    used, gated: samples. mean_nis: mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent
-    filter. heading_deviation: x (5,), P (5, 5) of how the heading deviates: coefficients of sine and cosine of the yaw
-    and of twice the yaw, rad, and of time, rad/s; None for models that take the heading as it is.
+    state: (n,), misalignment in rad in the DVL frame, then scale-factor errors, then nuisance states. covariance: (n,
+    n), for the next recording. recording_covariance: (n, n), for this one, inflated by the scatter of time blocks.
+    filter_covariance: (n, n), of the filter alone. left_open: (n, n), contribution of the reference clock to covariance
+    and recording_covariance; at one speed a delay looks like a lever arm. of_bias: effect of the DVL bias on the state
+    and these covariances, for the mounting, not for velocities at the speeds driven. used, gated: samples. mean_nis:
+    mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter. heading_deviation: x
+    (5,), P (5, 5): coefficients of sine and cosine of the yaw and of twice the yaw, rad, and of time, rad/s; None for
+    models with exact heading.
     """
 
     model: str
@@ -59,86 +59,86 @@ class Estimate:
 
     @property
     def std(self) -> Array:
-        """Standard deviations (n,), of the next recording."""
+        """Standard deviations (n,) for the next recording."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def recording_std(self) -> Array:
-        """Standard deviations (n,) of this recording."""
+        """Standard deviations (n,) for this recording."""
         return np.sqrt(np.diag(self.recording_covariance))
 
     @property
     def of_recording(self) -> GaussianState:
-        """State with its covariance of this recording."""
+        """State with its covariance for this recording."""
         return GaussianState(self.state, self.recording_covariance)
 
     @property
     def velocity_covariance(self) -> Array:
-        """(n, n) of this recording, for what velocities are worth that it corrects, at the speeds driven."""
+        """State covariance (n, n) for corrected velocities of this recording: without bias, at the speeds driven."""
         return self.recording_covariance - self.of_bias.covariance
 
     @property
     def filter_std(self) -> Array:
-        """Standard deviations (n,) that the filter alone claims."""
+        """Standard deviations (n,) of the filter alone."""
         return np.sqrt(np.diag(self.filter_covariance))
 
     @property
     def misalignment(self) -> Array:
-        """φ (3,) rad, DVL frame."""
+        """Misalignment φ (3,) rad, DVL frame."""
         return self.state[:3]
 
     @property
     def scale(self) -> Array:
-        """δk (3,) per DVL axis, zero where not estimated."""
+        """Scale-factor errors δk (3,) per DVL axis, zero where not estimated."""
         return (MODELS[self.model].error_terms_from_state @ self.state)[3:]
 
     def lever_arm(self, nominal: Sequence[float]) -> Array:
-        """Where the DVL is (3,) m from the reference point, body frame: as the parameters say, and what was found."""
+        """Return the DVL position (3,) m from the reference point, body frame: configured plus estimated."""
         return np.asarray(nominal, dtype=float) + self._beyond("lever_arm_x", "lever_arm_y", "lever_arm_z")
 
     def dvl_time_offset(self, nominal: float) -> float:
-        """By how much the DVL's stamps are late, s: as the parameters say, and what was found."""
+        """Return the DVL delay, s: configured plus estimated."""
         return nominal + float(self._beyond("time_offset")[0])
 
     def _beyond(self, *names: str) -> Array:
-        """States of these names, zero where the model has none."""
+        """Return states by name, zero where the model has none."""
         return np.array([self.state_of(name) for name in names])
 
     def state_of(self, name: str) -> float:
-        """State of this name, zero where the model has none."""
+        """Return a state by name, zero if the model has none."""
         own = self.state_names
         return float(self.state[own.index(name)]) if name in own else 0.0
 
     def std_of(self, *names: str) -> Array | None:
-        """Standard deviations of states of these names; None if the model has none of them."""
+        """Return the standard deviations of states by name; None if the model lacks one of them."""
         own = self.state_names
         return self.std[[own.index(name) for name in names]] if set(names) <= set(own) else None
 
     def corrected_velocity(self, velocity_dvl: Array, rotation_dvl_from_body: Array) -> Array:
-        """Measured DVL velocities (..., 3) m/s -> corrected body velocities (..., 3) m/s."""
+        """Return corrected body velocities (..., 3) m/s of measured DVL velocities (..., 3) m/s."""
         return correct(velocity_dvl, self.misalignment, self.scale, rotation_dvl_from_body)
 
     def rotation_body_from_dvl(self, rotation_dvl_from_body: Array) -> Array:
-        """Corrected mounting (3, 3)."""
+        """Return the corrected mounting (3, 3)."""
         return corrected_mounting(self.misalignment, rotation_dvl_from_body)
 
 
 @dataclass(frozen=True)
 class Day:
-    """What belongs to one of several days, by the data of all.
+    """States of one of several recordings, estimated from all data.
 
     Parameters
     ----------
     first_ns
         Stamp of its first DVL sample.
     dvl_time_offset, dvl_time_offset_std
-        By how much the DVL's stamps are late, s: as the parameters say, and what was found; its σ.
+        DVL delay, s, configured plus estimated; its σ.
     shown
-        Whether the data showed it.
+        True if the delay is observable.
     reference_offset, reference_offset_std
         (2,) constant error of the reference, east and north, m/s; its σ.
     name
-        Of the recording, '' for none.
+        Name of the recording, or ''.
     """
 
     first_ns: int
@@ -151,9 +151,9 @@ class Day:
 
 
 class Delay(NamedTuple):
-    """By how much the DVL's stamps are late, s: as the parameters say, and what was found; σ; whether it was shown.
+    """DVL delay, s, configured plus estimated; its σ; whether it is observable (shown).
 
-    day: whose it is, None where there is one only.
+    day: recording of the delay, None if there is only one.
     """
 
     day: Day | None
@@ -164,14 +164,13 @@ class Delay(NamedTuple):
 
 @dataclass(frozen=True)
 class Result:
-    """All models' estimates, which one is selected, and what the data went through.
+    """Estimates of all models, the selected one, and counts of the data.
 
     first_ns, last_ns: stamps of the DVL samples received in order, None before the first. counts: see
-    `Calibrator.counts`. segments: which model was selected from when. parameters: as used, plain values. verifications:
-    by model, empty if the calibrator was not to verify. suggestion: what configuration the data fit, where the one
-    given is grossly wrong, else ''. days: in order, none where there is one; days_of: the model whose states they are.
-    doubts: live, what the data say against the calibration, as bad as that is to the verdict of a replay. iac_model:
-    the model that the paper's own selection ends with.
+    `Calibrator.counts`. segments: selected model over time. parameters: as used, plain values. verifications: by model,
+    empty without verification. suggestion: configuration that fits, if the configured one is grossly wrong. days:
+    recordings in order, empty for a single one; days_of: the model of their states. doubts: live warnings with the
+    severity of a replay's verdict. iac_model: final model by the selection of the paper.
     """
 
     selected: str
@@ -191,24 +190,24 @@ class Result:
 
     @property
     def estimate(self) -> Estimate:
-        """The selected model's estimate."""
+        """Estimate of the selected model."""
         return self.estimates[self.selected]
 
     @property
     def position_in_body(self) -> tuple[float, float, float] | None:
-        """Where the DVL is in the body (3,) m, by the selected model; None where that is not known."""
+        """DVL position (3,) m in the body by the selected model; None if unknown."""
         estimate = self.estimate
         state = GaussianState(estimate.state, estimate.covariance)
         return position_in_body(MODELS[estimate.model], state, Parameters.from_mapping(self.parameters))
 
     @property
     def own_days(self) -> tuple[Day, ...]:
-        """Days that the selected model found something of; none where there is one."""
+        """Recordings with states of the selected model; empty for a single one."""
         return self.days if self.selected == self.days_of else ()
 
     @property
     def delays(self) -> tuple[Delay, ...]:
-        """What the selected model found of the DVL's clock: one of each day, one if there is one, none without."""
+        """DVL delays by the selected model: one per recording, or none."""
         estimate = self.estimate
         if self.own_days:
             return tuple(Delay(day, day.dvl_time_offset, day.dvl_time_offset_std, day.shown) for day in self.own_days)
@@ -220,7 +219,7 @@ class Result:
 
 
 class Segment(NamedTuple):
-    """From this stamp on (until the next segment's) this model was selected."""
+    """Model selected from this stamp to the next segment."""
 
     from_ns: int
     model: str
@@ -228,10 +227,10 @@ class Segment(NamedTuple):
 
 @dataclass(frozen=True)
 class Verification:
-    """The verdict on one model's calibration, with reasons, the decisive ones first.
+    """Verdict on the calibration of one model, with reasons, the decisive ones first.
 
-    verdict: reject, marginal or accept. mounting: what there is to inspect about the mounting, None for nothing: a good
-    calibration may be of a bad one.
+    verdict: reject, marginal or accept. mounting: reason to inspect the mounting, or None; a good calibration can have
+    one.
     """
 
     model: str
@@ -241,7 +240,7 @@ class Verification:
     mounting: Reason | None = None
 
     def with_objections(self, objections: Sequence[Reason]) -> Verification:
-        """With what else is known of it; the verdict is the worst of all."""
+        """Return the verification with further reasons; the verdict is the worst of all."""
         reasons = tuple(by_severity((*objections, *self.reasons)))
         return replace(self, verdict=reasons[0].severity, reasons=reasons)
 
@@ -250,11 +249,11 @@ _ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
 
 
 class MountingPose(NamedTuple):
-    """A DVL's frame in the body.
+    """Pose of the DVL frame in the body.
 
-    position: (3,) m in the body, nan where it is not known. rotation_body_from_dvl: (3, 3), of the frame that the
-    driver's data are in. covariance: (6, 6) of position (m²) and of a small turn about the body's axes (rad²), as in
-    geometry_msgs/PoseWithCovariance; NOT_ESTIMATED on the diagonal of what the model does not estimate.
+    position: (3,) m in the body, nan if unknown. rotation_body_from_dvl: (3, 3), of the frame of the driver data.
+    covariance: (6, 6) of position (m²) and of small rotations about body axes (rad²), as in
+    geometry_msgs/PoseWithCovariance; NOT_ESTIMATED on the diagonal of components that the model does not estimate.
     """
 
     position: tuple[float, float, float]
@@ -263,11 +262,10 @@ class MountingPose(NamedTuple):
 
 
 def position_in_body(model: Model, state: GaussianState, parameters: Parameters) -> tuple[float, float, float] | None:
-    """Where the DVL is in the body (3,) m, by one model's state x (n,), P (n, n); None where that is not known.
+    """Return the DVL position (3,) m in the body by a model state x (n,), P (n, n); None if unknown.
 
-    The lever arm is from the reference point, of which `dvl_position` says what is known. On an axis that the data do
-    not show it is as it was given, and where they contradict it or know it worse. If it was not given, nothing is
-    known.
+    `dvl_position` selects its source. The configured lever arm is kept on axes that are not observable, where the data
+    contradict it, and where a tape measure is better. If none is configured, all axes must be observable.
     """
     if parameters.dvl_position == UNKNOWN:
         return None
@@ -285,20 +283,19 @@ def position_in_body(model: Model, state: GaussianState, parameters: Parameters)
 
 
 def mounting_pose(model: Model, state: GaussianState, parameters: Parameters, turned: bool = False) -> MountingPose:
-    """Pose of the DVL by one model's state, to first order in its misalignment.
+    """Return the pose of the DVL by a model state, to first order in the misalignment.
 
     Parameters
     ----------
-    model: Whose state it is.
+    model: Model of the state.
     state: x (n,), P (n, n).
     parameters: Nominal mounting and lever arm.
-    turned: Whether the driver's data are forward-right-down, and were turned.
-
+    turned: True if the driver data are forward-right-down and were rotated.
     """
     t = parameters.rotation_dvl_from_body
     misalignment = (model.error_terms_from_state @ state.x)[:3]
     rotation = corrected_mounting(misalignment, t)
-    # R = Tᵀ (I + [φ×])ᵀ, so φ turns the DVL by -Tᵀφ about the body's axes
+    # R = Tᵀ (I + [φ×])ᵀ, so φ rotates the DVL by -Tᵀφ about body axes
     terms = np.zeros((6, model.n_state))
     names = model.state_names
     for row, name in enumerate(_ARM):
@@ -317,7 +314,7 @@ def mounting_pose(model: Model, state: GaussianState, parameters: Parameters, tu
     )
 
 
-# Turn (rad) over which the angles of a URDF are differentiated: their second derivatives are of order one.
+# Step (rad) of the numerical derivative of URDF angles: their second derivatives are of order one.
 _SMALL_TURN = 1e-5
 
 
@@ -331,7 +328,7 @@ def corrected_rpy(misalignment: Array, parameters: Parameters) -> Array:
 
 
 def rpy_jacobian(misalignment: Array, parameters: Parameters) -> Array:
-    """Differentiate roll, pitch, yaw of the corrected mounting by the misalignment φ (3,): (3, 3)."""
+    """Return the derivative (3, 3) of roll, pitch, yaw of the corrected mounting with respect to φ (3,)."""
     up, down = (
         np.array([corrected_rpy(misalignment + way * each, parameters) for each in _SMALL_TURN * np.eye(3)])
         for way in (1.0, -1.0)
@@ -340,18 +337,20 @@ def rpy_jacobian(misalignment: Array, parameters: Parameters) -> Array:
 
 
 def rpy_std(misalignment: Array, covariance: Array, parameters: Parameters) -> Array:
-    """Return standard deviations (3,) rad of roll, pitch, yaw of the corrected mounting, as a URDF's origin has them.
+    """Return the σ (3,) rad of roll, pitch, yaw of the corrected mounting, as in a URDF origin.
 
-    Not those of turns about the body's axes: of a DVL at 45 degrees, a roll of the body that the motion does not show
-    is as much pitch as roll. covariance: (n, n) of a model's state, which begins with φ.
+    They differ from σ about body axes: with a DVL at 45 degrees, unobservable body roll affects pitch and roll alike.
+    covariance: (n, n) of a state that begins with φ.
     """
     jacobian = rpy_jacobian(misalignment, parameters)
     return np.sqrt(np.diag(jacobian @ covariance[:3, :3] @ jacobian.T))
 
 
 class ScaleAndDelay(NamedTuple):
-    """What a pose does not hold. scale: of motion ahead, dimensionless. time_offset: of the DVL's stamps, s, positive
-    late, as the parameters say and what was found. Each with its σ, None where the model does not estimate it."""
+    """Scale of motion ahead (dimensionless) and DVL delay (s, positive late), configured plus estimated.
+
+    Each with its σ, None if the model does not estimate it.
+    """
 
     scale: float
     scale_std: float | None
@@ -360,7 +359,7 @@ class ScaleAndDelay(NamedTuple):
 
 
 def scale_and_delay(model: Model, state: GaussianState, parameters: Parameters) -> ScaleAndDelay:
-    """Scale ahead and delay by one model's state, x (n,), P (n, n)."""
+    """Return scale ahead and delay by a model state, x (n,), P (n, n)."""
     ahead = parameters.rotation_dvl_from_body[:, 0] ** 2 @ model.error_terms_from_state[3:]
     std = scale_std_ahead(model, state.p, parameters)
     delay, delay_std = parameters.dvl_time_offset, None
@@ -372,19 +371,20 @@ def scale_and_delay(model: Model, state: GaussianState, parameters: Parameters) 
 
 OFFSETS = "reference_east", "reference_north"
 ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
-# So many σ are no chance, and so many metres no tape measure's error.
+# Difference that contradicts the configured lever arm: in σ (two-sided p = 6e-7), and at least the error of a tape
+# measure, m.
 SIGMAS, MEASURED_TO = 5.0, 0.05
-# Data that know an arm so many times worse than a tape measure do not improve on it.
+# σ of the estimate, in errors of a tape measure, above which the configured lever arm is kept.
 WORSE_THAN_TOLD = 2.0
 
 
 def estimates_lever_arm(model: Model) -> bool:
-    """Whether its states have the lever arm."""
+    """Return whether a model estimates the lever arm."""
     return set(ARM) <= set(model.state_names)
 
 
 def keeps_configured_arm(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
-    """(3,) whether it is where it was told to be, by axis: contradicted, or known less well than by a tape measure."""
+    """Return, per body axis (3,), whether to keep the configured lever arm."""
     if not any(parameters.lever_arm) or not estimates_lever_arm(model):
         return np.zeros(3, dtype=bool)
     std = np.sqrt(np.diag(state.p)[[model.state_names.index(name) for name in ARM]])
@@ -392,7 +392,7 @@ def keeps_configured_arm(model: Model, state: GaussianState, parameters: Paramet
 
 
 def contradicts_configured_arm(model: Model, state: GaussianState, parameters: Parameters) -> Mask:
-    """(3,) whether the data show the DVL elsewhere than it was told to be, by axis of the body."""
+    """Return, per body axis (3,), whether the data contradict the configured lever arm."""
     if not any(parameters.lever_arm) or not estimates_lever_arm(model):
         return np.zeros(3, dtype=bool)
     at = [model.state_names.index(name) for name in ARM]

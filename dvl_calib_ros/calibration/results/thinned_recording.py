@@ -1,4 +1,4 @@
-"""`full` verified: the velocity error on samples that an estimate has not seen, with its lever arm and delay."""
+"""Verification of `full`: velocity error on held-out samples, with lever arm and delay."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from ..numerics.robust import median, steps
 from ..numerics.samples import Index, Mask, Stamps
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns, attitude_at
 
-# What is kept comes no faster than this, s: a velocity error is judged as well by five a second.
+# Shortest interval of thinned samples, s: five per second suffice for a velocity error.
 KEPT_EVERY_S = 0.19
-# An error of so many times the usual one is that of an outlier.
+# Size of an outlier in root median squared errors.
 OUTLYING = 5.0
-# An axis that the reference does not measure says nothing: (m/s)²
+# Variance of an axis that is not measured, and the limit below which an axis is measured, (m/s)²
 NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
 
 
@@ -36,28 +36,28 @@ class ThinnedBlock(NamedTuple):
     def between(
         from_s: float, to_s: float, dvl: DvlColumns, noise_dvl: Array, reference: ReferenceColumns, imu: ImuColumns
     ) -> ThinnedBlock:
-        """A block's own columns, thinned. noise_dvl: (3, 3) (m/s)²."""
+        """Return the thinned columns of a block. noise_dvl: (3, 3) (m/s)²."""
         first, last = np.searchsorted(dvl.times, (from_s, to_s)).tolist()
         at = first + _thinned_seconds(dvl.times[first:last])
         own = DvlColumns(dvl.times[at], dvl.velocity[at].copy())
         first, last = np.searchsorted(imu.times, (from_s, to_s)).tolist()
         at = first + _thinned_seconds(imu.times[first:last])
-        # a sample of a fast stream is noisier than what the vehicle turns by until the next one that is kept
+        # rates are averaged: the noise of one sample exceeds the change until the next kept one
         reach = 0.5 * KEPT_EVERY_S
         first, last = np.searchsorted(imu.times, (from_s - 2.0 * reach, to_s + 2.0 * reach)).tolist()
         rates = mean_around(imu.times[first:last], imu.angular_velocity[first:last], imu.times[at], reach)
         turning = ImuColumns(imu.times[at], imu.orientation[at], rates)
-        # what is a part of larger arrays would keep these
+        # copies, because views would keep the whole arrays in memory
         return ThinnedBlock(own, noise_dvl, reference._replace(velocity=reference.velocity.copy()), turning)
 
 
 def typical_error(recording: ThinnedRecording, terms: Terms, p: Parameters) -> float | None:
-    """Velocity error with these terms, m/s rms, without outliers; None where nothing can be compared."""
+    """Return the velocity error with these terms, m/s rms, without outliers; None if nothing is compared."""
     return without_outliers(recording.compared(np.arange(len(recording.dvl.times)), terms, p).error)
 
 
 def without_outliers(error: Array) -> float | None:
-    """Errors (N, 3) m/s rms without outliers; None where all are nan."""
+    """Return the RMS of errors (N, 3) m/s without outliers; None if all are nan."""
     square = (error[np.isfinite(error[:, 0])] ** 2).sum(axis=1)
     if not len(square):
         return None
@@ -66,7 +66,7 @@ def without_outliers(error: Array) -> float | None:
 
 
 class Terms(NamedTuple):
-    """What is to be corrected, beyond what the parameters say: errors (6,) φ rad and δk, lever_arm (3,) m, delays s."""
+    """Corrections beyond the configured ones: errors (6,) φ rad and δk, lever_arm (3,) m, delays s."""
 
     errors: Array
     lever_arm: Array
@@ -75,7 +75,7 @@ class Terms(NamedTuple):
 
     @staticmethod
     def of_state(state: Array) -> Terms:
-        """Of the states (n,) of `full`."""
+        """Return the terms of a state (n,) of `full`."""
         return Terms(np.array([*state[:5], 0.0]), state[LEVER_ARM], float(state[DELAY]), float(state[REFERENCE_DELAY]))
 
 
@@ -83,11 +83,11 @@ NO_TERMS = Terms(np.zeros(6), np.zeros(3), 0.0)
 
 
 class Compared(NamedTuple):
-    """N DVL samples beside the reference.
+    """Comparison of N DVL samples with the reference.
 
-    error (N, 3): reference less what the DVL says it is, body, m/s; nan where there is none, 0 along what the reference
-    does not measure. measured (N, 3, 3): onto what it does measure, body. body (N, 3): the reference velocity.
-    rotation_enu_from_body (N, 3, 3), oriented (N,): whether that is known. rates (N, 3): rad/s.
+    error (N, 3): reference minus corrected DVL, body, m/s; nan without reference, 0 along unmeasured axes. measured (N,
+    3, 3): projection on the measured axes, body. body (N, 3): reference velocity. rotation_enu_from_body (N, 3, 3),
+    oriented (N,): its validity. rates (N, 3): rad/s.
     """
 
     error: Array
@@ -99,7 +99,7 @@ class Compared(NamedTuple):
 
 
 class ThinnedRecording(NamedTuple):
-    """All that was kept, times in s since an epoch."""
+    """All thinned samples, times in s since an epoch."""
 
     dvl: DvlColumns
     noise_dvl: Array
@@ -108,7 +108,7 @@ class ThinnedRecording(NamedTuple):
 
     @staticmethod
     def of(kept: Sequence[ThinnedBlock]) -> ThinnedRecording:
-        """Blocks one after the other."""
+        """Return the joined blocks."""
         dvl = DvlColumns(*(np.concatenate(column) for column in zip(*(each.dvl for each in kept), strict=True)))
         noise = np.concatenate([np.full(len(each.dvl.times), np.trace(each.noise_dvl)) for each in kept])
         reference = zip(*(each.reference for each in kept), strict=True)
@@ -118,14 +118,14 @@ class ThinnedRecording(NamedTuple):
         )
 
     def judged(self, p: Parameters) -> tuple[float, Array]:
-        """The first two of the sums of `Moments` over all that can be compared."""
+        """Return the first two sums of `Moments` over all comparable samples."""
         seen = self.compared(np.arange(len(self.dvl.times)), NO_TERMS, p)
         use = np.isfinite(seen.error[:, 0])
         v, along = self.dvl.velocity[use], np.diagonal(seen.measured[use], axis1=1, axis2=2) > 0.5
         return float(np.count_nonzero(use)), np.einsum("nk,ni,nj->kij", along, v, v)
 
     def compared(self, at: Index, terms: Terms, p: Parameters) -> Compared:
-        """Some DVL samples beside the reference, corrected, interpolated as pairing does."""
+        """Return the comparison of DVL samples, corrected and interpolated as in pairing."""
         times, v = self.dvl.times[at] - terms.time_offset, self.dvl.velocity[at]
         stamps = self.reference.times - terms.reference_time_offset
         after = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
@@ -144,8 +144,8 @@ class ThinnedRecording(NamedTuple):
         error = body + (cross(rates, lever) if lever.any() else 0.0) - v @ matrix.T
         found = (times >= stamps[0]) & (times <= stamps[-1]) & (gap <= p.gnss_timeout) & (oriented | in_body)
         found &= (v**2).sum(axis=1) >= p.min_speed**2
-        # axes are left out in the reference's own frame: tilted by 2°, a vertical that is not measured would still
-        # reach the horizontal of the body
+        # unmeasured axes are removed in the frame of the reference: at a tilt of 2° an unmeasured vertical would reach
+        # the horizontal of the body
         variance = np.diagonal(self.reference.noise, axis1=1, axis2=2)
         axes = (np.maximum(variance[after], variance[after - 1]) < MEASURED_BELOW).astype(float)
         measured = (body_from_reference * axes[:, None]) @ body_from_reference.swapaxes(1, 2)
@@ -155,7 +155,7 @@ class ThinnedRecording(NamedTuple):
 
 
 def thinned(stamps_ns: Stamps) -> Index:
-    """Those of increasing stamps that are at least KEPT_EVERY_S apart."""
+    """Return indices of increasing stamps at intervals of about KEPT_EVERY_S or more."""
     return _thinned_seconds((stamps_ns - stamps_ns[0]) * 1e-9 if len(stamps_ns) else np.zeros(0))
 
 
@@ -167,7 +167,7 @@ def _thinned_seconds(times: Array) -> Index:
 
 
 def mean_around(times: Array, values: Array, at: Array, reach: float) -> Array:
-    """Means (M, c) of the finite values (N, c) within reach (s) of each time (M,) s; nan where there is none."""
+    """Return means (M, c) of finite values (N, c) within reach (s) of times (M,) s; nan where there is none."""
     first, end = times.searchsorted(at - reach), times.searchsorted(at + reach, side="right")
     sums, finite = np.zeros((len(times) + 1, values.shape[1])), np.isfinite(values)
     if finite.all():

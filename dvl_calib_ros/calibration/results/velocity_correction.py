@@ -1,4 +1,4 @@
-"""Using an estimate: the errors as ~/estimate carries them, and corrected velocities with their uncertainty."""
+"""Use of an estimate: the errors of ~/estimate, and corrected velocities with their uncertainty."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NOT_ESTIMATED = -1.0  # variance of a component that the model does not estimate
 
 
 def twist_terms(model: Model, state: GaussianState) -> tuple[Array, Array]:
-    """δk per axis, then φ (6,) with their joint covariance (6, 6).
+    """Return δk per axis, then φ (6,) with their joint covariance (6, 6).
 
     A component that the model does not estimate is 0 with variance NOT_ESTIMATED.
     """
@@ -26,14 +26,14 @@ def twist_terms(model: Model, state: GaussianState) -> tuple[Array, Array]:
 
 
 def lever_arm(model: Model, state: GaussianState, nominal: Sequence[float]) -> tuple[float, float, float]:
-    """Where the DVL is, m from the reference point, body frame: as the parameters say, and what the model found."""
+    """Return the DVL position, m from the reference point, body frame: configured plus estimated."""
     found = dict(zip(model.state_names, state.x.tolist(), strict=True))
     x, y, z = (known + found.get(f"lever_arm_{axis}", 0.0) for axis, known in zip("xyz", nominal, strict=True))
     return x, y, z
 
 
 class Correction:
-    """Corrects DVL velocities with one model's state."""
+    """Correction of DVL velocities by a model state."""
 
     def __init__(self, model: Model, state: GaussianState, rotation_dvl_from_body: Array) -> None:
         terms = model.error_terms_from_state
@@ -43,7 +43,10 @@ class Correction:
         self._error_covariance = terms @ state.p @ terms.T
 
     def apply(self, velocity_dvl: Array, noise_dvl: Array) -> tuple[Array, Array]:
-        """Body velocity (3,) m/s and its covariance (3, 3): sensor noise (3, 3), DVL frame, and the calibration's."""
+        """Return the body velocity (3,) m/s and its covariance (3, 3), including that of the calibration.
+
+        noise_dvl: (3, 3) (m/s)², DVL frame.
+        """
         jacobian = correction_jacobian(velocity_dvl, self._rotation_dvl_from_body)
         noise = self._matrix @ noise_dvl @ self._matrix.T
         return self._matrix @ velocity_dvl, noise + jacobian @ self._error_covariance @ jacobian.T

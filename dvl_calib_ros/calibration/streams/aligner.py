@@ -1,15 +1,12 @@
-"""From three streams of messages to DVL samples in order, with what the others say at their times.
+"""Alignment of DVL samples with the attitude and reference at their times, in order; counts of all messages.
 
     DVL ──────► valid? ─► in order? ─► a row ─► gates ─────────────► usable?
     IMU ──────► valid? ─► in order? ─► track ──► attitude, rates of the row
     reference ► valid? ─► in order? ─► track ──────────────► reference of the row
 
-A row waits for attitude, and then for its reference, no longer than they can still come (stream_order.py), in order;
-models that need neither do not wait. Rows are judged, oriented and paired by columns (pairing.py): of a recording
-those of a stretch (batch_alignment.py), live those that a message decides. Whether a message is valid and in order is
-asked of one by itself (live_alignment.py) or of a column; test_alignment.py holds both equal.
-
-Where the messages of a calibration went.
+A row waits for attitude, and then for its reference, as long as they can still arrive (stream_order.py); models that
+need neither do not wait. Rows are gated, oriented and paired in columns (pairing.py). Validity and order are checked
+per column (batch_alignment.py) or per sample (live_alignment.py); test_alignment.py holds both equal.
 """
 
 from __future__ import annotations
@@ -36,20 +33,20 @@ from .live_alignment import LiveAlignment
 from .pairing import add_count
 from .stream_order import LONG_AGO_NS
 
-# From so many messages on columns are faster.
+# Number of messages from which columns are faster.
 COLUMNS_FROM = 64
 
 
 class Aligner(LiveAlignment):
-    """Aligns three streams, by columns where these go on in a simple order."""
+    """Alignment of three streams, by columns where no clock steps occur."""
 
     def take(self, streams: Streams) -> None:
-        """Take a stretch of all streams, as if its rows came one by one in their order of arrival."""
+        """Add a stretch of all streams, with the same result as per sample in order of arrival."""
         count = sum(map(len, streams))
         if count < COLUMNS_FROM or self._before_restart:
             self._take_rows(streams)
         elif not self._take_columns(screened(streams, self.parameters)):
-            for half in streams.halves():  # the leap is in one of them
+            for half in streams.halves():  # halve the columns until the clock step is isolated
                 self.take(half)
 
     def _take_rows(self, streams: Streams) -> None:
@@ -61,9 +58,9 @@ class Aligner(LiveAlignment):
                 take[stream](row)  # type: ignore[operator]
 
     def _take_columns(self, valid: ScreenedStreams) -> bool:
-        """Take columns without jumps; False, and nothing is changed, where rows go on in no simple order.
+        """Add columns without jumps. Return False, with nothing changed, if they need per-sample alignment.
 
-        That is if the horizon falls back, because a stream that it went by runs away from the DVL, or as `decisions`.
+        This is the case if the horizon goes back, because its stream runs away from the DVL, or if `decisions` is None.
         """
         chunk = ordered(valid, self.orders, self._clocks, self._first_stamp_ns)
         if chunk is None:
@@ -83,18 +80,18 @@ class Aligner(LiveAlignment):
         if found is None:
             return False
         self._count_columns(valid, chunk, found, events)
-        if n_events:  # else there is nothing that would let rows go on
+        if n_events:  # without events no row can be decided
             self._append_columns(valid, chunk, events)
             known = int(np.searchsorted(found.oriented_at, n_events))
             partners.orient(events.imu_ns[found.oriented_at[:known]], self.parameters)
             known = int(np.searchsorted(found.paired_at, n_events))
             partners.pair(events.reference_ns[found.paired_at[:known]])
-            self._deadline_ns = LONG_AGO_NS  # what waits now is looked at with the next sample, whatever it is
+            self._deadline_ns = LONG_AGO_NS  # check the waiting rows again with the next sample
         self._n_messages += len(dvl)
         return True
 
     def _count_columns(self, valid: ScreenedStreams, chunk: OrderedStreams, found: Decisions, events: Events) -> None:
-        """Count what is not let through."""
+        """Count messages that are invalid, refused or not in order."""
         for block, is_valid, order in zip(
             valid.streams, valid[1:4], (chunk.dvl, chunk.reference, chunk.imu), strict=True
         ):
@@ -117,6 +114,7 @@ class Aligner(LiveAlignment):
             add_count(self.tally["reference"], "late", int(np.count_nonzero(stamps_ns < before)))
 
     def _append_columns(self, valid: ScreenedStreams, chunk: OrderedStreams, events: Events) -> None:
+        """Append admitted samples to the tracks and rows, and mark the late ones."""
         dvl, reference, _ = valid.streams
         reached_ns = np.maximum(np.maximum.accumulate(events.horizon_ns), self.reached_ns)
         self.reached_ns = int(reached_ns[-1])
@@ -142,7 +140,7 @@ class Aligner(LiveAlignment):
 def align(
     streams: Streams, parameters: Parameters, prior_sway_heave: tuple[float, float] | None = None
 ) -> tuple[AlignedBlock, Array]:
-    """A whole recording, aligned, and the prior sway and heave (2,) m/s that its models have at its end."""
+    """Return a whole aligned recording, and the prior sway and heave (2,) m/s at its end."""
     aligner = Aligner(parameters, prior_sway_heave)
     aligner.take(streams)
     return aligner.rows.block(0, aligner.rows.end), aligner.partners.prior.sway_heave
@@ -151,16 +149,15 @@ def align(
 def counted(
     aligner: Aligner, gnss_losses: int, restarts: int, restarted: Mapping[str, int]
 ) -> dict[str, dict[str, int]]:
-    """Counts by kind and reason, since the start or the last restart.
+    """Return message counts by stream and reason since the start or the last restart.
 
     dvl: received = invalid + duplicate + out_of_order + stray + held + refused ones (`Calibrator.refuse`) + accepted;
-    accepted = slow + frozen + turning + no_turn_rate + usable + awaiting_imu; repeated and dropouts are counted
-    beside these. pairing: accepted and decided = paired + unpaired; awaiting_reference is the rest. usable = oriented +
+    accepted = slow + frozen + turning + no_turn_rate + usable + awaiting_imu; repeated and dropouts are counted in
+    addition. pairing: accepted and decided = paired + unpaired; awaiting_reference is the rest. usable = oriented +
     not_oriented (no attitude or no angular velocity) + awaiting_attitude. A model's used + gated (+ samples in its
-    prior window) is what it was given: usable samples, for the models with GNSS those that were paired, for those with
-    attitude the oriented ones.
+    prior window) are its input: usable samples; with GNSS the paired ones, with attitude the oriented ones.
 
-    gnss_losses: how often the reference stayed away. restarts: of the calibration; restarted: of single models.
+    gnss_losses: number of reference outages. restarts: of the calibration; restarted: of single models.
     """
     counts = {name: dict(tally) for name, tally in aligner.tally.items()}
     for stream, order in aligner.orders.items():
@@ -192,26 +189,26 @@ def counted(
 def whereabouts(
     counts: Mapping[str, Mapping[str, int]], needs: Needs, given: int, used: int, gated: int
 ) -> dict[str, int]:
-    """Return for one model where each DVL sample that was received is; they add up to ``received`` at any time.
+    """Return the number of received DVL samples in each state, for one model; the sum is ``received``.
 
     refused: no sample, or not in order. unusable: slow, frozen or turning. unpaired: without the reference or attitude
-    that the model needs. waiting: for the sample that confirms its stamp, or for its partners. gathered: given to the
-    model, which has not used it yet, or for its prior alone. used, gated: by the model.
+    that the model needs. waiting: for the sample that confirms its stamp, or for its partners. gathered: passed to the
+    model but not used yet, or for its prior only. used, gated: by the model.
 
     Parameters
     ----------
     counts
-        As of `counted`.
+        Result of `counted`.
     needs
-        What the model needs of a sample.
+        Input that the model requires of a sample.
     given
-        How many samples the model was given.
+        Number of samples passed to the model.
     used, gated
-        How many of them it used and gated.
+        Number of samples that the model used and gated.
     """
     dvl, pairing = counts["dvl"], counts["pairing"]
     unusable, unpaired, waiting = dvl["accepted"] - dvl["usable"] - dvl["awaiting_imu"], 0, 0
-    if needs is Needs.REFERENCE:  # rows are paired whether they are usable or not
+    if needs is Needs.REFERENCE:  # unusable rows are paired, too
         unusable, unpaired, waiting = pairing["paired"] - given, pairing["unpaired"], pairing["awaiting_reference"]
     elif needs is Needs.ATTITUDE:
         unpaired, waiting = pairing["not_oriented"], pairing["awaiting_attitude"]

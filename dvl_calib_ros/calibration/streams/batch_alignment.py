@@ -1,7 +1,7 @@
-"""A stretch of columns of all streams: what of it is valid and in order, and when the rows that it brings are decided.
+"""Alignment of columns of all streams: validity, order, and the events at which their rows are decided.
 
-As if its messages came one by one in their order of arrival. A stretch in which a clock leaps, or rows go on in no
-simple order, is none for this: `Aligner` takes its messages one by one.
+Single messages in order of arrival give the same result. Stretches with clock steps are left to the per-sample
+alignment of `Aligner`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .stream_order import LONG_AGO_NS, Admitted, Sequencer, Track
 
 
 class ScreenedStreams(NamedTuple):
-    """Columns of all streams; which rows are valid, and what is made of them."""
+    """Columns of all streams, masks of the valid rows, and the screened values."""
 
     streams: Streams
     dvl: Mask
@@ -34,7 +34,7 @@ class ScreenedStreams(NamedTuple):
 
 
 class OrderedStreams(NamedTuple):
-    """Of every stream what is let through: places in its block, and stamps (the DVL's compensated)."""
+    """Admitted rows of each stream: indices in its block, and corrected stamps."""
 
     dvl: Admitted
     dvl_at: Index
@@ -49,7 +49,7 @@ class OrderedStreams(NamedTuple):
 
 
 class Decisions(NamedTuple):
-    """Events at which rows are decided: those to orient, those to pair (with their stamps), in order."""
+    """Event indices at which rows are oriented and paired (with the stamps of the latter), in order."""
 
     oriented_at: Index
     paired_at: Index
@@ -60,9 +60,11 @@ NO_DECISIONS = Decisions(*(np.zeros(0, dtype=kind) for kind in (np.intp, np.intp
 
 
 class Events(NamedTuple):
-    """The T admitted samples in their order of arrival: at which events those of each stream are, and what is known
-    after each event: newest stamps of reference and IMU (`LONG_AGO_NS`: none), and the horizon, see
-    `Aligner.horizon_ns`."""
+    """The T admitted samples in order of arrival.
+
+    dvl_at, reference_at, imu_at: event index of each sample of a stream. reference_ns, imu_ns: newest stamps after each
+    event (`LONG_AGO_NS`: none). horizon_ns: horizon after each event, see `Aligner.horizon_ns`.
+    """
 
     arrival: Stamps
     dvl_at: Index
@@ -79,7 +81,7 @@ class Events(NamedTuple):
         before_ns: tuple[int | None, int | None, int | None],
         max_jump_ns: int,
     ) -> Events:
-        """Each of DVL, reference, IMU."""
+        """Merge the samples of DVL, reference and IMU (tuples in this order) by arrival."""
         arrival = np.concatenate(arrivals)
         order = np.argsort(arrival, kind="stable")
         at = np.empty(len(order), dtype=np.intp)
@@ -100,7 +102,7 @@ class Events(NamedTuple):
 
 
 def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
-    """Which rows are valid, and what is made of them."""
+    """Check all rows for validity, and screen their values."""
     dvl, reference, imu = streams
     max_speed, believed = parameters.max_speed, parameters.use_message_covariance
     of_dvl, of_reference = (screen_columns(each.covariances, believed) for each in (dvl, reference))
@@ -123,7 +125,7 @@ def screened(streams: Streams, parameters: Parameters) -> ScreenedStreams:
 def ordered(
     screened: ScreenedStreams, orders: Mapping[Stream, Sequencer[Any]], clocks: Clocks, first_ns: int | None
 ) -> OrderedStreams | None:
-    """The rows that are let through; None if a stream has a jump. first_ns: the DVL's first stamp, if it is known."""
+    """Return the admitted rows, or None if a stream has a jump. first_ns: first DVL stamp, if known."""
     streams = screened.streams
     dvl_ns = streams.dvl.stamps_ns[screened.dvl]
     if len(dvl_ns):
@@ -146,8 +148,10 @@ def ordered(
 def decisions(
     partners: Pairer, rows: Rows, reference: Track, imu: Track, chunk: OrderedStreams, events: Events
 ) -> Decisions | None:
-    """When the rows that wait, and those that come, are decided; None where one may get its partner by waiting: while
-    attitude is waited for, a reference that is overdue may come after all."""
+    """Return when waiting and new rows are decided, or None if waiting may change a row's partner.
+
+    A late reference may still arrive while its row waits for attitude.
+    """
     n_events = len(events.horizon_ns)
     waiting = min(partners.n_oriented, partners.n_paired)
     stamps_ns = np.concatenate([rows.stamps_ns[waiting - rows.base : rows.size], chunk.dvl_ns])
@@ -160,7 +164,7 @@ def decisions(
         stamps_ns, since, chunk.reference_ns, events.reference_at, events.reference_ns, events.horizon_ns
     )
     paired_at = np.maximum(alone, oriented_at) if partners.needs_turn_rate else alone
-    # a reference in an earth frame waits for the attitude to turn it by
+    # a reference in an earth frame needs the attitude
     in_earth_frame = _in_earth_frame(reference, chunk, stamps_ns, alone, events)
     if in_earth_frame is not None:
         paired_at = np.where(in_earth_frame, np.maximum(paired_at, oriented_at), paired_at)
@@ -178,7 +182,7 @@ def decisions(
 def _in_earth_frame(
     track: Track, chunk: OrderedStreams, stamps_ns: Stamps, decided_at: Index, events: Events
 ) -> Mask | None:
-    """(N,) rows whose reference, once decided, is in an earth frame; None if none can be."""
+    """Return a mask (N,) of rows whose decided reference is in an earth frame; None if there are none."""
     n_events = len(events.horizon_ns)
     frames = np.concatenate([track.frames[track.begin : track.size], chunk.frames])
     if not len(frames) or (frames == BODY).all():

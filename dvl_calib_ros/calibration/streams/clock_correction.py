@@ -1,4 +1,4 @@
-"""Stamps of the three streams in one time: what the parameters say of each clock is taken off before pairing."""
+"""Clock correction: configured delays of all streams are subtracted from the stamps before pairing."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from ..models.parameters import Parameters
 from ..numerics.samples import Stamps
 
 SECOND_NS = 1_000_000_000
-# A clock is wrong by up to `dvl_clock_drift` over as long as a run may last, for which pairing has to wait and remember
+# Longest run (s) over which the DVL clock drifts; pairing must wait and store this much
 LONGEST_RUN_S = 3600.0
 S = TypeVar("S", int, Stamps)
 
 
 @dataclass(frozen=True)
 class Clocks:
-    """By how much the stamps of each stream are late.
+    """Configured delays of the stamps.
 
-    dvl_ns, reference_ns, imu_ns: constant offsets, ns. drift: of the DVL's clock, s/s since its first stamp. jump_ns:
-    by how much the DVL's stamps are later still from its stamp jump_at_ns on.
+    dvl_ns, reference_ns, imu_ns: constant offsets, ns. drift: of the DVL clock, s/s since its first stamp. jump_ns:
+    additional delay of DVL stamps from stamp jump_at_ns on.
     """
 
     dvl_ns: int = 0
@@ -33,7 +33,7 @@ class Clocks:
 
     @staticmethod
     def of(parameters: Parameters) -> Clocks:
-        """As the parameters have it."""
+        """Return the delays of the parameters."""
         p = parameters
         return Clocks(
             round(p.dvl_time_offset * SECOND_NS),
@@ -45,7 +45,7 @@ class Clocks:
         )
 
     def dvl(self, stamp_ns: S, first_ns: int) -> S:
-        """True time (ns) of a DVL's stamp, or of stamps (N,). first_ns: the first stamp of the run."""
+        """Return the true time (ns) of a DVL stamp, or of stamps (N,). first_ns: first stamp of the run."""
         true_ns = stamp_ns - self.dvl_ns
         if self.drift:
             late = self.drift * (stamp_ns - first_ns)
@@ -56,7 +56,7 @@ class Clocks:
 
     @property
     def spread_ns(self) -> int:
-        """By how much a stream that arrives in time can seem to lag another once their stamps are put right."""
+        """Largest lag between two simultaneous streams after the correction, ns."""
         drift_ns = round(self.drift * LONGEST_RUN_S * SECOND_NS)
         dvl = [self.dvl_ns + drift + jump for drift in (0, drift_ns) for jump in (0, self.jump_ns)]
         late = [*dvl, self.reference_ns, self.imu_ns]

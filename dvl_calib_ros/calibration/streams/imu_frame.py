@@ -1,6 +1,6 @@
-"""From what an IMU measures in a frame of its own to what the calibration goes by: the body's attitude and rates.
+"""Conversion of IMU data to the attitude and angular velocity of the body.
 
-With W the turn from the IMU's world to ENU and M the IMU's mounting ``rotation_body_from_imu``:
+With W the rotation from the IMU's world to ENU and M the IMU's mounting ``rotation_body_from_imu``:
 ``rotation_enu_from_body = W @ rotation_world_from_imu @ M.T`` and ``ω_body = M @ ω_imu``.
 """
 
@@ -23,16 +23,16 @@ from ..numerics.frames import (
 )
 from ..numerics.samples import ImuSample, SampleBlock
 
-# By the parameter imu_frame
+# rotation to ENU for each value of the parameter imu_frame
 ENU_FROM: Mapping[str, Array] = {IMU_ENU: np.eye(3), IMU_NED: ENU_FROM_NED, NWU: ENU_FROM_NWU}
-# What is not finite stays so, and is counted further on.
+# Non-finite values are passed on and counted later.
 _QUIET = np.errstate(invalid="ignore", over="ignore")
 
 
 class ImuAlignment:
-    """Turns samples of an IMU as parameters imu_rpy and imu_frame say.
+    """Rotation of IMU samples by the parameters imu_rpy and imu_frame.
 
-    `is_identity`: there is nothing to turn, and samples come out as the same objects.
+    is_identity: no rotation; samples are returned as the same objects.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -43,7 +43,7 @@ class ImuAlignment:
         self._enu_from_world = quaternion_from_rotation(ENU_FROM[parameters.imu_frame])
 
     def sample(self, sample: ImuSample) -> ImuSample:
-        """One sample, live. What the IMU does not give stays None; what is not finite stays so."""
+        """Rotate one live sample. Missing values stay None, non-finite values stay non-finite."""
         if self.is_identity:
             return sample
         orientation, rate = sample.orientation, sample.angular_velocity
@@ -58,7 +58,7 @@ class ImuAlignment:
         return ImuSample(sample.stamp_ns, turned, turned_rate)
 
     def block(self, block: SampleBlock) -> SampleBlock:
-        """Columns of the IMU's stream, row by row as `sample`."""
+        """Rotate columns of the IMU stream; rows as in `sample`."""
         if self.is_identity or not len(block):
             return block
         return replace(
@@ -67,17 +67,17 @@ class ImuAlignment:
 
     @_QUIET
     def _turned(self, orientation: Array) -> Array:
-        """Quaternions (N, 4) of the IMU in its world -> of the body in ENU."""
+        """Rotate quaternions (N, 4) of the IMU in its world to the body in ENU."""
         return quaternion_product(quaternion_product(self._enu_from_world, orientation), self._imu_from_body)
 
     @_QUIET
     def _in_body(self, angular_velocity: Array) -> Array:
-        """(N, 3) rad/s; not by a matrix product, whose last bit depends on how many rows there are."""
+        """Rotate rates (N, 3) rad/s; the last bit of a matrix product would depend on N."""
         return np.sum(angular_velocity[:, None, :] * self._rotation_body_from_imu, axis=-1)
 
 
 def quaternion_product(a: Array | Quaternion, b: Array | Quaternion) -> Array:
-    """Hamilton product of quaternions (..., 4) in the order x, y, z, w: the rotation b and then a."""
+    """Return the Hamilton product of quaternions (..., 4) in the order x, y, z, w: rotation b, then a."""
     ax, ay, az, aw = np.moveaxis(np.asarray(a, dtype=float), -1, 0)
     bx, by, bz, bw = np.moveaxis(np.asarray(b, dtype=float), -1, 0)
     return np.stack(

@@ -1,10 +1,8 @@
-"""Value and slope of a stream at any time, and the streams as columns.
+"""Interpolation of streams: value and slope at any time, and the streams as columns.
 
-Two streams with a delay between them are compared at times at which neither has a sample. A straight line between
-neighbours is a filter that depends on where between them the time lies: half as noisy in the middle as on a sample, and
-blind to what curves. Delays would then be told apart by the interpolation, not by the vehicle. A quadratic through the
-five or six samples around, weighted by their distance (local regression: Cleveland, "Robust locally weighted
-regression", 1979), is the same filter everywhere, and has a slope.
+Delayed streams are compared at times between their samples. Linear interpolation would bias the delay: its noise is
+halved midway between samples, and it ignores curvature. Local regression (Cleveland, "Robust locally weighted
+regression", 1979), a weighted quadratic through five or six samples, filters alike everywhere and has a slope.
 """
 
 from __future__ import annotations
@@ -19,29 +17,29 @@ from ..numerics.robust import median, steps
 from ..numerics.samples import Index, Mask
 
 LONGEST_DELAY_S = 3.2
-# Samples faster than this are averaged over bins of so long: none the worse for it, and the work stays the same.
+# Samples at shorter intervals (s) than FASTER_THAN_S are averaged over bins (s): same accuracy, bounded work.
 BIN_S = 0.1
 FASTER_THAN_S = 0.07
-# A quadratic that averages the DVL's noise reaches at least so far; the slope further, for its noise pulls the delay
-# that it shows: 0.01 m/s at 5 Hz is 0.006 m/s² over 1 s, an eighth of what a turning vehicle has.
+# Smallest reach of the fit for value and slope, s. The slope needs more, because its noise biases the delay: 0.01 m/s
+# at 5 Hz is 0.006 m/s² over 1 s, an eighth of the acceleration of a turning vehicle.
 LEAST_REACH_S, LEAST_SLOPE_REACH_S = 0.6, 1.0
-# ... and at most: DVL samples more than 1.3 s apart do not tell a turning vehicle's velocity between them.
+# Largest reach, s: DVL samples more than 1.3 s apart do not determine the velocity of a turning vehicle.
 MOST_REACH_S = 3.4
-# How far beyond a block of references the other streams have to be known.
+# Margin around a block of references in which the other streams are needed, s.
 MARGIN_S = 7.0
 
 
 class DvlColumns(NamedTuple):
-    """times (N,) s, velocity (N, 3) m/s in the DVL's frame."""
+    """DVL times (N,) s and velocity (N, 3) m/s, DVL frame."""
 
     times: Array
     velocity: Array
 
 
 class ReferenceColumns(NamedTuple):
-    """times (J,) s, velocity (J, 3) m/s and noise (J, 3, 3) (m/s)²; ENU, or body where in_body (J,).
+    """Reference times (J,) s, velocity (J, 3) m/s and noise (J, 3, 3) (m/s)²; body frame where in_body (J,), else ENU.
 
-    claimed: (J,) where the noise is the message's, to which the DVL's is added; else it is that of both.
+    claimed: (J,) True if the noise is from the message and excludes the DVL, False if it includes the DVL.
     """
 
     times: Array
@@ -51,12 +49,12 @@ class ReferenceColumns(NamedTuple):
     claimed: Mask
 
     def part(self, at: Index) -> ReferenceColumns:
-        """Some of them."""
+        """Return the rows at these indices."""
         return ReferenceColumns(self.times[at], self.velocity[at], self.noise[at], self.in_body[at], self.claimed[at])
 
 
 class ImuColumns(NamedTuple):
-    """times (M,) s, orientation (M, 4) quaternion (x, y, z, w) enu from body, angular_velocity (M, 3) rad/s, body."""
+    """IMU times (M,) s, orientation (M, 4) x, y, z, w enu from body, angular_velocity (M, 3) rad/s, body."""
 
     times: Array
     orientation: Array
@@ -64,14 +62,14 @@ class ImuColumns(NamedTuple):
 
 
 class TurnRates(NamedTuple):
-    """Angular velocity where it is known, averaged over bins: times (M,) s, rates (M, 3) rad/s, body."""
+    """Known angular velocity, averaged over bins: times (M,) s, rates (M, 3) rad/s, body."""
 
     times: Array
     rates: Array
 
     @staticmethod
     def of(imu: ImuColumns) -> TurnRates:
-        """Those of an IMU."""
+        """Return the turn rates of an IMU."""
         known = ~np.isnan(imu.angular_velocity).any(axis=1)
         return TurnRates(*binned(imu.times[known], imu.angular_velocity[known]))
 
@@ -87,8 +85,10 @@ def shortened(pauses: Array, most: float) -> Array:
 
 
 def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
-    """Means of times (N,) s and columns (N, ...) over bins of BIN_S, of those bins that hold any;
-    as they are if they come no faster than FASTER_THAN_S."""
+    """Return means of times (N,) s and columns (N, ...) over non-empty bins of BIN_S.
+
+    Columns with intervals of FASTER_THAN_S and more are returned unchanged.
+    """
     if len(times) < 2 or median(steps(times)) >= FASTER_THAN_S:
         return times, *columns
     bins = np.floor(times / BIN_S)
@@ -101,7 +101,7 @@ def binned(times: Array, *columns: Array) -> tuple[Array, ...]:
 
 
 def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> Array:
-    """(J, 3) rad/s at these times, averaged as the DVL's velocity is; nan where not known."""
+    """Return rates (J, 3) rad/s at these times, smoothed like the DVL velocity; nan where unknown."""
     stamps, rates = turns
     if len(stamps) < 2:
         return np.full((len(times), 3), np.nan)
@@ -118,13 +118,13 @@ def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> Array:
 
 
 def _beside(stamps: Array, times: Array) -> tuple[Index, Index, Mask]:
-    """Places of the samples after and before each of J times, and where there are none (J,). stamps: (N > 1,) s."""
+    """Return indices of the samples after and before J times, and a mask (J,) of times outside. stamps: (N > 1,) s."""
     after = np.minimum(np.maximum(np.searchsorted(stamps, times), 1), len(stamps) - 1)
     return after, after - 1, (times < stamps[0]) | (times > stamps[-1])
 
 
 class InBody(NamedTuple):
-    """Velocity (J, 3), noise (J, 3, 3) in the body frame, where that is known (J,), `Observations.earth_in_body`."""
+    """References in the body frame: velocity (J, 3), noise (J, 3, 3), mask known (J,), `Observations.earth_in_body`."""
 
     velocity: Array
     noise: Array
@@ -133,7 +133,7 @@ class InBody(NamedTuple):
 
 
 def in_body(reference: ReferenceColumns, rotation: Array, known: Mask) -> InBody:
-    """References as in the body, by attitudes ``rotation_enu_from_body`` (J, 3, 3) where they are known (J,)."""
+    """Rotate references to the body by attitudes ``rotation_enu_from_body`` (J, 3, 3) where known (J,)."""
     in_body = reference.in_body
     if in_body.all():
         n = len(in_body)
@@ -146,9 +146,9 @@ def in_body(reference: ReferenceColumns, rotation: Array, known: Mask) -> InBody
 
 
 def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mask]:
-    """``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and where that is possible (J,).
+    """Return ``rotation_enu_from_body`` (J, 3, 3) by spherical interpolation, and a validity mask (J,).
 
-    gap_s: longest gap that is interpolated across.
+    gap_s: longest interpolated gap.
     """
     given = ~np.isnan(imu.orientation[:, 0])
     stamps, quaternions = imu.times, imu.orientation
@@ -163,17 +163,16 @@ def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mas
     return rotation_from_quaternion(between), ~outside & (gap <= gap_s)
 
 
-# Samples on each side that a fit needs: with fewer it extrapolates.
+# Fewest samples on each side of a fit: with fewer it extrapolates.
 ON_EACH_SIDE = 2
-# A fit reaches this far to each side, in intervals of the samples: five or six of them, so that none comes or goes
-# with much weight.
+# Reach to each side, in sample intervals: five or six samples, whose weights vanish at the ends.
 REACH_INTERVALS = 2.6
 
 
 class LocalFit(NamedTuple):
-    """At M times: value (M, c), slope (M, c) per s, and whether there is one (M,).
+    """Fit at M times: value (M, c), slope (M, c) per s, mask found (M,).
 
-    slope_gain: (M,) variance of the slope for samples with white noise of variance 1.
+    slope_gain: (M,) variance of the slope for white noise of variance 1.
     """
 
     value: Array
@@ -183,7 +182,7 @@ class LocalFit(NamedTuple):
 
 
 def spacing_at(times: Array, at: Array) -> Array:
-    """Mean interval of the six samples of times (N,) s around each time (...); nan near an end."""
+    """Return the mean interval of the six samples of times (N,) s around each time (...); nan near an end."""
     if len(times) < 6:
         return np.full(at.shape, np.nan)
     after = np.searchsorted(times, at)
@@ -193,7 +192,7 @@ def spacing_at(times: Array, at: Array) -> Array:
 
 
 def reach_at(spacing: Array, least: float, most: float) -> Array:
-    """How far (s) a fit has to reach where samples are so far apart: at least `least`, nan beyond `most`."""
+    """Return the reach (s) of a fit for a sample spacing (s): at least `least`, nan beyond `most`."""
     reach = np.maximum(spacing * REACH_INTERVALS, least)
     return np.where(reach <= most, reach, np.nan)  # nan stays nan
 
@@ -209,7 +208,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
         return LocalFit(nothing, nothing, nothing[:, 0], found)
     after = np.searchsorted(times, at)
     around = _within(times, float(np.nanmax(reach)))
-    # samples of a window first: sums over them are then those of whole rows
+    # window along the first axis, so that sums run over whole rows
     index = after + np.arange(-around, around)[:, None]
     there = (index >= 0) & (index < len(times))
     index = np.clip(index, 0, len(times) - 1)
@@ -222,7 +221,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
     found &= np.minimum(np.add.reduce(before, 0, dtype=np.intp), np.add.reduce(after, 0, dtype=np.intp)) >= ON_EACH_SIDE
     first = weight * u
     second = first * u
-    # the normal equations of a + b u + c u² and, by cofactors, the first two rows of their inverse
+    # normal equations of a + b u + c u², and the first two rows of their inverse by cofactors
     third = second * u
     s0, s1, s2, s3, s4 = (np.add.reduce(each) for each in (weight, first, second, third, third * u))
     c00, c01, c02 = s2 * s4 - s3 * s3, s2 * s3 - s1 * s4, s1 * s3 - s2 * s2
@@ -240,7 +239,7 @@ def local_fit(times: Array, values: Array, at: Array, reach: Array) -> LocalFit:
 
 
 def _within(times: Array, seconds: float) -> int:
-    """How many samples follow each other within so many seconds at most, and no fewer than one.
+    """Return the largest number of consecutive samples within a time, at least one.
 
     times: (N,) s, increasing.
     """

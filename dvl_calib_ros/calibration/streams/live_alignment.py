@@ -1,7 +1,6 @@
-"""Alignment of single samples as they come, with the recent past of the reference.
+"""Alignment of single samples as they arrive, with the recent reference and IMU samples.
 
-Live, and where a clock leaps, whether a message is valid and in order is asked of one by itself; what is done when a
-clock leaps is here.
+Validity and order are checked per sample: live, and in stretches with clock steps, which are handled here.
 """
 
 from __future__ import annotations
@@ -33,25 +32,24 @@ from .pairing import Pairer, Rows, add_count
 from .screening import ALL_AXES, VERTICAL, CovarianceScreen, is_valid_rate, is_valid_velocity, unit_quaternion
 from .stream_order import DROPOUT_NS, LONG_AGO_NS, SHORTEST_PAUSE_NS, Dropouts, NewDays, Order, Sequencer, Track
 
-# How far a DVL may lag GNSS and IMU and still find its partners, beyond what pairing waits for.
+# Largest DVL lag behind GNSS and IMU with available partners, ns, beyond the latency of pairing.
 RETENTION_NS = 10 * SECOND_NS
-# A DVL whose stamps are off by seconds, which the full model finds, lags others by as much, or they lag it.
+# Additional lag between streams due to a delay of seconds, which the full model estimates, ns.
 WRONG_CLOCK_NS = 4 * SECOND_NS
 NEVER_NS = 2**63 - 1
-# The past of GNSS and IMU is looked through for what may go once in so many live samples.
+# Live samples between two purges of old GNSS and IMU samples.
 FORGET_EVERY = 256
 _NAN_4, _NAN_3 = (math.nan,) * 4, (math.nan,) * 3
 
 
 class LiveAlignment:
-    """Aligns three streams; `rows` are its outcome, `partners` says how many of them are decided.
+    """Alignment of three streams; `rows` is the result, `partners` counts the decided rows.
 
-    reference, imu: their samples of late. dropouts: of the DVL. lag_ns: by how much (in stamps) one stream may lag
-    another, a wrong clock included. day_rows, day_starts_ns: numbers and stamps of rows that a new day begins with.
-    tally: by stream and for pairing, see `Calibrator.counts`. on_restart: told by how much (s) the DVL's stamps went
-    back (ahead: negative) when all is to start anew; everything here has then been forgotten. before_clearing: called
-    before the past of a track is forgotten whose stamps went back, so that who needs it takes it then, whatever stretch
-    it came in.
+    reference, imu: their recent samples. dropouts: of the DVL. lag_ns: largest lag between streams (in stamps),
+    including a wrong clock. day_rows, day_starts_ns: numbers and stamps of the first rows of new recordings. tally: by
+    stream and for pairing, see `Calibrator.counts`. on_restart: called with the backward step (s; negative: forward) of
+    DVL stamps after a reset. before_clearing: called before a track with a backward clock step is cleared, so that
+    users of its samples can copy them first.
     """
 
     def __init__(
@@ -75,38 +73,39 @@ class LiveAlignment:
     # ------------------------------------------------------------------ state
 
     def reset(self) -> None:
-        """Forget all samples."""
+        """Discard all samples."""
         p = self.parameters
         self._first_stamp_ns: int | None = None
-        # one stream that is stamped late lags the others by as much once that is put right
+        # after the correction of its delay, a late-stamped stream lags the others by it
         latency_ns = round(p.max_latency * 1e9) + self._clocks.spread_ns
         self.lag_ns = latency_ns + WRONG_CLOCK_NS
         gnss_ns, imu_ns = round(p.gnss_timeout * 1e9), round(p.imu_timeout * 1e9)
         retention_ns = RETENTION_NS + gnss_ns + imu_ns + latency_ns
         self.orders: dict[Stream, Sequencer[Any]] = {stream: Sequencer(self._max_jump_ns) for stream in Stream}
-        self._dvl_order = self.orders[Stream.DVL]  # asked with every sample
+        self._dvl_order = self.orders[Stream.DVL]  # used for every sample
         self.reference = ReferenceTrack(p, gnss_ns, latency_ns, retention_ns)
         self.imu = Track(imu_ns, latency_ns, retention_ns)
         self._tracks = {Stream.REFERENCE: self.reference, Stream.IMU: self.imu}
         self.tally: dict[str, Counter[str]] = {
             name: Counter() for name in (*(each.value for each in Stream), "pairing")
         }
-        # those of a stream's counters that refused messages are under
+        # counter names of refused messages, by stream
         self.refused_as: dict[str, set[str]] = {stream.value: set() for stream in Stream}
-        # streams that still bring samples from before a restart of the DVL's stamps
+        # streams that still deliver samples from before a restart of the DVL stamps
         self._before_restart: set[Stream] = set()
         self._n_messages = 0
         self._forget_dvl()
 
     def _forget_dvl(self) -> None:
+        """Discard the DVL samples, their rows and recordings."""
         self.rows = Rows()
         self.partners = Pairer(self.parameters, self.rows, self.reference, self.imu, self.tally, self._prior_sway_heave)
         self.reference.vertical_seen = False
-        # what the first waiting rows wait for: samples of these streams, or any stream's stamp reaching this
+        # the first waiting rows wait for samples of these streams, or for any stamp reaching the deadline
         self._waits_for: set[Track] = set()
         self._deadline_ns = NEVER_NS
         self._row_of_held = 0
-        self.reached_ns = LONG_AGO_NS  # the newest horizon so far
+        self.reached_ns = LONG_AGO_NS  # newest horizon so far
         self.first_ns: int | None = None
         self.day_rows: list[int] = []
         self.day_starts_ns: list[int] = []
@@ -119,24 +118,24 @@ class LiveAlignment:
         return {"dvl": self.last_ns, "reference": self.reference.newest_ns, "imu": self.imu.newest_ns}
 
     def latest_angular_velocity(self, stamp_ns: int) -> Vector | None:
-        """Newest angular velocity (rad/s, body), if not older than imu_timeout; None where the IMU gives none."""
+        """Return the newest angular velocity (rad/s, body), or None if missing or older than imu_timeout."""
         newest_ns = self.imu.newest_ns
         if newest_ns is None or abs(stamp_ns - newest_ns) > self.parameters.imu_timeout * 1e9:
             return None
         x, y, z = self.imu.values[self.imu.size - 1, 4:7].tolist()
         return None if math.isnan(x) else (x, y, z)
 
-    # ------------------------------------------------------------------ one by one
+    # ------------------------------------------------------------------ per sample
 
     def refuse(self, stream: Stream, reason: str) -> None:
-        """Count a message of a stream that is no sample, and why."""
+        """Count a message of a stream that is no sample, by reason."""
         self.refused_as[stream.value].add(reason)
         self.tally[stream.value]["received"] += 1
         self.tally[stream.value][reason] += 1
         self._n_messages += stream is Stream.DVL
 
     def take_dvl(self, sample: DvlSample) -> DvlSample | None:
-        """Take a DVL sample; None unless it is valid and in order, else as it goes on: in time, covariance screened."""
+        """Add a DVL sample. Return it corrected and screened, or None if it is invalid or not in order."""
         tally = self.tally["dvl"]
         tally["received"] += 1
         row = self._n_messages
@@ -167,7 +166,7 @@ class LiveAlignment:
         return sample
 
     def _append_samples(self, samples: Sequence[DvlSample], numbers: Sequence[int]) -> None:
-        """Make rows of one sample, or of one that was held and what confirmed it."""
+        """Append rows for one sample, or for a held sample and the one that confirmed it."""
         for (stamp_ns, velocity, covariance), number in zip(samples, numbers, strict=True):
             self._append_rows(
                 np.array([stamp_ns]),
@@ -180,7 +179,7 @@ class LiveAlignment:
     def _append_rows(
         self, stamps_ns: Stamps, number: Index, velocity: Array, covariance: Array | float, late: Mask
     ) -> None:
-        """Make rows (N,) of a DVL's samples, in order. number: of their messages."""
+        """Append rows (N,) of DVL samples, in order. number: of their messages."""
         rows = self.rows
         slots = rows.extend(len(stamps_ns))
         rows.stamps_ns[slots], rows.late[slots], rows.row[slots] = stamps_ns, late, number
@@ -204,7 +203,7 @@ class LiveAlignment:
             self.partners.judge(rows.end, self.parameters)
 
     def take_reference(self, sample: ReferenceSample) -> None:
-        """Take a reference (GNSS) velocity."""
+        """Add a reference (GNSS) velocity."""
         tally = self.tally["reference"]
         tally["received"] += 1
         valid, _, unmeasured = self._reference_covariance(sample.covariance)
@@ -213,13 +212,13 @@ class LiveAlignment:
             return
         stamp_ns = sample.stamp_ns - self._clocks.reference_ns
         if stamp_ns < self.partners.decided_ns:
-            tally["late"] += 1  # a DVL sample has gone on without it: max_latency is too short
+            tally["late"] += 1  # a DVL row was decided without it: max_latency is too short
         if stamp_ns != sample.stamp_ns:
             sample = sample._replace(stamp_ns=stamp_ns)
         self._keep(Stream.REFERENCE, sample)
 
     def take_imu(self, sample: ImuSample) -> None:
-        """Take attitude and angular velocity."""
+        """Add attitude and angular velocity."""
         tally = self.tally["imu"]
         tally["received"] += 1
         stamp_ns, given, angular_velocity = sample
@@ -235,7 +234,7 @@ class LiveAlignment:
         self._keep(Stream.IMU, sample)
 
     def _keep(self, stream: Stream, sample: ReferenceSample | ImuSample) -> None:
-        """Put a sample on its track if its stamp allows, and let waiting rows go on if it decides them."""
+        """Append a sample to its track if its stamp is in order, and advance the rows that it decides."""
         track = self._tracks[stream]
         if not self._before_restart and self.orders[stream].goes_on(sample.stamp_ns):
             self._append(track, sample)
@@ -245,7 +244,7 @@ class LiveAlignment:
             self._advance()
 
     def _keep_unusual(self, stream: Stream, track: Track, sample: ReferenceSample | ImuSample) -> bool:
-        """`_keep` for what is not simply the next sample; whether the track has grown."""
+        """Append a sample whose stamp is not simply the next one. Return whether the track has grown."""
         order, admitted = self.orders[stream].admit(sample)
         self._count_order(self.tally[stream.value], order)
         if order is Order.CONFIRMED_RESTART:
@@ -263,7 +262,7 @@ class LiveAlignment:
         return bool(admitted)
 
     def _append(self, track: Track, sample: ReferenceSample | ImuSample) -> None:
-        """Put one sample on its track."""
+        """Append one sample to its track."""
         late = self._is_late(sample.stamp_ns)
         if isinstance(sample, ImuSample):
             values = (*(sample.orientation or _NAN_4), *(sample.angular_velocity or _NAN_3))
@@ -281,7 +280,7 @@ class LiveAlignment:
             track.forget_old()
 
     def _append_imu(self, n: int, stamps_ns: Stamps | int, values: Array | tuple[float, ...], late: Mask | bool) -> int:
-        """Put samples (N,) on the IMU's track; the slot of the first."""
+        """Append samples (N,) to the IMU track. Return the slot of the first."""
         slots = self.imu.extend(n)
         self.imu.stamps_ns[slots], self.imu.late[slots], self.imu.values[slots, :7] = stamps_ns, late, values
         return slots.start
@@ -292,15 +291,15 @@ class LiveAlignment:
             tally[order.value] += 1
 
     def _restart(self, stamp_ns: int) -> None:
-        """Start anew with this sample: DVL stamps went back (a bag loops, a clock was set), or the first was stray."""
+        """Restart with this sample: DVL stamps stepped backward (bag loop, clock set), or the first was stray."""
         back_s = ((self.last_ns or stamp_ns) - stamp_ns) * 1e-9
-        self.tally["dvl"] = Counter(received=2)  # the two samples that showed it
+        self.tally["dvl"] = Counter(received=2)  # the two samples that confirmed the restart
         for name in ("reference", "imu", "pairing"):
             self.tally[name].clear()
         self.orders[Stream.DVL].stray = 0
         self._forget_dvl()
         self._row_of_held, self._n_messages = 0, 2
-        # a stream that has not gone back yet brings what must not be paired with what comes now
+        # samples from before the step must not be paired with later ones
         for stream, track in self._tracks.items():
             if track.newest_ns is not None and track.newest_ns > stamp_ns + self._max_jump_ns:
                 track.clear()
@@ -308,7 +307,7 @@ class LiveAlignment:
         self._on_restart(back_s)
 
     def _advance(self) -> None:
-        """Let rows go on as far as their partners are decided; note what the next ones wait for."""
+        """Advance the rows whose partners are decided; note what the next ones wait for."""
         partners, end, horizon_ns = self.partners, self.rows.end, self.horizon_ns
         self._waits_for.clear()
         self._deadline_ns = NEVER_NS
@@ -321,15 +320,14 @@ class LiveAlignment:
         if not n:
             return
         newest_ns, oriented = _newest(self.reference, n), partners.n_oriented - partners.n_paired
-        if n > oriented:  # a reference in an earth frame waits for the attitude to turn it by
+        if n > oriented:  # a reference in an earth frame needs the attitude
             waits = partners.in_earth_frame(partners.n_paired + n, newest_ns)
             waits[: max(oriented, 0)] = False
             n = int(np.argmax(waits)) if waits.any() else n
         partners.pair(newest_ns[:n])
 
     def _decided(self, track: Track, first: int, end: int, horizon_ns: int) -> int:
-        """How many rows from `first` on need not wait for a track any more; of the next one note for what, and until
-        when it does."""
+        """Return the number of rows from `first` on that a track decides; note what the next one waits for."""
         rows, n = self.rows, 0
         while first + n < end:
             stamp_ns = int(rows.stamps_ns[first + n - rows.base])
@@ -342,9 +340,9 @@ class LiveAlignment:
 
     @property
     def horizon_ns(self) -> int:
-        """Newest stamp of any stream that keeps the DVL's time.
+        """Newest stamp of any stream within max_time_jump of the DVL.
 
-        One whose clock is far ahead would say of every DVL sample that nothing can come for it any more.
+        A stream whose clock is far ahead would end the waiting of every DVL row.
         """
         horizon_ns = dvl_ns = self._dvl_order.last_ns or 0
         for track in (self.reference, self.imu):
@@ -354,26 +352,26 @@ class LiveAlignment:
         return horizon_ns
 
     def _is_late(self, stamp_ns: int) -> bool:
-        """Whether a sample that has just come lags other streams by more than one may even if its clock is wrong."""
+        """Return whether a new sample lags other streams by more than the limit, even for a wrong clock."""
         self.reached_ns = max(self.reached_ns, self.horizon_ns)
         return stamp_ns < self.reached_ns - self.lag_ns
 
     def forget_old(self) -> None:
-        """Forget of reference and IMU what nobody asks for any more."""
+        """Discard samples of reference and IMU that are no longer needed."""
         self.reference.forget_old()
         self.imu.forget_old()
 
 
 def _newest(track: Track, n: int) -> Stamps:
-    """(N,) the newest stamp of a track, for rows that are decided now."""
+    """Return the newest stamp of a track (N,), for rows that are decided now."""
     return np.full(n, LONG_AGO_NS if track.newest_ns is None else track.newest_ns, dtype=np.int64)
 
 
 class ReferenceTrack(Track):
-    """A `Track` of reference samples. vertical_seen: whether one of them had a vertical velocity."""
+    """`Track` of reference samples. vertical_seen: one of them had a vertical velocity."""
 
     def __init__(self, parameters: Parameters, max_gap_ns: int, max_latency_ns: int, retention_ns: int) -> None:
-        """As `Track`."""
+        """Make an empty track."""
         super().__init__(max_gap_ns, max_latency_ns, retention_ns)
         self.vertical_seen = False
         east, north = parameters.reference_velocity_offset
@@ -389,7 +387,7 @@ class ReferenceTrack(Track):
         late: Mask | bool,
         gnss_axes: str,
     ) -> int:
-        """Put samples (N,) on the track, values (N, 12); the slot of the first. gnss_axes: as the parameter."""
+        """Append samples (N,), values (N, 12). Return the slot of the first. gnss_axes: the parameter."""
         slots = self.extend(len(frames))
         self.stamps_ns[slots], self.late[slots], self.frames[slots] = stamps_ns, late, frames
         vertical = np.logical_or.accumulate(values[:, 2] != 0.0) | self.vertical_seen
@@ -402,5 +400,5 @@ class ReferenceTrack(Track):
 
 
 def _never_measured(gnss_axes: str, vertical_seen: bool) -> int:
-    """The axes, as bits, that are not measured whatever the covariances say."""
+    """Return the axes, as bits, that are not measured whatever the covariances are."""
     return 0 if gnss_axes == XYZ or (vertical_seen and gnss_axes != XY) else VERTICAL

@@ -1,7 +1,7 @@
-"""Pairing of DVL samples with attitude and reference, and the gates that decide which are used.
+"""Pairing of DVL samples with attitude and reference, and the gates that select the usable ones.
 
-By columns only: live, of the one or two rows that a message decides. Who calls says how many rows are decided, in
-order, and how far each track had come by then.
+Works on columns; live, on the one or two rows that a message decides. The caller passes the number of decided rows, in
+order, and the newest stamp of each track at the decision.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ BODY = FRAME_CODES[VelocityFrame.BODY]
 
 
 def add_count(tally: Counter[str], name: str, count: int) -> None:
-    """Add to a counter what is more than nothing: one that never counted is not in it."""
+    """Add to a counter unless the count is zero: a counter never incremented is absent."""
     if count:
         tally[name] += count
 
 
 class Pairer:
-    """Fills in the rows of an aligner.
+    """Pairing state of the rows of an aligner.
 
-    n_judged, n_oriented, n_paired: numbers of the first row whose verdict, attitude or reference is not decided yet.
-    given: by need, how many rows there are so far for models that have it. decided_ns: stamp of the newest row whose
-    reference is decided. needs_turn_rate: whether verdicts wait for the angular velocity.
+    n_judged, n_oriented, n_paired: numbers of the first row without decided verdict, attitude or reference. given: by
+    need, number of rows available to models with that need. decided_ns: stamp of the newest row with decided reference.
+    needs_turn_rate: verdicts wait for the angular velocity.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Pairer:
         self.decided_ns = LONG_AGO_NS
 
     def judge(self, end: int, parameters: Parameters) -> None:
-        """Decide on the verdicts of the rows before `end`, and count them."""
+        """Decide the verdicts of the rows before `end`, and count them."""
         first, rows, tally = self.n_judged, self._rows, self._tally["dvl"]
         if end <= first:
             return
@@ -80,7 +80,7 @@ class Pairer:
             rows.prior_known[slots] = self.prior.known_at(rows.stamps_ns[slots], rows.velocity_dvl[slots])
 
     def orient(self, newest_ns: Stamps, parameters: Parameters) -> None:
-        """Orient the next rows (N,). newest_ns: (N,) stamp of the newest IMU sample when each was decided."""
+        """Orient the next rows (N,). newest_ns: (N,) newest IMU stamp at each decision."""
         n, first, rows, track = len(newest_ns), self.n_oriented, self._rows, self._imu
         if not n:
             return
@@ -105,14 +105,14 @@ class Pairer:
         self.given[Needs.ATTITUDE] += oriented
 
     def in_earth_frame(self, end: int, newest_ns: Stamps) -> Mask:
-        """(N,) of the next rows, before `end`, those whose reference is in an earth frame. newest_ns: as for `pair`."""
+        """Return a mask (N,) of the next rows before `end` with an earth-frame reference. newest_ns: as for `pair`."""
         rows, track = self._rows, self._reference
         stamps_ns = rows.stamps_ns[self.n_paired - rows.base : end - rows.base]
         _, after, _, found = track.brackets(stamps_ns, newest_ns)
         return found & (track.frames[after] != BODY)
 
     def pair(self, newest_ns: Stamps) -> None:
-        """Pair the next rows (N,). newest_ns: (N,) stamp of the newest reference when each was decided."""
+        """Pair the next rows (N,). newest_ns: (N,) newest reference stamp at each decision."""
         n, first, rows, track = len(newest_ns), self.n_paired, self._rows, self._reference
         if not n:
             return
@@ -129,8 +129,8 @@ class Pairer:
             fits = found & (~between | (track.frames[before] == frame))
             pairing[fits] = np.where(has_attitude[fits], Pairing.PAIRED, Pairing.WITHOUT_ATTITUDE)
             is_paired = fits & has_attitude
-            # The mean of two samples is less noisy than each, but its neighbours share them: over a run a reference
-            # sample carries its own information once, which is what the plain mean of the covariances gives.
+            # The mean of two samples is less noisy than each, but neighbouring rows share the samples. The plain mean
+            # of the covariances counts the information of each reference sample once.
             earlier, later = track.values[before], track.values[after]
             values = np.where(between[:, None], earlier + (later - earlier) * fraction[:, None], later)
             rows.reference[at] = np.where(is_paired[:, None], values, math.nan)
@@ -153,7 +153,7 @@ class Pairer:
 
 
 class Rows(RowTable):
-    """The columns of `AlignedBlock` as they come to be known."""
+    """Growing columns of `AlignedBlock`."""
 
     LAYOUT: ClassVar = {
         "stamps_ns": (np.int64, ()),
@@ -187,7 +187,7 @@ class Rows(RowTable):
     late: Mask
 
     def await_partners(self, at: int | slice) -> None:
-        """Fill in what is not known yet."""
+        """Mark rows as undecided."""
         self.verdict[at] = SampleUse.AWAITING
         self.prior_known[at] = False
         self.attitude[at] = math.nan
@@ -197,7 +197,7 @@ class Rows(RowTable):
         self.weight[at] = 1.0
 
     def block(self, first: int, end: int) -> AlignedBlock:
-        """The rows with these numbers, as long as nothing is added."""
+        """Return the rows with these numbers, valid until rows are added."""
         at = slice(first - self.base, end - self.base)
         return AlignedBlock(*[getattr(self, name)[at] for name in _COLUMNS])
 
@@ -206,7 +206,7 @@ _COLUMNS = [each.name for each in fields(AlignedBlock)]
 
 
 class Gates:
-    """Judges the samples of a DVL, in order. repeated: how many had exactly the velocity of the one before."""
+    """Gates for DVL samples, in order. repeated: number of samples equal to the previous velocity."""
 
     def __init__(self) -> None:
         self.repeated = 0
@@ -214,7 +214,7 @@ class Gates:
         self._repeats = 0
 
     def judge(self, velocity: Array, angular_velocity: Array, p: Parameters) -> Codes:
-        """Verdicts (N,). velocity: (N, 3) m/s. angular_velocity: (N, 3) rad/s, nan where not known."""
+        """Return verdicts (N,). velocity: (N, 3) m/s. angular_velocity: (N, 3) rad/s, nan where unknown."""
         verdict = np.zeros(len(velocity), dtype=np.uint8)
         slow = _squared(velocity) < p.min_speed * p.min_speed
         if slow.any():
@@ -231,7 +231,7 @@ class Gates:
         return verdict
 
     def _frozen(self, velocity: Array, p: Parameters) -> Mask:
-        """(N,) of samples that are not slow: which repeat themselves too often."""
+        """Return a mask (N,) of samples whose velocity repeats too often; slow samples are excluded before."""
         n = len(velocity)
         if not n:
             return np.zeros(0, dtype=bool)
@@ -239,12 +239,12 @@ class Gates:
         same[0] = self._velocity_before is not None and tuple(velocity[0].tolist()) == self._velocity_before
         if n > 1:
             same[1:] = (velocity[1:] == velocity[:-1]).all(axis=1)
-        if not same.any():  # as nearly always
+        if not same.any():
             x, y, z = velocity[-1].tolist()
             self._velocity_before, self._repeats = (x, y, z), 0
             return same
         at = np.arange(n)
-        other = np.maximum.accumulate(np.where(same, -1, at))  # the last one that was not the same; -1: before these
+        other = np.maximum.accumulate(np.where(same, -1, at))  # index of the last change; -1: before these samples
         repeats = np.where(other < 0, self._repeats + at + 1, at - other)
         self.repeated += int(np.count_nonzero(same))
         x, y, z = velocity[-1].tolist()
@@ -259,7 +259,7 @@ def _squared(vectors: Array) -> Array:
 
 
 class PriorWindow:
-    """Prior sway and heave (m/s, body frame) of the models that need them."""
+    """Prior sway and heave (m/s, body frame) of M5 and M6."""
 
     def __init__(self, parameters: Parameters, given: tuple[float, float] | None) -> None:
         self._rotation_body_from_dvl = parameters.rotation_dvl_from_body.T
@@ -271,7 +271,7 @@ class PriorWindow:
         self._collecting = parameters.prior_source == "initial_window"
 
     def known_at(self, stamps_ns: Stamps, velocity_dvl: Array) -> Mask:
-        """Whether the prior is known at usable samples (N,), in order; until then, take them into the mean."""
+        """Return a mask of usable samples (N,), in order, with known prior; average the earlier ones into it."""
         known = np.ones(len(stamps_ns), dtype=bool)
         if not self._collecting or not len(stamps_ns):
             return known

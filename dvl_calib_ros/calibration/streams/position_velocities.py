@@ -1,4 +1,4 @@
-"""A reference that is positions: velocities of a moment, from those over the windows of `position_window`."""
+"""Velocities derived from reference positions: correction for the averaging over `position_window`."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from ..models.parameter_spec import ParameterError
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 
-# Velocities made of positions are of no use from this noise on, m/s.
+# Noise from which velocities derived from positions are useless, m/s.
 NOISY_MPS = 0.3
 
 
 def are_positions(parameters: Parameters) -> bool:
-    """Whether the reference is positions."""
+    """Return whether the reference consists of positions."""
     return parameters.gnss_type.endswith(("/NavSatFix", "/PoseWithCovarianceStamped", "/PoseStamped"))
 
 
 def check_model(parameters: Parameters) -> None:
-    """Raise ParameterError where a model is named that goes by positions, and the reference is velocities."""
+    """Raise ParameterError if the model needs positions and the reference has velocities."""
     if parameters.model == WITH_POSITIONS and not are_positions(parameters):
         raise ParameterError(
             f"model: {WITH_POSITIONS} goes by positions, and {parameters.gnss_type} holds velocities; name another "
@@ -28,9 +28,9 @@ def check_model(parameters: Parameters) -> None:
 
 
 def of_moments(times: Array, velocity: Array, window_s: float) -> Array:
-    """Velocities (N, 3) m/s at the middles (N,) s of their windows, from those over them.
+    """Correct mean velocities (N, 3) m/s over windows to those at the middles (N,) s of the windows.
 
-    Over a window a wave is less than in its middle, by its bend: on a circle that looks like a clock that is late.
+    The mean attenuates waves in proportion to their curvature, which on a circle looks like a delay.
     """
     if len(times) < 2:
         return velocity
@@ -38,7 +38,7 @@ def of_moments(times: Array, velocity: Array, window_s: float) -> Array:
     known = np.ones(len(times), dtype=bool)
     for asked in (times - window_s, times + window_s):
         after = np.clip(np.searchsorted(times, asked), 1, len(times) - 1)
-        # beyond an end, and across an outage, nothing is known
+        # no correction beyond an end and across an outage
         known &= (asked >= times[0]) & (asked <= times[-1]) & (times[after] - times[after - 1] <= 1.5 * window_s)
         bend = bend + np.stack([np.interp(asked, times, axis) for axis in velocity.T], axis=1)
     return velocity - np.where(known[:, None], bend, 0.0) / 24.0

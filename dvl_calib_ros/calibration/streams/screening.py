@@ -1,6 +1,6 @@
-"""Which samples are valid at all. What is not is counted and never reaches the filter.
+"""Validity of samples: invalid ones are counted and never reach the filter.
 
-Each rule stands here twice, for one sample and for columns of them; test_alignment.py holds both equal.
+Each rule is implemented for one sample and for columns; test_alignment.py holds both equal.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from ..numerics.frames import Array, Quaternion, Vector
 from ..numerics.samples import Codes, Covariances, Mask
 
-# A variance below (1 µm/s)² is no claim that a velocity sensor can make; it is taken as not given, like zero.
+# Smaller variances, (1 µm/s)², are implausible for a velocity sensor and count as not given, like zero.
 SMALLEST_VARIANCE = 1e-12
-# From this variance, (m/s)², on an axis is not measured: at a standard deviation of 30 m/s nothing is known of a
-# vehicle's velocity. Drivers of receivers without a vertical velocity send such variances, or -1.
+# Variance, (m/s)², from which an axis is not measured: drivers of receivers without vertical velocity send such values
+# (a standard deviation of 30 m/s) or -1.
 NOT_MEASURED_VARIANCE = 1e3
-# rad/s; gyroscopes end at a third of this, and a number that is far above would overflow
+# rad/s, three times the range of gyroscopes; limits overflow
 LARGEST_RATE = 100.0
 _NOT_MEASURED_FLAG = -1.0
 _BITS = np.array([1, 2, 4], dtype=np.uint8)
@@ -26,13 +26,13 @@ ALL_AXES, VERTICAL = 7, 4
 
 
 def is_valid_velocity(velocity: Vector, max_speed: float) -> bool:
-    """Finite, and not faster than max_speed (m/s)."""
+    """Return whether a velocity is finite and not faster than max_speed (m/s)."""
     x, y, z = velocity
     return x * x + y * y + z * z <= max_speed * max_speed  # False for nan and inf, too
 
 
 def are_valid_velocities(velocity: Array, max_speed: float) -> Mask:
-    """`is_valid_velocity` of (N, 3)."""
+    """Return `is_valid_velocity` for (N, 3)."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = velocity.T
         valid: Mask = x * x + y * y + z * z <= max_speed * max_speed
@@ -40,11 +40,10 @@ def are_valid_velocities(velocity: Array, max_speed: float) -> Mask:
 
 
 class Screened(NamedTuple):
-    """What a velocity's covariance says.
+    """Screened covariance of a velocity.
 
-    valid: whether the sample may be used. covariance: (3, 3) (m/s)², symmetric positive definite; None where not
-    given. unmeasured: a bit (1, 2, 4) for every axis that is not measured; its variance in the covariance is 1, and
-    means nothing.
+    valid: the sample may be used. covariance: (3, 3) (m/s)², symmetric positive definite; None if not given.
+    unmeasured: a bit (1, 2, 4) per axis that is not measured; its variance in the covariance is a placeholder of 1.
     """
 
     valid: bool
@@ -56,13 +55,12 @@ _NOT_GIVEN = Screened(True, None)
 
 
 def screened_covariance(covariance: Array | None, believed: bool = True) -> Screened:
-    """Judge one covariance (3, 3).
+    """Screen one covariance (3, 3).
 
-    A zero variance means "not given" (the whole covariance then is); a negative or non-finite one, or a matrix that
-    is not positive definite, is invalid. A variance of -1 or of `NOT_MEASURED_VARIANCE` and more: not measured.
+    A zero variance marks the whole covariance as not given. A negative or non-finite variance, or a matrix that is not
+    positive definite, is invalid. A variance of -1 or from `NOT_MEASURED_VARIANCE` on marks an axis as not measured.
 
-    believed: whether covariances are used (parameter use_message_covariance); where they are not, one that says that
-    no axis is measured is not given.
+    believed: parameter use_message_covariance. If False, a covariance without any measured axis counts as not given.
     """
     if covariance is None:
         return _NOT_GIVEN
@@ -83,7 +81,7 @@ def screened_covariance(covariance: Array | None, believed: bool = True) -> Scre
 
 
 def screened_covariances(covariance: Array, believed: bool = True) -> tuple[Mask, Mask, Array, Codes]:
-    """`screened_covariance` of (C, 3, 3): valid (C,), given (C,), covariance (C, 3, 3), unmeasured (C,)."""
+    """Screen covariances (C, 3, 3): return valid (C,), given (C,), covariance (C, 3, 3), unmeasured (C,)."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     with np.errstate(invalid="ignore", over="ignore"):
         finite = np.isfinite(covariance.reshape(-1, 9).sum(axis=1))
@@ -104,11 +102,11 @@ def screened_covariances(covariance: Array, believed: bool = True) -> tuple[Mask
 
 
 def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[bool, bool, bool]:
-    """Which axes a reference measures: most of its messages say so, the parameter does, and one is not 0 throughout.
+    """Return the measured axes of a reference: by most messages, by the parameter, and z not constantly 0.
 
-    velocity: (N, 3) m/s. unmeasured: (N,) as of `Screened`. gnss_axes: as the parameter.
+    velocity: (N, 3) m/s. unmeasured: (N,) as in `Screened`. gnss_axes: the parameter.
     """
-    unmeasured = np.where(unmeasured == ALL_AXES, 0, unmeasured)  # such a message says nothing of a single axis
+    unmeasured = np.where(unmeasured == ALL_AXES, 0, unmeasured)  # all unmeasured: no evidence per axis
     measured = [2 * np.count_nonzero(unmeasured & bit) < len(unmeasured) for bit in _BITS]
     if gnss_axes != "auto":
         measured[2] = gnss_axes == "xyz"
@@ -117,7 +115,7 @@ def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[b
 
 
 class CovarianceScreen:
-    """`screened_covariance` that recognises the covariance of the sample before: most streams repeat it."""
+    """`screened_covariance` with a cache of the last covariance, which most streams repeat."""
 
     def __init__(self, believed: bool) -> None:
         self._believed = believed
@@ -125,7 +123,7 @@ class CovarianceScreen:
         self._result = _NOT_GIVEN
 
     def __call__(self, covariance: Array | None) -> Screened:
-        """As `screened_covariance`; the same object in gives the same object out."""
+        """Return the screened covariance; the same object for the same input object."""
         if covariance is not self._seen:
             self._result = screened_covariance(covariance, self._believed)
             self._seen = covariance
@@ -133,7 +131,7 @@ class CovarianceScreen:
 
 
 class ScreenedColumns(NamedTuple):
-    """`Screened` of N rows: valid (N,), covariance (N, 3, 3) with nan where not given, unmeasured (N,)."""
+    """`Screened` for N rows: valid (N,), covariance (N, 3, 3) with nan where not given, unmeasured (N,)."""
 
     valid: Mask
     covariance: Array
@@ -141,30 +139,30 @@ class ScreenedColumns(NamedTuple):
 
 
 def screen_columns(covariances: Covariances, believed: bool = True) -> ScreenedColumns:
-    """`screened_covariance` of N rows."""
+    """Screen the covariances of N rows."""
     valid, given, found, unmeasured = screened_covariances(covariances.distinct, believed)
-    # the last ones are for rows without, whose index is -1
+    # the last entry is for rows without covariance, whose index is -1
     valid, unmeasured = np.append(valid, True), np.append(unmeasured, np.uint8(0))
     found = np.concatenate([np.where(given[:, None, None], found, np.nan), np.full((1, 3, 3), np.nan)])
     return ScreenedColumns(valid[covariances.index], found[covariances.index], unmeasured[covariances.index])
 
 
 def unit_quaternion(q: Quaternion | None) -> Quaternion | None:
-    """The quaternion with its length made one; None if it has none worth the name (nan, or all zero)."""
+    """Return the normalised quaternion, or None if its length is not near 1."""
     if q is None:
         return None
     x, y, z, w = q
     square = x * x + y * y + z * z + w * w
     if abs(square - 1.0) < 1e-9:
         return q
-    if not 0.25 < square < 4.0:  # nan and inf, too
+    if not 0.25 < square < 4.0:  # nan and inf are rejected, too
         return None
     scale = 1.0 / math.sqrt(square)
     return x * scale, y * scale, z * scale, w * scale
 
 
 def unit_quaternions(q: Array) -> Array:
-    """`unit_quaternion` of (N, 4); nan where there is none."""
+    """Return `unit_quaternion` for (N, 4); nan where invalid."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z, w = q.T
         square = x * x + y * y + z * z + w * w
@@ -176,13 +174,13 @@ def unit_quaternions(q: Array) -> Array:
 
 
 def is_valid_rate(angular_velocity: Vector) -> bool:
-    """Finite, and no faster than anything turns that carries a DVL."""
+    """Return whether an angular velocity is finite and plausible for a vehicle."""
     x, y, z = angular_velocity
     return x * x + y * y + z * z <= LARGEST_RATE * LARGEST_RATE
 
 
 def valid_rates(angular_velocity: Array) -> Array:
-    """(N, 3) with nan in all of a row that is not as `is_valid_rate` wants it."""
+    """Return rates (N, 3) with nan in rows that `is_valid_rate` rejects."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z = angular_velocity.T
         valid = x * x + y * y + z * z <= LARGEST_RATE * LARGEST_RATE

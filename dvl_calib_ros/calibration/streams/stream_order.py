@@ -1,11 +1,10 @@
-"""Order of each stream by header stamps alone, its values at other times, new days and dropouts.
+"""Order of each stream by header stamps alone, its values at other times, new recordings and dropouts.
 
-Nothing here looks at a clock, nor at the order in which *different* topics arrive, as long as one topic does not lag
-another by more than a bounded time in stamps. So a live run and a replay of its recording decide alike. What stands
-here twice, for one sample and for columns of them, is the same rule (test_alignment.py).
+A live run and a replay agree: results depend neither on wall time nor, within a bounded lag in stamps, on the arrival
+order of *different* topics. Rules for one sample and for columns are the same (test_alignment.py).
 
-Clocks are set, and an inertial navigation aligned, between one dive and the next. Live, a pause says so; of recordings
-that are replayed together it is known.
+Between two dives clocks are set and an INS is aligned. Live, a pause marks a new recording; in a joint replay the
+recordings are known.
 """
 
 from __future__ import annotations
@@ -23,32 +22,32 @@ from ..numerics.samples import Codes, Index, Mask, Stamps
 from ..numerics.tables import RowTable
 from .clock_correction import SECOND_NS
 
-# Earlier than any stamp, and so far from the ends of 64 bits that a timeout can be added.
+# Earlier than any stamp; adding a timeout cannot overflow 64 bits.
 LONG_AGO_NS = -(2**62)
-# The past that is kept for who needs more than pairing does, at most: a DVL that is silent must not fill the memory.
+# Longest history that a track keeps beyond pairing, ns: a silent DVL must not fill the memory.
 LONGEST_NS = 600_000_000_000
-# So many are never forgotten for that: ten minutes at 400 Hz, 26 MB. A stamp that leaps ahead is no silence, and
-# what goes with it must not depend on whether samples come one by one or in columns.
+# Fewest samples to which LONGEST_NS applies: ten minutes at 400 Hz, 26 MB. A forward clock step is no silence, and its
+# effect must not depend on the size of columns.
 MOST_KEPT = 240_000
 
 
-# Stamps further apart belong to different segments of time: no recording is longer without a break.
+# A longer gap separates segments of time: no recording is longer without a break.
 SEGMENT_GAP_NS = 7 * 86_400 * SECOND_NS
 
 
 class Stamped(Protocol):
-    """Anything with a header stamp."""
+    """Object with a header stamp."""
 
     @property
     def stamp_ns(self) -> int:
-        """Integer nanoseconds."""
+        """Stamp in integer nanoseconds."""
 
 
 S = TypeVar("S", bound=Stamped)
 
 
 class Order(Enum):
-    """What a stamp is after the ones before it in the same stream."""
+    """Relation of a stamp to the earlier ones of its stream."""
 
     NEXT = "next"
     DUPLICATE = "duplicate"
@@ -59,7 +58,7 @@ class Order(Enum):
 
 
 class Admitted(NamedTuple):
-    """Of N rows of a stream those that are let through (N,), and how many others there are of each kind."""
+    """Mask (N,) of the admitted rows of a stream, and counts of the others by kind."""
 
     rows: Mask
     duplicate: int
@@ -67,14 +66,14 @@ class Admitted(NamedTuple):
 
 
 class Sequencer(Generic[S]):
-    """Lets a stream's samples through in strictly increasing order of stamps.
+    """Filter that admits samples of a stream in strictly increasing order of stamps.
 
-    One wrong stamp must not poison the timeline, and a real jump (a dropout, a clock set, a bag that loops) must not
-    stop it. So a sample more than `max_jump_ns` away is held until the next sample confirms it (a gap or, back in
-    time, a restart) or contradicts it (the held one was stray and is dropped). Nothing confirms the very first sample:
-    if the next ones are more than `SEGMENT_GAP_NS` ahead, that is a restart as well.
+    A sample more than `max_jump_ns` away is held until the next one confirms it (a gap or, backward, a restart) or
+    contradicts it (stray, dropped). So neither one wrong stamp nor a real jump (dropout, clock set, bag loop) stops the
+    stream. The first sample is unconfirmed: if the next ones are more than `SEGMENT_GAP_NS` ahead, it is a restart,
+    too.
 
-    is_alone: whether there was one sample so far.
+    is_alone: there was only one sample so far.
     """
 
     def __init__(self, max_jump_ns: int) -> None:
@@ -85,7 +84,7 @@ class Sequencer(Generic[S]):
         self.stray = 0
 
     def goes_on(self, stamp_ns: int) -> bool:
-        """Take note of a stamp and say True if it simply is the next one, as nearly all are; else call `admit`."""
+        """Record a stamp and return True if it is simply the next one; else call `admit`."""
         last = self.last_ns
         if last is None or self.held is not None or not last < stamp_ns <= last + self._max_jump_ns:
             return False
@@ -94,12 +93,12 @@ class Sequencer(Generic[S]):
         return True
 
     def follow(self, stamps_ns: Stamps) -> None:
-        """Take note of a column of stamps (N > 0,) that `admit_columns` let through."""
+        """Record stamps (N > 0,) that `admit_columns` admitted."""
         self.is_alone = self.last_ns is None and len(stamps_ns) == 1
         self.last_ns = int(stamps_ns[-1])
 
     def admit(self, sample: S) -> tuple[Order, tuple[S, ...]]:
-        """What the sample is, and the samples that may now go on (the held one before it, once confirmed)."""
+        """Return the order of a sample, and the admitted samples (a confirmed held one first)."""
         stamp, last = sample.stamp_ns, self.last_ns
         if last is None:
             self.last_ns = stamp
@@ -132,9 +131,9 @@ class Sequencer(Generic[S]):
             self.held = None
 
     def admit_columns(self, stamps_ns: Stamps) -> Admitted | None:
-        """`admit` for a column of stamps (N,), without taking note of it; None if there is a jump among them.
+        """Apply `admit` to stamps (N,) without recording them. Return None if there is a jump among them.
 
-        Jumps are rare and change everything: such a column goes through `admit` row by row.
+        Columns with jumps, which are rare, must use `admit` per sample.
         """
         if self.held is not None:
             return None
@@ -150,7 +149,7 @@ class Sequencer(Generic[S]):
 
 
 def strays(stamps_ns: Stamps, max_jump_ns: int) -> Mask:
-    """Return which stamps (N,) are far from both neighbours on the same side, where these are near each other."""
+    """Return a mask of stamps (N,) far from both neighbours on the same side, while these are near each other."""
     stray = np.zeros(len(stamps_ns), dtype=bool)
     if len(stamps_ns) > 2:
         before, after = stamps_ns[1:-1] - stamps_ns[:-2], stamps_ns[2:] - stamps_ns[1:-1]
@@ -160,7 +159,7 @@ def strays(stamps_ns: Stamps, max_jump_ns: int) -> Mask:
 
 
 class Bracket(NamedTuple):
-    """Slots of the samples before (-1: none near enough) and at or after a time, and where between them it lies.
+    """Slots of the samples before (-1: none near enough) and at or after a time, and its fraction between them.
 
     fraction: 0..1; 1 is exactly the later.
     """
@@ -171,7 +170,7 @@ class Bracket(NamedTuple):
 
 
 class Brackets(NamedTuple):
-    """`Bracket` for N times. found: (N,) where there is one; the rest means nothing elsewhere."""
+    """`Bracket` for N times. found: (N,); other fields are undefined where it is False."""
 
     before: Index
     after: Index
@@ -180,12 +179,12 @@ class Brackets(NamedTuple):
 
 
 class Track(RowTable):
-    """The recent past of one stream, to be interpolated but never extrapolated.
+    """Recent samples of one stream, for interpolation without extrapolation.
 
-    values: what interpolates linearly or, of an IMU, the quaternion and the angular velocity, see samples.py; of a
-    reference velocity (3), covariance (9, nan where not given). frames, unmeasured: of a reference, its frame (a place
-    in `FRAMES`) and a bit for every axis that it does not measure. late: it came when other streams were further ahead
-    than one may lag another.
+    values: linearly interpolated quantities or, for an IMU, quaternion and angular velocity (samples.py); for a
+    reference velocity (3), covariance (9, nan where not given). frames, unmeasured: of a reference, its frame (index in
+    `FRAMES`) and a bit per axis that is not measured. late: at its arrival it lagged other streams by more than the
+    limit.
     """
 
     LAYOUT: ClassVar = {
@@ -202,16 +201,16 @@ class Track(RowTable):
     late: Mask
 
     def __init__(self, max_gap_ns: int, max_latency_ns: int, retention_ns: int) -> None:
-        """Make an empty one.
+        """Make an empty track.
 
-        max_gap_ns: longest gap that is interpolated across. max_latency_ns: by how much other streams may run ahead
-        of this one before it is given up waiting for. retention_ns: how far behind the newest sample a time may lie.
+        max_gap_ns: longest interpolated gap. max_latency_ns: lead of other streams at which waiting for this one ends.
+        retention_ns: largest age of a time behind the newest sample.
         """
         super().__init__()
         self.max_gap_ns = max_gap_ns
         self.max_latency_ns = max_latency_ns
         self.retention_ns = retention_ns
-        # by who wants it: stamp from which on nothing is forgotten before LONGEST_NS
+        # by user: stamp from which samples are kept, up to LONGEST_NS
         self.needed_from: dict[object, int] = {}
 
     @property
@@ -220,7 +219,7 @@ class Track(RowTable):
         return int(self.stamps_ns[self.size - 1]) if self.size > self.begin else None
 
     def forget_old(self) -> None:
-        """Forget what no time that may still be asked for needs."""
+        """Discard samples that no future request needs."""
         if self.size > self.begin:
             oldest_ns = int(self.stamps_ns[self.size - 1]) - self.retention_ns - self.max_gap_ns
             if self.needed_from:
@@ -231,21 +230,20 @@ class Track(RowTable):
             self.begin += int(np.searchsorted(self.stamps_ns[self.begin : self.size], oldest_ns))
 
     def in_time(self, from_ns: int, to_ns: int) -> Index:
-        """Slots of samples between two stamps that were not late: live, the others come when a block is closed."""
+        """Return slots of samples between two stamps that were not late; live, late ones miss their block."""
         span = self.between(self.stamps_ns, from_ns, to_ns)
         return np.flatnonzero(~self.late[span]) + span.start
 
     def decided(self, stamp_ns: int, horizon_ns: int) -> bool:
-        """Whether `bracket(stamp_ns)` can no longer change, with horizon_ns the newest stamp of any stream.
+        """Return whether `bracket(stamp_ns)` is final. horizon_ns: newest stamp of any stream.
 
-        Either this stream has reached the time, or what could still bracket it (at the time itself, or within
-        max_gap of the newest sample) should have come by now.
+        It is final once this stream has reached the time, or once every sample that could bracket it is overdue.
         """
         newest = self.newest_ns
         return (newest is not None and newest >= stamp_ns) or horizon_ns >= self.deadline_ns(stamp_ns)
 
     def deadline_ns(self, stamp_ns: int) -> int:
-        """The horizon from which a time that this stream has not reached is decided all the same."""
+        """Return the horizon at which a time that this stream has not reached is decided anyway."""
         newest = self.newest_ns
         last_chance_ns = stamp_ns if newest is None else max(stamp_ns, newest + self.max_gap_ns)
         return last_chance_ns + self.max_latency_ns
@@ -253,16 +251,16 @@ class Track(RowTable):
     def decided_in(
         self, stamps_ns: Stamps, since: Index, new_ns: Stamps, arrived: Index, newest_ns: Stamps, horizon_ns: Stamps
     ) -> Index:
-        """`decided` for columns: the event (0..T-1, T: none of them) at which each of N times is.
+        """Return the event (0..T-1, T: none) at which each of N times is `decided`.
 
-        stamps_ns: (N,) increasing. since: (N,) event from which a time is asked for. new_ns: stamps of the samples
-        that this stream gains, and arrived: at which events. newest_ns, horizon_ns: (T,) after every event.
+        stamps_ns: (N,) increasing. since: (N,) event from which each time is requested. new_ns: stamps of the samples
+        that this stream gains, arrived: their events. newest_ns, horizon_ns: (T,) after every event.
         """
         n_events = len(horizon_ns)
         before_ns = LONG_AGO_NS if self.newest_ns is None else self.newest_ns
         reached_at = np.append(arrived, n_events)[np.searchsorted(new_ns, stamps_ns)]
         decided = np.where(stamps_ns <= before_ns, since, np.maximum(since, reached_at))
-        # up to which time this stream is given up after an event; while it stands still that only grows
+        # time up to which this stream is given up after an event; it grows while the stream is silent
         overdue = newest_ns + self.max_gap_ns + self.max_latency_ns <= horizon_ns
         if not overdue.any():
             return decided
@@ -278,9 +276,9 @@ class Track(RowTable):
         return decided
 
     def bracket(self, stamp_ns: int, newest_ns: int | None = None) -> Bracket | None:
-        """The samples around a time; None without one at or after it, across too long a gap, or too long ago.
+        """Return the samples around a time; None beyond the newest sample, across a long gap, or too long ago.
 
-        newest_ns: stamp of this stream's newest sample when that was decided; None where it still is.
+        newest_ns: newest stamp of this stream at the decision; None: now.
         """
         stamps = self.stamps_ns[self.begin : self.size]
         at = int(stamps.searchsorted(stamp_ns))
@@ -298,8 +296,8 @@ class Track(RowTable):
         return None if before < 0 else Bracket(before, after, (stamp_ns - before_ns) / (after_ns - before_ns))
 
     def brackets(self, stamps_ns: Stamps, newest_ns: Stamps) -> Brackets:
-        """`bracket` for columns; newest_ns: (N,) stamp of this stream's newest sample when each was decided."""
-        if len(stamps_ns) == 1:  # live there is one: a fifth of the work
+        """Return `bracket` for columns; newest_ns: (N,) newest stamp of this stream at each decision."""
+        if len(stamps_ns) == 1:  # live there is one row: faster
             one = self.bracket(int(stamps_ns[0]), int(newest_ns[0]))
             slots = np.array([-1, 0] if one is None else [one.before, one.after])
             fraction = np.array([1.0 if one is None else one.fraction])
@@ -319,22 +317,25 @@ class Track(RowTable):
         return Brackets(np.where(near, after - 1, -1), after, fraction, found)
 
 
-# What follows sooner is another part of the same recording. Longer than a block of its samples and the longest delay,
-# so that none holds those of two days.
+# Shortest pause before a new recording, ns: longer than a block of samples and the longest delay, so that no block
+# holds samples of two recordings.
 SHORTEST_PAUSE_NS = 15_000_000_000
 
 
 class NewDays:
-    """Says of a DVL sample whether it is the first of a day, by stamps alone."""
+    """Detection of the first DVL sample of a recording, by stamps alone."""
 
     def __init__(self, pause_ns: int, recordings_ns: Sequence[int] = ()) -> None:
-        """pause_ns: of the DVL, after which it is another day. recordings_ns: stamps between one recording and the next
-        of those that are taken together, each of a day of its own."""
+        """Set the limits of recordings.
+
+        pause_ns: DVL pause that starts a new recording. recordings_ns: stamps between recordings that are replayed
+        together.
+        """
         self._pause_ns = pause_ns
         self._recordings_ns = sorted(recordings_ns)
 
     def begins(self, stamp_ns: int, interval_ns: int) -> bool:
-        """Whether a day begins with this stamp, which came so long after the one before."""
+        """Return whether a recording begins with this stamp, an interval after the previous one."""
         if interval_ns <= SHORTEST_PAUSE_NS:
             return False
         if interval_ns > self._pause_ns:
@@ -344,11 +345,11 @@ class NewDays:
 
 
 def parts_by_day(days: Sequence[int], first: int, end: int) -> Iterator[tuple[int, int, bool]]:
-    """Yield first row, end and whether a day begins, of the parts of rows first .. end - 1.
+    """Yield first row, end, and whether a recording begins, for the parts of rows first .. end - 1.
 
-    days: rows with which days begin, in order.
+    days: first rows of recordings, in order.
     """
-    if not days or days[-1] < first or days[0] >= end:  # as nearly always
+    if not days or days[-1] < first or days[0] >= end:
         yield first, end, False
         return
     own = [day for day in days if first <= day < end]
@@ -356,21 +357,21 @@ def parts_by_day(days: Sequence[int], first: int, end: int) -> Iterator[tuple[in
         yield start, stop, start in own
 
 
-# A DVL that sends nothing for so long, and for so many times its shortest interval, has dropped out.
+# A dropout is a DVL gap longer than this, ns, and than this multiple of its shortest interval.
 DROPOUT_NS = SECOND_NS
 DROPOUT_INTERVALS = 3
 _NEVER_NS = 2**63 - 1
 
 
 class Dropouts:
-    """Those since the start or the last restart. longest_ns: of them."""
+    """DVL dropouts since the start or the last restart. longest_ns: longest of them."""
 
     def __init__(self) -> None:
         self.longest_ns = 0
         self._shortest_interval_ns = _NEVER_NS
 
     def add(self, interval_ns: Stamps) -> int:
-        """Take the intervals (N,) between samples, in order; how many of them are dropouts."""
+        """Add the intervals (N,) between samples, in order. Return the number of dropouts."""
         if not len(interval_ns):
             return 0
         if interval_ns.max() <= DROPOUT_NS:
