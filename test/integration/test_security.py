@@ -197,7 +197,7 @@ def test_names_in_a_bag_write_no_file_and_reach_no_terminal_or_page_raw(tmp_path
         message.header.frame_id = HOSTILE_NAME if topic != "gnss/twist" else "map"
         return message
 
-    bag = rewrite(tmp_path / "bag", change, run(20.0))
+    bag = rewrite(tmp_path / "bag", change, run(30.0))
     outputs = ["--json", "out.json", "--save", "out.yaml", "--report", "out.html"]
     assert main(["replay", str(bag), "-p", "gnss_frame:=enu", "-p", "dvl_position:=told", *outputs]) == 0
     assert main(["salvage", str(bag), "-o", str(tmp_path / "new")]) == 0

@@ -46,7 +46,7 @@ def test_mounting_and_lever_arm_come_from_robot_description_unless_given(world, 
     arm = (0.0, 0.0, 0.0) if given and "use_transforms" in given[0] else (-0.6, 0.1, -0.2)
     publisher = world.node.create_publisher(String, "robot_description", LATCHED)
     publisher.publish(String(data=URDF))
-    with world.calibration_node("max_latency:=600.0", f"result_file:={saved}", *given):
+    with world.calibration_node("max_latency:=600.0", "model:=M3", f"result_file:={saved}", *given):
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         until(lambda: diagnostics, "the node to run")
         if not given or "use_transforms" not in given[0]:
@@ -77,7 +77,7 @@ def test_what_the_imu_claims_of_its_heading_is_taken_unless_given(world, tmp_pat
             if topic == "imu/data":
                 message.orientation_covariance = np.diag([0.0, 0.0, math.radians(2.0) ** 2]).ravel()
             written.message(topic, TOPICS[topic], log_ns, message)
-    with world.calibration_node("max_latency:=600.0", f"result_file:={saved}", *given):
+    with world.calibration_node("max_latency:=600.0", "model:=M3", f"result_file:={saved}", *given):
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         until(lambda: diagnostics, "the node to run")
         player = BagPlayer(world.node, [bag])

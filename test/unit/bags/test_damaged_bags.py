@@ -19,7 +19,6 @@ import damage
 import lz4.frame
 import pytest
 from conftest import searched
-from documentation import section
 from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 from io_fixtures import estimates, mcap_bytes, raw, raw_and_notes, replayed, run, storage_file, write_bag
@@ -131,12 +130,6 @@ def test_all_that_is_whole_comes_out_and_nothing_else(tmp_path):
         assert f"{len(found)} whole messages" in note, case.name
         said = ("bytes skipped", "bytes short", "damaged pages")
         assert any(words in note for words in said) or len(found) == 1800, case.name
-
-
-def test_the_table_in_the_documentation_says_what_is_recovered():
-    table = section("damage")
-    for case in damage.cases():
-        assert f"| {case.name} | {len(case.whole)} | {len(case.whole)} | " in table
 
 
 @pytest.mark.parametrize("compression", [NONE, LZ4, ZSTD])

@@ -65,8 +65,8 @@ def write_team_bag(path: Path, kind: str, change: Callable[[int, Any], None] = l
     store, name = get_typestore(Stores.ROS2_JAZZY), f"team_msgs/msg/{kind.title()}"
     store.register(get_types_from_msg("geometry_msgs/Vector3 direction\nfloat64 velocity\n", BEAM))
     store.register(get_types_from_msg(HEAD + definition, name))
-    source = write_bag(path.with_name(f"{path.name}_listed"), run(20.0))
-    samples = iter([sample for sample in run(20.0) if isinstance(sample, DvlSample)])
+    source = write_bag(path.with_name(f"{path.name}_listed"), run(30.0))
+    samples = iter([sample for sample in run(30.0) if isinstance(sample, DvlSample)])
     connections: dict[str, Any] = {}
     n_dvl = 0
     with BagReader([source]) as bag, Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
