@@ -45,7 +45,7 @@ def said(command, bag, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("moves", "words"),
-    [({"leap": 1.0}, "the reference's clock leaps ahead by 1.0"), ({"drift": 1e-3}, "the reference's clock drifts by")],
+    [({"leap": 1.0}, "the reference's clock steps ahead by 1.0"), ({"drift": 1e-3}, "the reference's clock drifts by")],
     ids=["leap", "drift"],
 )
 def test_a_reference_whose_clock_moves_is_named_by_all_and_not_accepted(moves, words, tmp_path, capsys):
@@ -60,7 +60,7 @@ def test_a_reference_whose_clock_moves_is_named_by_all_and_not_accepted(moves, w
 @pytest.mark.parametrize(
     ("moves", "words"),
     [
-        ({"leap": 1.0}, "the DVL's clock leaps ahead by"),
+        ({"leap": 1.0}, "the DVL's clock steps ahead by"),
         pytest.param({"drift": 1e-3}, "the DVL's clock drifts by", marks=pytest.mark.slow),
     ],
     ids=["leap", "drift"],

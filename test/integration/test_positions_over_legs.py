@@ -90,7 +90,7 @@ def test_where_velocities_of_positions_are_good_auto_does_not(tmp_path):
 def test_positions_too_seldom_for_velocities_calibrate(tmp_path):
     bag = write_positions(tmp_path / "bag", run(fix_s=10.0, seconds=1800.0))
     result = replay([bag], Parameters(), TOPICS).result
-    assert result.selected == WITH_POSITIONS and "too seldom" in str(result.selected_because)
+    assert result.selected == WITH_POSITIONS and "too infrequent" in str(result.selected_because)
     assert abs(result.estimate.state[2] - TRUTH.phi[2]) < 3.0 * result.estimate.recording_std[2]
 
 

@@ -74,7 +74,7 @@ def test_beside_a_lag_the_noise_is_not_only_what_high_frequencies_show(page, tmp
 
 def test_effects_that_cannot_be_told_apart_are_named_together_and_none_is_preferred(page):
     assert page.row("lever_arm or sideslip")[1:3] == ["85 %", "< 0.001"]
-    assert "cannot tell lever_arm from sideslip" in page.text
+    assert "cannot distinguish lever_arm from sideslip" in page.text
 
 
 def test_sizes_that_this_data_cannot_show_are_marked_against_those_worth_knowing(tmp_path):
