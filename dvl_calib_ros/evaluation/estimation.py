@@ -183,7 +183,7 @@ def _estimate_one(
 
 
 def _estimate_fed(name: str, data: SensorData, parameters: Parameters, ends: Sequence[int]) -> GaussianState:
-    """Of a model with an estimator of its own: each variant as a recording of it, looked at after so many samples."""
+    """Return x (E, B, n), P (E, B, n, n) of an estimator, fed each variant, after its first `ends` samples."""
     prior = true_prior(data, parameters)
     x, p = [], []
     for variant in range(len(data.velocity_dvl)):

@@ -44,7 +44,7 @@ class Procedure:
 
     @property
     def studied(self) -> tuple[str, ...]:
-        """Models of the studies: a filter does all combinations at once, an estimator takes a calibration for each."""
+        """Models of the studies: filters alone, because an estimator needs a calibration per error combination."""
         return tuple(name for name in self.models if not MODELS[name].estimator)
 
     @property

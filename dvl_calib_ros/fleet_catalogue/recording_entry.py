@@ -24,8 +24,8 @@ from ..recordings.recording import open_recording
 from .recording_search import StoredRecording, as_text
 
 _UNITS = {"°": "deg"}
-# `Estimate.heading_deviation`, in degrees; the last per hour
-HEADING_ERRORS = ("heading_sin", "heading_cos", "heading_sin2", "heading_cos2", "heading_drift")
+# `Estimate.heading_deviation`, in degrees
+HEADING_ERRORS = ("heading_sin", "heading_cos", "heading_sin2", "heading_cos2")
 # variation between days, which recordings of one day share
 _DAY = ("day_std_heading", "day_std_scale")
 
@@ -157,13 +157,10 @@ def _heading(estimate: Estimate) -> list[Row]:
     if estimate.heading_deviation is None:
         return []
     value, std = estimate.heading_deviation.x, np.sqrt(np.diag(estimate.heading_deviation.p))
-    rows = []
-    for name, each, each_std in zip(HEADING_ERRORS, np.degrees(value), np.degrees(std), strict=True):
-        factor, unit = (3600.0, "deg/h") if name == "heading_drift" else (1.0, "deg")
-        rows.append(
-            {"parameter": name, "unit": unit, "value": factor * float(each), "std_recording": factor * float(each_std)}
-        )
-    return rows
+    return [
+        {"parameter": name, "unit": "deg", "value": float(each), "std_recording": float(each_std)}
+        for name, each, each_std in zip(HEADING_ERRORS, np.degrees(value), np.degrees(std), strict=True)
+    ]
 
 
 def _water(water: Water | None) -> list[Row]:

@@ -320,7 +320,7 @@ FINDINGS = (
     ),
     Kind(
         "HEADING_DEVIATION",
-        "the heading error changes {course}: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
+        "the heading error changes with the heading: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
         "{least:+.1f}° at {least_at:.0f}°; it costs {cost:.0f} m per km",
         "A compass deviates with the heading, a gyro drifts; the yaw holds the mean deviation.",
         "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",

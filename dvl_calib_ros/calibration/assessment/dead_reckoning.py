@@ -181,9 +181,7 @@ def dead_reckoned(
         track_after=(reference - astray[1])[kept],
         error_before=before.in_body[use[kept]],
         error_after=after.in_body[use[kept]],
-        deviation=heading_deviation(recording.dvl.times[use], after.yaw[use], heading)
-        if on_a_map and heading is not None
-        else None,
+        deviation=heading_deviation(after.yaw[use], heading) if on_a_map and heading is not None else None,
         followed=_followed(recording, after, use) if on_a_map else None,
     )
 

@@ -1,4 +1,4 @@
-"""Check of the heading for a deviation that changes with the heading or drifts.
+"""Check of the heading for a deviation that changes with the heading.
 
 A constant error of the IMU's heading is harmless, because the same IMU navigates. `full` estimates the deviation with
 the mounting; this check judges it on the headings driven.
@@ -25,16 +25,13 @@ FIRST, SURELY = math.radians(3.0), 3.0
 # The same from GATED_FIRST (rad) if more than this share of samples is gated: the deviation affects these most, so it
 # may be larger.
 GATED_FIRST, GATED_FROM = math.radians(1.0), 0.1
-# Drift (rad, rms; 1.2° from first to last) from which yaw is not accepted: it is unknown when a drifting heading was
-# right.
-DRIFTS_FROM = math.radians(0.35)
 
 
 class HeadingDeviation(NamedTuple):
     """Heading deviation on the headings driven.
 
     rms, std: rad, of the deviation about its mean, and of its estimate. most, least: rad, at headings most_at, least_at
-    (rad, from north, clockwise). by_time: whether drift exceeds the deviation with heading.
+    (rad, from north, clockwise).
     """
 
     rms: float
@@ -43,21 +40,19 @@ class HeadingDeviation(NamedTuple):
     most_at: float
     least: float
     least_at: float
-    by_time: bool
 
 
-def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> HeadingDeviation | None:
+def heading_deviation(yaw: Array, coefficients: GaussianState) -> HeadingDeviation | None:
     """Return the heading deviation; None if not significant.
 
     Parameters
     ----------
-    time: (N,) s.
     yaw: (N,) rad, from east, counterclockwise.
-    coefficients: x (5,), P (5, 5), see `Estimate.heading_deviation`.
+    coefficients: x (4,), P (4, 4), see `Estimate.heading_deviation`.
     """
     if not len(yaw):
         return None
-    terms = np.stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), time], axis=1)
+    terms = np.stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)], axis=1)
     terms -= terms.mean(axis=0)
     shown = terms @ coefficients.x
     rms = float(np.sqrt((shown**2).mean()))
@@ -67,10 +62,8 @@ def heading_deviation(time: Array, yaw: Array, coefficients: GaussianState) -> H
         return None
     most, least = int(np.argmax(shown)), int(np.argmin(shown))
     north = (0.5 * math.pi - yaw) % (2.0 * math.pi)
-    by_heading, by_time = terms[:, :4] @ coefficients.x[:4], terms[:, 4] * coefficients.x[4]
     return HeadingDeviation(
-        rms, std, float(shown[most]), float(north[most]), float(shown[least]), float(north[least]),
-        bool(by_time.std() > by_heading.std()),
+        rms, std, float(shown[most]), float(north[most]), float(shown[least]), float(north[least])
     )  # fmt: skip
 
 
@@ -79,18 +72,15 @@ def severity_of(found: HeadingDeviation, estimate: Estimate) -> Severity:
     is_cut = estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
     if (is_cut and found.rms > GATED_FIRST) or found.rms > max(FIRST, SURELY * found.std):
         return Severity.REJECT
-    is_drift = found.by_time and found.rms > max(DRIFTS_FROM, SURELY * found.std)
-    return Severity.MARGINAL if is_drift or is_cut else Severity.WARNING
+    return Severity.MARGINAL if is_cut else Severity.WARNING
 
 
 def heading_warnings(found: HeadingDeviation) -> Reason:
     """Word the deviation as a warning."""
     degrees = math.degrees
-    course = "with time" if found.by_time else "with the heading"
     first = "calibrate the compass first: " if found.rms > max(FIRST, SURELY * found.std) else ""
     return finding(
         "HEADING_DEVIATION",
-        course=course,
         rms=degrees(found.rms),
         std=degrees(found.std),
         most=degrees(found.most),

@@ -87,7 +87,7 @@ class Estimator(ABC):
 
     @property
     def heading_deviation(self) -> GaussianState | None:
-        """Heading deviation x (5,), P (5, 5), see `Estimate.heading_deviation`; None if not estimated."""
+        """Heading deviation x (4,), P (4, 4), see `Estimate.heading_deviation`; None if not estimated."""
         return None
 
     @property

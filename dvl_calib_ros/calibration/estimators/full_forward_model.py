@@ -281,7 +281,4 @@ def _about_up(angle: Array) -> Array:
 
 def deviation_of(state: GaussianState) -> GaussianState:
     """Return the heading deviation of a state x (20,), P (20, 20), see `Estimate.heading_deviation`."""
-    p = np.zeros((5, 5))
-    p[:4, :4] = state.p[HEADING, HEADING]
-    p[4, 4] = 1e-12
-    return GaussianState(-np.append(state.x[HEADING], 0.0), p)
+    return GaussianState(-state.x[HEADING], state.p[HEADING, HEADING])

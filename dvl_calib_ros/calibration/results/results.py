@@ -33,8 +33,8 @@ class Estimate:
     and recording_covariance; at one speed a delay looks like a lever arm. of_bias: effect of the DVL bias on the state
     and these covariances, for the mounting, not for velocities at the speeds driven. used, gated: samples. mean_nis:
     mean of νᵀS⁻¹ν over the used samples, with the two-sided 99 % bounds of a consistent filter. heading_deviation: x
-    (5,), P (5, 5): coefficients of sine and cosine of the yaw and of twice the yaw, rad, and of time, rad/s; None for
-    models with exact heading.
+    (4,), P (4, 4): coefficients of sine and cosine of the yaw and of twice the yaw, rad; None for models with exact
+    heading.
     """
 
     model: str

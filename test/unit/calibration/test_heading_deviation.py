@@ -42,8 +42,8 @@ def recorded(seed, off, offset=(0.0, 0.0), legs=16, every=math.pi / 4.0, **param
 
 
 def deviation(*args, **more):
-    calibrator, time, yaw = recorded(*args, **more)
-    return heading_deviation(time, yaw, calibrator.heading_deviation)
+    calibrator, _, yaw = recorded(*args, **more)
+    return heading_deviation(yaw, calibrator.heading_deviation)
 
 
 @pytest.mark.spread(2)
@@ -57,7 +57,7 @@ def test_a_constant_error_of_the_heading_or_of_the_reference_is_no_deviation(see
 def test_a_compass_that_deviates_is_found_with_its_size_and_headings(cycles):
     size = math.radians(2.0)
     found = deviation(1, lambda yaw, _: size * math.sin(cycles * yaw))
-    assert found.rms == pytest.approx(size / math.sqrt(2.0), rel=0.25) and not found.by_time
+    assert found.rms == pytest.approx(size / math.sqrt(2.0), rel=0.25)
     if cycles == 1:  # most at the heading next to yaw 90 degrees, which is north
         assert min(found.most_at, 2.0 * math.pi - found.most_at) < 0.25
     said = heading_warnings(found)
@@ -88,4 +88,4 @@ def test_on_one_heading_sigma_of_yaw_holds_what_the_heading_may_be_off_by():
 
 def test_few_headings_or_nothing_at_all_say_nothing():
     assert deviation(3, lambda yaw, _: math.sin(yaw) * 0.05, legs=1) is None
-    assert heading_deviation(np.zeros(0), np.zeros(0), GaussianState(np.zeros(5), np.eye(5))) is None
+    assert heading_deviation(np.zeros(0), GaussianState(np.zeros(4), np.eye(4))) is None
