@@ -14,7 +14,7 @@ import numpy as np
 
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..calibration.filters.observability import Convergence, observability
-from ..calibration.models import MODELS, Model
+from ..calibration.models import MODELS, REPLACED, Model
 from ..calibration.models.parameter_spec import ParameterError
 from ..calibration.models.parameters import FRD, Parameters
 from ..calibration.numerics.error_model import corrected_mounting
@@ -129,6 +129,8 @@ class CalibratedMounting:
 def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     """Read a result file. Raises InputError if it is none, is damaged, or was changed by hand."""
     content, states = load_result(path)
+    if (name := str(content.get("model"))) in REPLACED:
+        raise InputError(f"{path}: it is of model {name}, which {REPLACED[name]} replaces; replay its recording again")
     try:
         model = MODELS[content["model"]]
         state = states[model.name]

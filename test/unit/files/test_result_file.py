@@ -27,7 +27,7 @@ from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.calibration.results.results import Result
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.files.mounting import load_extrinsics
+from dvl_calib_ros.files.mounting import load_calibrated_mounting, load_extrinsics
 from dvl_calib_ros.files.result_file import (
     KeptError,
     load_initial_calibration,
@@ -393,6 +393,20 @@ def test_a_file_of_before_the_end_was_announced_is_read(saved, result):
         del content["ends_with"], content["complete"]
 
     assert [*load_initial_calibration(change(saved, as_before))["M7"].x] == [*result.estimates["M7"].state]
+
+
+def test_a_file_whose_parameters_name_a_replaced_model_is_read(saved):
+    text = saved.read_text()
+    assert text.count("gnss_model: full") == 1
+    save_text(saved, text.replace("gnss_model: full", "gnss_model: G1"))
+    assert load_calibrated_mounting(saved).parameters.gnss_model == "full"
+
+
+def test_a_file_of_a_replaced_model_says_so(saved):
+    text = saved.read_text()
+    save_text(saved, text.replace("\nmodel: full\n", "\nmodel: G1\n", 1))
+    with pytest.raises(InputError, match="of model G1, which full replaces; replay its recording again"):
+        load_calibrated_mounting(saved)
 
 
 def test_files_that_are_no_result_file_are_refused(tmp_path):
