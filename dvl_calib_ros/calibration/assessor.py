@@ -99,6 +99,7 @@ class Assessor:
             bool(model.estimator) and estimator.claims,
             typical,
             calibration_error(model, of_velocity, judged, p.rotation_dvl_from_body),
+            drift_left_open(estimate, p),
         )
 
     def doubts(self, name: str, of_clocks: Sequence[Reason], *, fresh: bool) -> list[Reason]:

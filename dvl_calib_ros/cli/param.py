@@ -1,6 +1,6 @@
 """List, read and set the parameters of a running calibration node, also where ros2 param is not installed.
 
-A value is checked as for -p, so angles may be in degrees: ``dvl-calib param set fine_std_misalignment 0.5deg``.
+A value is checked as for -p: ``dvl-calib param set target_drift 3.5``.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..bag_replay.checked_replay import checked_replay
 from ..bag_replay.replay import Replayed
+from ..calibration.filters.observability import KM, PredictedDrift
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
@@ -351,10 +352,11 @@ def _shown(replayed: Replayed) -> tuple[Shown, ...]:
 
 def _one_shown(found: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:
     if found.name == "scale":
-        unit, prior, fine = 100.0, parameters.initial_std_scale, parameters.fine_std_scale
+        unit, prior = 100.0, parameters.initial_std_scale
     else:
-        unit, prior, fine = math.degrees(1.0), parameters.initial_std_misalignment, parameters.fine_std_misalignment
+        unit, prior = math.degrees(1.0), parameters.initial_std_misalignment
     missing = (each.missing for each in estimate.observability if each.axis == found.name and each.missing)
     needs = "" if found.shown else next(missing, MODELS[estimate.model].shown_by[found.name])
-    way = math.log(prior * unit / max(found.std, 1e-12)) / math.log(prior / fine)
+    fine = PredictedDrift.goals(parameters).side / KM
+    way = math.log(prior * unit / max(found.std, 1e-12)) / max(math.log(prior / fine), 1e-9)
     return Shown(found.name, found.unit.strip(), found.std, min(1.0, max(0.0, way)), needs)

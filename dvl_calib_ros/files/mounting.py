@@ -190,9 +190,7 @@ def _objections_and_doubts(
     if convergence is Convergence.COLLECTING:
         objections.append("no angle and no scale is observable in its data yet (collecting)")
     elif convergence is Convergence.COARSE:
-        doubts.append(
-            "its convergence is coarse: standard deviations are above fine_std_misalignment or fine_std_scale"
-        )
+        doubts.append("its convergence is coarse: the drift that it leaves open is above target_drift")
     if verification is None:
         doubts.append("it is not verified on held-out data; `dvl-calib replay` of a recording does that")
         return tuple(objections), tuple(doubts)

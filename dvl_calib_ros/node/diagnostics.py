@@ -18,7 +18,6 @@ from ..calibration.checks.data_warnings import (
     reference_warnings,
 )
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale
-from ..calibration.filters.observability import Convergence
 from ..calibration.models import MODELS
 from ..calibration.models.base import Needs
 from ..calibration.models.parameters import Parameters
@@ -188,7 +187,7 @@ def diagnose(
         "gnss available": str(int(selection.gnss.available)),
         "convergence": estimate.convergence.value,
         "verdict": verdict.value,
-        "usable": "no" if verdict is Severity.REJECT or estimate.convergence is Convergence.COLLECTING else "yes",
+        "usable": "no" if verdict is Severity.REJECT else "yes",
         **_estimate_values(estimate),
         **_scale_and_delay_values(estimate, calibrator.parameters),
         **_count_values(calibrator, estimate, counts),

@@ -12,16 +12,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..calibration.assessment.manoeuvre_planner import (
-    KM,
     Outlook,
-    PredictedDrift,
     RecentMotion,
     is_good_enough,
     noise_of_a_second,
     outlook,
-    predicted_drift,
 )
 from ..calibration.calibrator import Calibrator
+from ..calibration.filters.observability import KM, PredictedDrift, predicted_drift
 from ..calibration.models import MODELS
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.results import Estimate, corrected_rpy, rpy_std, scale_and_delay
@@ -203,9 +201,10 @@ class Card:
         elif found.next.code != "NEXT_WAIT":  # a standing vehicle keeps its last prediction
             remaining = self._remaining.look(found.seconds, drift.both, self._shown_s)
         unknown = KM * parameters.initial_std_misalignment, KM * parameters.initial_std_scale
+        goal = PredictedDrift.goals(parameters)
         goals = {
-            "side": _progress_percent(drift.side, unknown[0], target / math.sqrt(2.0)),
-            "ahead": _progress_percent(drift.ahead, unknown[1], target / math.sqrt(2.0)),
+            "side": _progress_percent(drift.side, unknown[0], goal.side),
+            "ahead": _progress_percent(drift.ahead, unknown[1], goal.ahead),
             "worth": 100.0 if worth.is_good else min(_progress_percent(drift.both, math.hypot(*unknown), target), 99.0),
         }
         return {

@@ -11,7 +11,7 @@ from ..verdict.kinds import Severity
 from .document import Answer, Columns, Commands, Document, FindingLine, Section, Sentence, bar, table_by
 from .numbers import options, typed
 
-SHOWN_NOTE = "A full bar is fine (fine_std_misalignment, fine_std_scale); red is not observable, yellow is between."
+SHOWN_NOTE = "A full bar is fine (target_drift); red is not observable, yellow is between."
 ANSWERS = {
     "yes": (Severity.ACCEPT, "This recording can calibrate the DVL."),
     "partly": (Severity.MARGINAL, "This recording can calibrate a part of the DVL's errors."),

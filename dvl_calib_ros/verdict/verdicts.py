@@ -17,7 +17,7 @@ _KINDS = (
         "NO_SAMPLE_USED",
         "no sample was used",
         "No reference, no attitude, or every sample was refused.",
-        "there is nothing to apply; the model `full` needs 25 s of data",
+        "there is nothing to apply",
         Severity.REJECT,
     ),
     Kind(
@@ -39,6 +39,13 @@ _KINDS = (
         "none of the angles is observable in the data yet",
         "σ of each angle is still that of the prior: drive more.",
         "",
+        Severity.REJECT,
+    ),
+    Kind(
+        "DRIFT_OPEN",
+        "the calibration leaves {open:.0f} m of drift per km open (1σ), more than {limit:.0f}",
+        "The data determine the calibration badly; five times `target_drift` is accepted.",
+        "drive on: other headings, other speeds, turns to both sides",
         Severity.MARGINAL,
     ),
     # estimated values

@@ -82,7 +82,7 @@ def without_numbers(document, numbers):
 def test_the_demo_bag_holds_the_truth_within_four_standard_deviations():
     """Of the angles: the scale of M3 is pulled down by noise in the reference, as documented."""
     from dvl_calib_ros.bag_replay.replay import replay
-    from dvl_calib_ros.calibration.assessment.manoeuvre_planner import predicted_drift
+    from dvl_calib_ros.calibration.filters.observability import predicted_drift
     from dvl_calib_ros.calibration.models import MODELS
     from dvl_calib_ros.calibration.models.parameters import Parameters
     from dvl_calib_ros.cli.demo import BAG, MISALIGNMENT_DEG, SCALE_PERCENT

@@ -330,7 +330,7 @@ def test_models_are_switched_by_parameter_at_once_and_a_late_subscriber_gets_the
         ("gnss_timeout", 5.0, "read-only"),
         ("gnss_hysteresis", -1.0, ""),
         ("gnss_hysteresis", "long", "type"),
-        ("fine_std_scale", float("nan"), ""),
+        ("target_drift", float("nan"), ""),
         ("result_file", "/no/such/folder/r.yaml", "at run time"),
         ("no_such_parameter", 1.0, ""),
     ],

@@ -22,7 +22,7 @@ def test_parameters_of_a_running_node_are_listed_read_and_set(world, capsys, mon
         assert succeed(capsys, "param", "get", "lever_arm")[0].startswith("lever_arm: [0.0, 0.0, 0.0]")
         assert succeed(capsys, "param", "set", "model", "M4")[0] == "model: M4\n"
         assert node.get_parameter("model").value == "M4" and node._calibrator.selected == "M4"
-        assert "0.0087" in succeed(capsys, "param", "set", "fine_std_misalignment", "0.5deg")[0]
+        assert "target_drift: 3.5" in succeed(capsys, "param", "set", "target_drift", "3.5")[0]
         assert "dvl_type" in fail(capsys, "param", "set", "dvl_type", "geometry_msgs/msg/TwistStamped")
         assert "result_file" in fail(capsys, "param", "set", "result_file", "/etc/r.yaml")
 

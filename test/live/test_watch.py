@@ -289,7 +289,7 @@ def test_progress_goes_from_the_prior_to_fine_by_the_logarithm(name):
     for entry in observability(MODELS[name], covariance, parameters):
         angle = entry.name.startswith("phi")
         prior = parameters.initial_std_misalignment if angle else parameters.initial_std_scale
-        fine = parameters.fine_std_misalignment if angle else parameters.fine_std_scale
+        fine = 1e-3 * parameters.target_drift / math.sqrt(2.0)  # of an angle, rad, or a scale
         expected = math.log(prior / entry.std) / math.log(prior / fine)
         assert entry.progress == pytest.approx(min(max(expected, 0.0), 1.0))
     first = calibrate([]).estimate(name)

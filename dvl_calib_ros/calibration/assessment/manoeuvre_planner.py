@@ -1,8 +1,7 @@
-"""Predicted drift of dead reckoning, and the manoeuvre that reduces it most.
+"""Manoeuvre that reduces the predicted drift of dead reckoning most.
 
-Errors of yaw and scale move a vehicle off a straight leg, to the side and ahead. The drift is predicted from this
-recording's covariance, because no manoeuvre reduces day-to-day variation. A manoeuvre's information comes from the
-model's H and noise on its motion, and is added to the present information.
+The drift is predicted from this recording's covariance, because no manoeuvre reduces day-to-day variation. A
+manoeuvre's information comes from the model's H and noise on its motion, and is added to the present information.
 """
 
 from __future__ import annotations
@@ -13,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
+from ..filters.observability import KM, drift_rows, predicted_drift
 from ..models import MODELS, Model
 from ..models.base import Assumptions, Observations
 from ..models.parameters import Parameters
-from ..numerics.frames import FLU_FROM_FRD, Array, rotation_from_quaternion, skew
+from ..numerics.frames import FLU_FROM_FRD, Array, rotation_from_quaternion
 from ..numerics.samples import FRAME_CODES, VelocityFrame
 from ..results.results import Estimate
 from ..streams.aligner import Aligner
 
-KM = 1000.0
 # Duration and sample interval of a manoeuvre, s, and largest number of manoeuvres.
 TRIED_S, STEP_S, MOST = 60.0, 2.0, 30
 CIRCLE_RADPS, EIGHT_RADPS = math.radians(6.0), math.radians(12.0)
@@ -46,14 +45,6 @@ class RecentMotion(NamedTuple):
     noise: float
 
 
-class PredictedDrift(NamedTuple):
-    """Predicted drift on a straight leg, m per km, 1σ: to the side, ahead (nan without scale), and both together."""
-
-    side: float
-    ahead: float
-    both: float
-
-
 class Outlook(NamedTuple):
     """Next manoeuvre, and time until the drift is within its target, s; None if it is already or never will be."""
 
@@ -61,24 +52,9 @@ class Outlook(NamedTuple):
     seconds: float | None
 
 
-def predicted_drift(model: Model, covariance: Array, parameters: Parameters) -> PredictedDrift:
-    """Return the drift due to a model's covariance (n, n)."""
-    rows = _rows(model, parameters)
-    side, ahead = (KM * math.sqrt(max(float(row @ covariance @ row), 0.0)) for row in rows)
-    return PredictedDrift(side, ahead if model.scale_axes else math.nan, math.hypot(side, ahead))
-
-
 def drift_left_open(estimate: Estimate, parameters: Parameters) -> float:
     """Return the predicted drift (m per km, σ) of an estimate, at the speeds driven."""
     return predicted_drift(MODELS[estimate.model], estimate.velocity_covariance, parameters).both
-
-
-def _rows(model: Model, parameters: Parameters) -> Array:
-    """Return derivatives (2, n) of port and forward velocity, per m/s forward, by the states of a model."""
-    t = parameters.rotation_dvl_from_body
-    by_terms = t.T @ np.hstack([-skew(t[:, 0]), np.diag(t[:, 0])])
-    rows: Array = by_terms[[1, 0]] @ model.error_terms_from_state
-    return rows
 
 
 def is_good_enough(model: Model) -> Reason:
@@ -106,7 +82,7 @@ def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, be
     before: the last suggestion, kept unless another is clearly better.
     """
     model = MODELS[estimate.model]
-    target, rows = parameters.target_drift, _rows(model, parameters)
+    target, rows = parameters.target_drift, drift_rows(model, parameters)
     now = predicted_drift(model, estimate.velocity_covariance, parameters)
     if now.both <= target:
         return Outlook(is_good_enough(model), None)

@@ -7,6 +7,7 @@ advanced by SOLVED_WITHIN_NS, so a live run and a replay agree at any machine sp
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -258,16 +259,28 @@ class FullEstimator(Estimator):
 
     @contextmanager
     def settled(self) -> Iterator[None]:
-        """Let all complete blocks take effect inside this context, for results that do not depend on later samples."""
-        told = self._told
+        """Let all samples so far take effect inside this context, as if the run ended here.
+
+        Blocks that are not complete yet are solved in a copy, because later samples belong to them.
+        """
+        if self._is_settled:
+            yield
+            return
+        told, solver, starts_ns = self._told, self._solver, [*self._day_starts_ns]
         self._last_told, self._is_settled = self._newest(), True
         try:
+            if incomplete := [self._copied(block_ns, is_last=True) for block_ns in self._incomplete()]:
+                self._solver = copy.deepcopy(solver)
+                self._last_told = self._solver.solve(incomplete)[-1]
             yield
         finally:
             self._last_told, self._is_settled = told, False
+            self._solver, self._day_starts_ns = solver, starts_ns
 
     def _newest(self) -> Outcome:
         """Wait for the last complete block and return its result."""
+        if self._is_settled:
+            return self._last_told
         self._solve_gathered()
         if not self._coming:
             return self._last_told
@@ -300,14 +313,27 @@ class FullEstimator(Estimator):
         )
 
     def finish(self) -> None:
-        """Let all complete blocks take effect after the last sample."""
+        """Let all blocks take effect after the last sample."""
+        for block_ns in self._incomplete():
+            self._submit(block_ns, is_last=True)
+            self._block_ns = block_ns + BLOCK_NS
         self.settle()
         while self._coming:
             self._let_take_effect(self._coming[-1][0])
 
-    def _submit(self, block_ns: int) -> None:
-        """Solve a block now, or gather it."""
-        block = self._copied(block_ns)
+    def _incomplete(self) -> list[int]:
+        """Return the starts of the blocks with a reference that wait for later samples."""
+        track = self._aligner.reference
+        if self._block_ns is None:
+            return []
+        self.take_rows()
+        stamps_ns = track.stamps_ns[track.begin : track.size]
+        starts_ns = stamps_ns[stamps_ns >= self._block_ns] // BLOCK_NS * BLOCK_NS
+        return sorted(set(starts_ns.tolist()))
+
+    def _submit(self, block_ns: int, *, is_last: bool = False) -> None:
+        """Solve a block now, or gather it. is_last: whether the run has ended."""
+        block = self._copied(block_ns, is_last=is_last)
         from_ns = block.end_ns + self._wait_ns + SOLVED_WITHIN_NS
         if self._together == 1:  # live, other threads may read the results meanwhile
             self._solve([block], [from_ns])
@@ -344,8 +370,8 @@ class FullEstimator(Estimator):
         finally:
             self._is_telling = False
 
-    def _copied(self, block_ns: int) -> Block:
-        """Copy a block with its margins from the aligner."""
+    def _copied(self, block_ns: int, *, is_last: bool = False) -> Block:
+        """Copy a block with its margins from the aligner. is_last: whether the run has ended."""
         dvl, reference, imu = self._dvl, self._aligner.reference, self._aligner.imu
         end_ns = block_ns + BLOCK_NS
         from_ns, to_ns = block_ns - MARGIN_NS, end_ns + MARGIN_NS
@@ -355,7 +381,7 @@ class FullEstimator(Estimator):
             block_ns,
             end_ns,
             self._new_days(block_ns),
-            self._dvl_is_silent(end_ns),
+            not is_last and self._dvl_is_silent(end_ns),
             DvlSamples(dvl.stamps_ns[rows].copy(), dvl.velocity[rows].copy(), dvl.covariance[rows].copy()),
             ReferenceSamples(
                 reference.stamps_ns[at], reference.values[at], reference.frames[at], reference.unmeasured[at]

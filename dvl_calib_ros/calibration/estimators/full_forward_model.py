@@ -71,6 +71,10 @@ class FitBlock:
     measured: Mask
     fold: NDArray[np.int64]
 
+    def __deepcopy__(self, _: object) -> FitBlock:
+        """Return the block itself, which nobody changes."""
+        return self
+
     @cached_property
     def suspicious(self) -> Index:
         """Indices of samples of a slow DVL that deviate from interpolation, more than their neighbours do."""

@@ -1,4 +1,7 @@
-"""Observability of the parameters by the data so far, missing motions, and convergence."""
+"""Observability of the parameters by the data so far, missing motions, predicted drift, and convergence.
+
+Errors of yaw and scale move a vehicle off a straight leg, to the side and ahead.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,10 @@ import numpy as np
 
 from ..models import Model
 from ..models.parameters import Parameters
-from ..numerics.frames import Array
+from ..numerics.frames import Array, skew
 from .filter_setup import prior
+
+KM = 1000.0
 
 # Largest share of the prior σ of an observable parameter: its data then hold three times the prior information.
 OBSERVED_SHARE = 0.5
@@ -25,11 +30,25 @@ MEASURES_VERTICAL = "a reference that measures the vertical velocity"
 
 
 class Convergence(Enum):
-    """Progress of a calibration."""
+    """Progress of a calibration: nothing is observable, something is, the drift is within `target_drift`."""
 
     COLLECTING = "collecting"
     COARSE = "coarse"
     FINE = "fine"
+
+
+class PredictedDrift(NamedTuple):
+    """Predicted drift on a straight leg, m per km, 1σ: to the side, ahead (nan without scale), and both together."""
+
+    side: float
+    ahead: float
+    both: float
+
+    @staticmethod
+    def goals(parameters: Parameters) -> PredictedDrift:
+        """Return the drift at `target_drift`, shared equally by both directions."""
+        each = parameters.target_drift / math.sqrt(2.0)
+        return PredictedDrift(each, each, parameters.target_drift)
 
 
 class Observability(NamedTuple):
@@ -60,16 +79,15 @@ def observability(
     """
     prior_std = np.sqrt(np.diag(prior(model, parameters).p))
     in_body = body_angle_std(covariance, parameters)
+    fine_std = PredictedDrift.goals(parameters).side / KM  # of an angle in rad, of a scale
     entries = []
     for index, name in enumerate(model.state_names[: model.n_errors]):
         std = math.sqrt(covariance[index, index])
         observed = bool(std <= OBSERVED_SHARE * prior_std[index])
         if index < 3:  # row i of T is the i-th DVL axis in the body
             axis = _BODY_AXES[int(np.argmax(np.abs(parameters.rotation_dvl_from_body[index]) * in_body))]
-            fine_std = parameters.fine_std_misalignment
         else:
             axis = _scale_axis(model, index, parameters)
-            fine_std = parameters.fine_std_scale
         missing = "" if observed else tilt_needs if tilt_needs and axis in _BODY_AXES[:2] else model.shown_by[axis]
         entries.append(Observability(name, std, observed, axis, missing, _progress(std, prior_std[index], fine_std)))
     for index, name in enumerate(model.state_names[model.n_errors :], start=model.n_errors):
@@ -112,8 +130,23 @@ def scale_std_ahead(model: Model, covariance: Array, parameters: Parameters) -> 
     return np.sqrt(np.array([ahead @ covariance @ ahead]))
 
 
+def predicted_drift(model: Model, covariance: Array, parameters: Parameters) -> PredictedDrift:
+    """Return the drift due to a model's covariance (n, n)."""
+    rows = drift_rows(model, parameters)
+    side, ahead = (KM * math.sqrt(max(float(row @ covariance @ row), 0.0)) for row in rows)
+    return PredictedDrift(side, ahead if model.scale_axes else math.nan, math.hypot(side, ahead))
+
+
+def drift_rows(model: Model, parameters: Parameters) -> Array:
+    """Return derivatives (2, n) of port and forward velocity, per m/s forward, by the states of a model."""
+    t = parameters.rotation_dvl_from_body
+    by_terms = t.T @ np.hstack([-skew(t[:, 0]), np.diag(t[:, 0])])
+    rows: Array = by_terms[[1, 0]] @ model.error_terms_from_state
+    return rows
+
+
 def convergence(model: Model, covariance: Array, parameters: Parameters) -> Convergence:
-    """Return the convergence of a model. Fine: an angle is observed; observed angles and scale are below thresholds.
+    """Return the convergence of a model by its covariance (n, n) for velocities of this recording.
 
     Angles are about body axes, the ones a motion makes observable. The scale is that for motion ahead, because other
     axes may never be observable.
@@ -124,5 +157,5 @@ def convergence(model: Model, covariance: Array, parameters: Parameters) -> Conv
     observed_scales = scales <= OBSERVED_SHARE * parameters.initial_std_scale
     if not observed_angles.any() and not observed_scales.any():
         return Convergence.COLLECTING
-    angles_fine = observed_angles.any() and (angles[observed_angles] < parameters.fine_std_misalignment).all()
-    return Convergence.FINE if angles_fine and (scales < parameters.fine_std_scale).all() else Convergence.COARSE
+    is_fine = predicted_drift(model, covariance, parameters).both <= parameters.target_drift
+    return Convergence.FINE if is_fine else Convergence.COARSE

@@ -442,28 +442,13 @@ class Parameters:
         low=15.0,
         high=1e9,
     )
-    fine_std_misalignment: float = _parameter(
-        0.0017453292519943296,
-        "The estimate is fine once each observable angle's standard deviation is below this (0.1°) ...",
-        unit="rad",
-        low=1e-6,
-        high=1.0,
-        read_only=False,
-    )
-    fine_std_scale: float = _parameter(
-        0.001,
-        "... and the scale's below this.",
-        low=1e-7,
-        high=0.5,
-        read_only=False,
-    )
     discover: bool = _parameter(
         True,
         "Look for DVL, reference and IMU in all topics while the DVL's is silent and not remapped.",
     )
     target_drift: float = _parameter(
         2.0,
-        "Predicted drift that the live view calls good enough.",
+        "Predicted drift of a fine calibration: good enough. Up to five times it is accepted.",
         unit="m/km",
         low=0.01,
         high=1000.0,

@@ -110,13 +110,13 @@ def make_motion(
     measured: tuple[bool, bool, bool],
     imu: ImuColumns,
 ) -> MotionStreams | None:
-    """Return a motion without velocity spikes, or None if too few samples remain.
+    """Return a motion without velocity spikes, or None if too few samples remain or no axis is measured.
 
     dvl, reference: increasing times (N,) s and velocities (N, 3) m/s.
     """
     times, velocity = _cleaned(*dvl)
     reference_times, seen = _cleaned(*reference)
-    if min(len(times), len(reference_times)) < 2:
+    if min(len(times), len(reference_times)) < 2 or not any(measured):
         return None
     return MotionStreams(DvlColumns(times, velocity), reference_times, seen, in_earth, measured, imu, TurnRates.of(imu))
 

@@ -23,6 +23,9 @@ from ..numerics.kalman import GaussianState
 from ..numerics.tests import chi2_isf
 from .results import Verification
 
+# Drift that an accepted calibration may leave open, in `target_drift`: 1 % of distance by default, which a mounting by
+# hand (0.5°) has.
+ACCEPTED_DRIFT = 5.0
 # Significant growth of the squared error in variances of the estimate: above 99 % of chi-square per degree of freedom,
 # with three and more.
 WORSE_FROM = 4.0
@@ -53,6 +56,7 @@ def verify(
     finds_lever_arm: bool = False,
     typical_error: float | None = None,
     own_error: float = 0.0,
+    drift_open: float = 0.0,
 ) -> Verification:
     """Judge an estimate of all data by its size, its used samples, and its held-out error.
 
@@ -70,6 +74,7 @@ def verify(
     finds_lever_arm: True if the σ of the angles include the lever arm.
     typical_error: Velocity error without outliers, m/s rms, if the held-out one is large.
     own_error: Velocity error predicted by σ of time blocks, m/s rms (`calibration_error`).
+    drift_open: Drift that the calibration leaves open, m per km (`drift_left_open`).
     """
     reasons = by_severity(
         [
@@ -78,7 +83,7 @@ def verify(
             *use_findings(used_and_gated),
             *_lever_arm_findings(lever_arm_turns, finds_lever_arm, parameters),
             *_size_findings(model, state, parameters),
-            *_convergence_findings(convergence),
+            *_drift_findings(convergence, drift_open, parameters),
             _error_finding(held_out, parameters, reference_claims, typical_error, own_error),
         ]
     )
@@ -184,8 +189,11 @@ def _error_finding(
     return finding("HELD_OUT", **said)
 
 
-def _convergence_findings(convergence: Convergence) -> list[Reason]:
-    return [finding("NO_ANGLE_SHOWN")] if convergence is Convergence.COLLECTING else []
+def _drift_findings(convergence: Convergence, drift_open: float, parameters: Parameters) -> list[Reason]:
+    if convergence is Convergence.COLLECTING:
+        return [finding("NO_ANGLE_SHOWN")]
+    limit = ACCEPTED_DRIFT * parameters.target_drift
+    return [] if drift_open <= limit else [finding("DRIFT_OPEN", open=drift_open, limit=limit)]
 
 
 def verification_document(verification: Verification) -> dict[str, Any]:

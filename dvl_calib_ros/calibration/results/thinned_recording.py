@@ -25,12 +25,16 @@ NOT_MEASURED, MEASURED_BELOW = 1e6, 1e4
 
 
 class ThinnedBlock(NamedTuple):
-    """Thinned columns of one block, for verification; times in s since the epoch of `DelayFilter`."""
+    """Thinned columns of one block, for verification; times in s since an epoch."""
 
     dvl: DvlColumns
     noise_dvl: Array
     reference: ReferenceColumns
     imu: ImuColumns
+
+    def __deepcopy__(self, _: object) -> ThinnedBlock:
+        """Return the block itself, which nobody changes."""
+        return self
 
     @staticmethod
     def between(

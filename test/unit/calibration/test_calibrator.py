@@ -586,7 +586,7 @@ def test_a_dvl_at_45_degrees_lacks_roll_not_pitch_on_a_straight_leg():
 
 def test_convergence_goes_from_collecting_over_coarse_to_fine():
     samples = make_samples(variant(NOISY, trajectory="straight", seconds=150, gnss_std=0.02))
-    parameters = Parameters(gnss_aided_std=0.02, fine_std_misalignment=0.003)
+    parameters = Parameters(gnss_aided_std=0.02, target_drift=4.0)
     calibrator = Calibrator(parameters, block_size=64)
     seen = [calibrator.estimate("M3").convergence.value]
     for start in range(0, len(samples), 50):

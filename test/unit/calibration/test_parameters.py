@@ -17,7 +17,7 @@ CONTRACT = {
     "initial_std_misalignment": 0.05, "initial_std_scale": 0.006, "process_std_misalignment": 0.0,
     "process_std_scale": 0.0, "use_message_covariance": True, "gnss_aided_std": 0.2, "gnss_free_std": 0.025,
     "prior_source": "fixed", "prior_window": 2.0, "prior_sway_heave": (0, 0), "gate_probability": 0.999,
-    "min_speed": 0.3, "max_turn_rate": 0.0, "fine_std_misalignment": 0.0017453292519943296, "fine_std_scale": 0.001,
+    "min_speed": 0.3, "max_turn_rate": 0.0,
     "result_file": "", "initial_calibration": "",
 }  # fmt: skip
 

@@ -127,9 +127,10 @@ def test_verification_does_not_depend_on_how_samples_are_gathered(block_size):
     assert other.corrected == pytest.approx(one.corrected, rel=1e-9)
 
 
-def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, std=1e-3, own_error=0.0, **parameters):
+def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, std=1e-3, own_error=0.0, open=0.0, **parameters):
     state = GaussianState(np.array([0.0, np.tan(np.deg2rad(degrees)), 0.0, scale]), std**2 * np.eye(4))
-    return verify(MODELS["M3"], state, convergence, held_out, Parameters(**parameters), own_error=own_error)
+    p = Parameters(**parameters)
+    return verify(MODELS["M3"], state, convergence, held_out, p, own_error=own_error, drift_open=open)
 
 
 def test_an_angle_or_a_scale_that_is_not_known_is_no_misalignment_and_no_scale_that_is_off():
@@ -181,7 +182,10 @@ def test_an_angle_or_a_scale_that_is_not_known_is_no_misalignment_and_no_scale_t
         ({"held_out": HeldOutError(1000, 0.10, 0.0501, 0.05, 0.002)}, Severity.ACCEPT, "HELD_OUT"),
         ({"held_out": HeldOutError(1000, 0.0500, 0.0501, 0.0501, 0.002)}, Severity.ACCEPT, "HELD_OUT"),
         ({"held_out": None}, Severity.MARGINAL, "HELD_OUT_TOO_FEW"),
-        ({"convergence": Convergence.COLLECTING}, Severity.MARGINAL, "NO_ANGLE_SHOWN"),
+        ({"convergence": Convergence.COLLECTING}, Severity.REJECT, "NO_ANGLE_SHOWN"),
+        ({"convergence": Convergence.COARSE, "open": 9.9}, Severity.ACCEPT, "HELD_OUT"),
+        ({"convergence": Convergence.COARSE, "open": 10.1}, Severity.MARGINAL, "DRIFT_OPEN"),
+        ({"open": 10.1, "target_drift": 3.0}, Severity.ACCEPT, "HELD_OUT"),
         ({"degrees": 3.0, "scale": 0.06}, Severity.REJECT, "SCALE_LARGE"),
     ],
 )

@@ -10,14 +10,13 @@ import pytest
 from runs import ONE_HERTZ, MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.assessment.manoeuvre_planner import (
-    KM,
     RecentMotion,
     _information,
     _manoeuvres,
     noise_of_a_second,
     outlook,
-    predicted_drift,
 )
+from dvl_calib_ros.calibration.filters.observability import KM, predicted_drift
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy, skew

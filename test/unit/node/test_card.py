@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from runs import MatchedRun, calibrate, make_samples
 
-from dvl_calib_ros.calibration.assessment.manoeuvre_planner import PredictedDrift, predicted_drift
 from dvl_calib_ros.calibration.calibrator import Calibrator
+from dvl_calib_ros.calibration.filters.observability import PredictedDrift, predicted_drift
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.node.operator_card import (
