@@ -361,6 +361,13 @@ FINDINGS = (
         "subtract the bias in the driver, or have the DVL serviced",
     ),
     Kind(
+        "BEAM_OFF",
+        "one beam of the DVL is off by {percent:.0f} ± {std:.0f} %: that at {azimuth:.0f}° from its x axis to port "
+        "reads low, or the opposite one high",
+        "A fouled or damaged transducer, or bubbles before it; roll and yaw of the mounting are then wrong.",
+        "look at that transducer; a DVL that gives beam velocities can solve without it",
+    ),
+    Kind(
         "BED_MOVES",
         "moving bed: over ground the reference is {millimetres:.0f} mm/s faster than the DVL towards {course:.0f}°, "
         "on every heading",

@@ -182,7 +182,7 @@ def dead_reckoned(
         error_before=before.in_body[use[kept]],
         error_after=after.in_body[use[kept]],
         deviation=heading_deviation(after.yaw[use], heading) if on_a_map and heading is not None else None,
-        followed=_followed(recording, after, use) if on_a_map else None,
+        followed=_followed(recording, after, use, parameters) if on_a_map else None,
     )
 
 
@@ -225,11 +225,12 @@ class _Level(NamedTuple):
                 level[some, 2:] = np.matmul(seen.rotation_enu_from_body, body[..., None])[:, :2, 0]
 
 
-def _followed(recording: ThinnedRecording, after: _Level, use: Index) -> ResidualTrend | None:
+def _followed(recording: ThinnedRecording, after: _Level, use: Index, p: Parameters) -> ResidualTrend | None:
     """Return `residual_trend` of the samples in use."""
     rotation, velocity, error, rates = (each[use] for each in after.whole)
     interval_s = float(median(np.diff(recording.reference.times)))
-    return residual_trend(recording.dvl.times[use], rotation, velocity, error, rates, interval_s)
+    times, nominal = recording.dvl.times[use], p.rotation_dvl_from_body
+    return residual_trend(times, rotation, velocity, error, rates, interval_s, nominal)
 
 
 def _steps(times: Array) -> Array:

@@ -1,9 +1,10 @@
 """Tests whether the residual velocity follows a signal that no mounting makes.
 
-The residual is the reference minus the corrected DVL. Least squares tests it against three signals, together with all
+The residual is the reference minus the corrected DVL. Least squares tests it against four signals, together with all
 errors that a calibration may leave. If it follows tilt, the DVL's velocity does not rotate with the IMU's attitude (a
 driver that levels it, a wrong sign). If it is constant at every speed, the DVL has a bias. If it follows the second
-derivative of the velocity, one of the two is smoothed. All three bias the angles beyond their σ.
+derivative of the velocity, one of the two is smoothed. If it follows the velocity along one beam, that beam has a scale
+error. All four bias the angles beyond their σ.
 
 If it follows the DVL's earlier noise, the reference is a filter's output with that DVL as input. With d = s + n of the
 DVL and r = s + m of an independent instrument, r - d = m - n, and no earlier d predicts white noise n. A filter that
@@ -44,7 +45,7 @@ SURELY, SURELY_SMOOTHED, SURELY_BIASED, NAMED_FROM = 6.0, 5.0, 4.2, 3.7
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
 # about the earth's vertical (rad), which differs from yaw when the vehicle tilts. BY_HEADING: heading errors with one
 # and two cycles of the heading (rad), similar to a bias but not to fast signals.
-KNOWN: Array = np.array([0.05] * 3 + [0.02] * 2 + [1.0] * 3 + [0.3] + [0.01] * 3 + [0.1])
+KNOWN: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2)
 # Prior σ of the tested signals: shares of tilt, and second derivative (s²); DVL bias (m/s), tested on means over MEAN_S
 # (s).
@@ -55,7 +56,7 @@ LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
 # the cause: an inertial navigation at sea (recording T09) had an error of 0.054.
 BED_STD_MPS, MOVES_FROM_MPS = 1.0, 0.08
 # Columns of the reference error, east and north, in `KNOWN`.
-OVER_GROUND = slice(9, 11)
+OVER_GROUND = slice(10, 12)
 # Share of the second derivative that means over `MEAN_S` must keep for the smoothing test.
 LEAST_OF_BEND = 0.3
 # σ of the missing share of tilt above which it may be the whole tilt.
@@ -69,6 +70,10 @@ WRONG_SIGN_FROM = 1.6
 SAID_FROM, WRONG_FROM, WITHIN = math.radians(0.2), math.radians(0.5), 2.0
 # Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
+# Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
+BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
+# Scale error of a beam from which it is reported, and from which a calibration is rejected: 10 m of drift per km.
+BEAM_SAID_FROM, BEAM_WRONG_FROM = 0.02, 0.03
 # Residual, relative to the median, beyond which it is an outlier; number of iterations.
 OUTLYING, ROUNDS = 4.0, 3
 # Smallest noise of the residual, m/s.
@@ -100,8 +105,9 @@ class ResidualTrend(NamedTuple):
     wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
     of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
     circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: memory, s, the most
-    significant of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
-    heading; 0 if the residual holds less than half of it.
+    significant of `FORGOTTEN_S`. beam, beam_std: share by which one beam reads low; beam_deg: its azimuth in the DVL.
+    over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every heading; 0 if the residual
+    holds less than half of it.
     """
 
     tilt: Array
@@ -117,6 +123,9 @@ class ResidualTrend(NamedTuple):
     circular_s: float
     over_ground: Array
     over_ground_std: Array
+    beam: float
+    beam_std: float
+    beam_deg: float
 
 
 class _Fit(NamedTuple):
@@ -138,7 +147,13 @@ class _Fit(NamedTuple):
 
 
 def residual_trend(
-    time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
+    time: Array,
+    rotation_enu_from_body: Array,
+    velocity: Array,
+    error: Array,
+    rates: Array,
+    interval_s: float = 0.0,
+    rotation_dvl_from_body: Array | None = None,
 ) -> ResidualTrend | None:
     """Fit the residual velocity; None for too little data.
 
@@ -149,6 +164,7 @@ def residual_trend(
     velocity, error: (N, 3) m/s, of the reference, and reference minus corrected DVL, body.
     rates: (N, 3) rad/s, body.
     interval_s: sample interval of the reference, which is interpolated linearly, s.
+    rotation_dvl_from_body: (3, 3) nominal mounting; None for the unit matrix.
     """
     if len(time) < 3 or time[-1] - time[0] < ENOUGH * STRETCH_S:
         return None
@@ -212,19 +228,44 @@ def residual_trend(
     return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
         *_circular(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
+        *_beam(fast, both, moving, np.eye(3) if rotation_dvl_from_body is None else rotation_dvl_from_body),
     )  # fmt: skip
 
 
 def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
-    """Return nuisance columns (N, 3, 13) from velocity, turn rate and acceleration (N, 3), body axes."""
+    """Return nuisance columns (N, 3, 14) from velocity, turn rate and acceleration (N, 3), body axes."""
     known = np.zeros((len(moving), 3, len(KNOWN)))
     known[:, :, :3] = skew(moving)
-    known[:, 0, 3], known[:, 1, 4] = moving[:, 0], moving[:, 1]
-    known[:, :, 5:8] = skew(rates)
-    known[:, :, 8] = slope
-    known[:, :, 9:12] = body_from_enu
-    known[:, :, 12] = cross(moving, body_from_enu[:, :, 2])
+    known[:, [0, 1, 2], [3, 4, 5]] = moving
+    known[:, :, 6:9] = skew(rates)
+    known[:, :, 9] = slope
+    known[:, :, 10:13] = body_from_enu
+    known[:, :, 13] = cross(moving, body_from_enu[:, :, 2])
     return known
+
+
+def _beam(fit: _Fit, columns: Array, moving: Array, rotation_dvl_from_body: Array) -> tuple[float, float, float]:
+    """Return the most significant share by which one beam reads low, its σ, and its azimuth in the DVL, degrees.
+
+    The velocity is the least-squares solution of four beams. A beam that reads high looks like the opposite one that
+    reads low, but for scales. columns: (N, 3, n) of the fit. moving: (N, 3) m/s, body.
+    """
+    t, weight, found = rotation_dvl_from_body, fit.weight, []
+    flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)
+    few = of_few(np.array([len(fit.starts) - 1.0]))[0]
+    for degrees in AZIMUTHS_DEG:
+        along = math.radians(degrees)
+        beam = np.array([flat * math.cos(along), flat * math.sin(along), -down])
+        solution = beam / [2.0 * flat**2, 2.0 * flat**2, 4.0 * down**2]
+        low = moving @ (t.T @ np.outer(solution, beam) @ t).T
+        alone = low - columns @ (fit.p @ np.einsum("n,nij,ni->j", weight, columns, low))
+        square = max(float(np.einsum("n,ni,ni->", weight, alone, alone)), 1e-12)
+        share = float(np.einsum("n,ni,ni->", weight, alone, fit.rest)) / square
+        rest = fit.rest - share * alone
+        scores = np.add.reduceat(weight * (alone * rest).sum(axis=1), fit.starts) / square
+        std = few * float(_std(scores[None], QUICK_STRETCHES)[0])
+        found.append((abs(share), std, (degrees + 180.0 * (share < 0.0)) % 360.0))
+    return max(found, key=lambda each: each[0] / each[1])
 
 
 def _beside(time: Array, values: Array, starts: Index) -> Array:
@@ -325,6 +366,10 @@ def residual_warnings(
             said.append(found_tilt.weighed(word))
         elif std > TILT_SHOWN and abs(float(found.lean[axis])) > WRONG_FROM:
             said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
+    if found.beam > max(SURELY_BIASED * found.beam_std, BEAM_SAID_FROM):
+        word = Severity.REJECT if found.beam - found.beam_std > BEAM_WRONG_FROM else Severity.MARGINAL
+        percent, std = 100.0 * found.beam, 100.0 * found.beam_std
+        said.append(finding("BEAM_OFF", percent=percent, std=std, azimuth=found.beam_deg).weighed(word))
     size = np.abs(found.bias)
     shown = (size > NAMED_FROM * found.bias_std) & (size > SAID_FROM * found.speed)
     if shown.any():

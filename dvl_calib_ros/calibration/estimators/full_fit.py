@@ -11,13 +11,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
 
 from ..filters.cross_validation import FOLDS, HeldOutError
-from ..models.own import BIAS, DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, SCALE
+from ..models.own import (
+    BIAS,
+    DELAY,
+    FULL,
+    HEADING,
+    LEVER_ARM,
+    N_STATE,
+    PHI,
+    REFERENCE_DELAY,
+    REFERENCE_ERROR,
+    SCALE,
+)
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
@@ -50,6 +61,11 @@ POINTS = 16
 OFF_CENTRE, RECENTRED = 0.7, 4
 # A configured lever arm is a tape measurement with this σ, m, and wrong with probability WRONG_TAPE.
 TAPE_STD_M, WRONG_TAPE = 0.05, 0.1
+# A vehicle at the surface or at constant depth ends at the height at which it began, within LEVEL_M (tide, waves) and
+# its own excursions; with probability NOT_LEVEL it climbs, with σ CLIMB_MPS. Vertical reference error: with probability
+# OFFSET it has σ OFFSET_MPS (a receiver's antenna model) instead of `reference_offset_std`.
+LEVEL_M, NOT_LEVEL, CLIMB_MPS = 1.0, 0.1, 0.3
+OFFSET, OFFSET_MPS = 0.1, 0.05
 # Smallest white noise of a velocity, m/s. Degrees of freedom needed to estimate the noise of bins.
 LEAST_NOISE_MPS, FEWEST = 1e-4, 6
 # Mean of the smaller 90 % of squares of a standard normal variable.
@@ -84,11 +100,16 @@ class Priors:
 
 
 class _Section(NamedTuple):
-    """Interval between two knots. seconds: length. gram: of its rows, None without rows. fold: hold-out fold."""
+    """Interval between two knots.
+
+    seconds: length. gram: of its rows, None without rows. fold: hold-out fold. up: (21,) mean of `PredictedRows.up`,
+    its velocity at zero states; None without attitude or vertical reference.
+    """
 
     seconds: float
     gram: Array | None
     fold: int
+    up: Array | None = None
 
 
 @dataclass
@@ -112,6 +133,18 @@ class _Day:
     single: Array = field(default_factory=lambda: np.full(3, math.nan))
     level: Array = field(default_factory=lambda: np.zeros(3))
     level_std: Array = field(default_factory=lambda: np.full(3, math.inf))
+
+
+class _Climb(NamedTuple):
+    """Mean velocity upwards of a day by its DVL.
+
+    at: (20,) indices of its states. row: (21,) derivatives by these, and m/s at zero states. std: m/s, of a vehicle
+    that is level.
+    """
+
+    at: Index
+    row: Array
+    std: float
 
 
 class JointEstimate(NamedTuple):
@@ -384,7 +417,7 @@ class JointFit:
                 self._misfit += float(misfit[good].sum())
                 bins = part.bins(day.single)
                 gram, fold = gram_of(bins, day.white, x, part.slope_variance), int(bins.fold[len(bins.fold) // 2])
-            self._append(day, _Section(SECTION_S, gram, fold))
+            self._append(day, _Section(SECTION_S, gram, fold, None if gram is None else part.up(x)))
 
     def _append(self, day: _Day, section: _Section) -> None:
         assert day.chain is not None
@@ -396,7 +429,7 @@ class JointFit:
 
     def _solve(self) -> None:
         ended = [None if day.chain is None else day.chain.ended() for day in self._days]
-        self._fitted = self._mixture(ended, slice(None))
+        self._fitted = self._mixture(ended, slice(None), self._climbs())
         self._x = self._fitted.state.x.copy()
 
     def without_folds(self) -> list[list[GaussianState]]:
@@ -416,7 +449,7 @@ class JointFit:
                 for section in day.sections:
                     chain = chain.after(None if section.fold == fold else section.gram, section.seconds, slow)
                 ended.append(chain.ended())
-            found.append(self._by_day(self._mixture(ended, points).state))
+            found.append(self._by_day(self._mixture(ended, points, self._climbs(fold)).state))
         return found
 
     def held_out_error(self) -> HeldOutError | None:
@@ -449,12 +482,40 @@ class JointFit:
                     seconds += (block.end_s - block.from_s) * float(np.mean(block.fold == fold))
         return sums.error(seconds, memory_s)
 
-    def _mixture(self, ended: Sequence[Eliminated | None], points: slice) -> JointEstimate:
-        """Return mean and covariance over points of the slow errors, with a right and a wrong configured lever arm."""
-        likely = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
-        priors = [self._by_prior(points, std) for std in likely]
+    def _climbs(self, without: int = -1) -> list[_Climb]:
+        """Return the mean climb of every day that shows one. without: fold that is held out."""
+        found = []
+        for number, day in enumerate(self._days):
+            rows = [each.up for each in day.sections if each.up is not None and each.fold != without]
+            if len(rows) > 1:
+                at, up = self._of_day(number), np.array(rows)
+                velocity = up[:, :-1] @ self._x[at] + up[:, -1]
+                path = SECTION_S * np.cumsum(velocity - velocity.mean())
+                std = (LEVEL_M + float(np.ptp(path))) / (SECTION_S * len(up))
+                found.append(_Climb(at, up.mean(axis=0), min(std, CLIMB_MPS)))
+        return found
+
+    def _mixture(self, ended: Sequence[Eliminated | None], points: slice, climbs: Sequence[_Climb]) -> JointEstimate:
+        """Return mean and covariance over points of the slow errors and over the hypotheses of the priors.
+
+        These are a right and a wrong configured lever arm, a small and a large vertical error of the reference, and a
+        level and a climbing vehicle.
+        """
+        arms = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
+        offsets = {0.0: 1.0 - OFFSET, OFFSET_MPS: OFFSET} if climbs else {0.0: 1.0}
+        level = {True: 1.0 - NOT_LEVEL, False: NOT_LEVEL} if climbs else {True: 1.0}
+        cases = list(product(arms, offsets, level))
+        likely = np.array([arms[arm] * offsets[offset] * level[is_level] for arm, offset, is_level in cases])
+        priors = [self._by_prior(points, arm, offset) for arm, offset, _ in cases]
         information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
         square = np.zeros(information.shape[:2])
+        for climb in climbs:
+            variance = np.array([climb.std if is_level else CLIMB_MPS for *_, is_level in cases])[:, None] ** 2
+            h, at = climb.row[:-1], climb.at
+            information[:, :, at[:, None], at] += np.outer(h, h) / variance[:, :, None, None]
+            vector[:, :, at] -= climb.row[-1] * h / variance[:, :, None]
+            square += climb.row[-1] ** 2 / variance
+            log_det += np.log(variance)
         for number, each in enumerate(ended):
             if each is not None:
                 at = self._of_day(number)
@@ -466,7 +527,7 @@ class JointFit:
         covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
         x = (covariance @ vector[..., None])[..., 0]
         left = square - (x * vector).sum(axis=-1)
-        odds = np.log([*likely.values()])[:, None] + self._log_prior[points]
+        odds = np.log(likely)[:, None] + self._log_prior[points]
         evidence = odds - 0.5 * (left + log_det + np.linalg.slogdet(information)[1])
         weights = np.exp(evidence - evidence.max())
         weights /= weights.sum()
@@ -475,10 +536,11 @@ class JointFit:
         p = np.tensordot(weights, covariance) + np.einsum("ac,aci,acj->ij", weights, spread, spread)
         return JointEstimate(GaussianState(mean, 0.5 * (p + p.T)), weights.sum(axis=0))
 
-    def _by_prior(self, points: slice, tape_std: float) -> tuple[Array, Array, Array]:
+    def _by_prior(self, points: slice, tape_std: float, offset_std: float) -> tuple[Array, Array, Array]:
         """Return the prior's information (C, n, n), its product with the state (C, n) and -log determinant (C,).
 
-        tape_std: σ (m) of a configured lever arm; inf for `initial_std_lever_arm`.
+        tape_std: σ (m) of a configured lever arm; inf for `initial_std_lever_arm`. offset_std: σ (m/s) of the vertical
+        reference error; 0 for `reference_offset_std`.
         """
         deviation = self._deviation[points]
         n = len(OF_VEHICLE) + len(OF_DAY) * len(self._days)
@@ -492,6 +554,10 @@ class JointFit:
             vector[:, at[places]] += of_state[places]
         scale = np.ones((len(deviation), n))
         scale[:, HEADING] = 1.0 / deviation[:, None]
+        if offset_std:
+            upwards = [int(self._of_day(number)[REFERENCE_ERROR][-1]) for number in range(len(self._days))]
+            own_std = self._parameters.reference_offset_std
+            scale[:, upwards] = min(1.0, own_std / offset_std)
         if self._arm_is_given:
             scale[:, LEVER_ARM] = np.maximum(np.sqrt(np.diag(self._prior.p)[LEVER_ARM]) / tape_std, 1.0)
         information *= scale[:, :, None] * scale[:, None]
@@ -525,6 +591,16 @@ class _SectionRows:
         """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
         found: Array = (np.nan_to_num(self.left) ** 2 / single).sum(axis=1)
         return found
+
+    def up(self, x: Array) -> Array | None:
+        """Return the mean velocity upwards as in `_Section`. x: (20,) point of linearisation."""
+        assert self.rows is not None
+        known = self.rows.oriented & (self.rows.weight[:, 2] > 0.0)
+        if not known.any():
+            return None
+        mean: Array = self.rows.up[known].mean(axis=0)
+        mean[-1] -= mean[:-1] @ x
+        return mean
 
     def bins(self, single: Array) -> Bins:
         """Average the rows over bins, with robust weights. single: see `misfit`."""

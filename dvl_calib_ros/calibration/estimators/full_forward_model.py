@@ -118,7 +118,8 @@ class PredictedRows(NamedTuple):
     """Residuals and derivatives of J references about a state.
 
     times: (J,) s. residual: (J, 3) m/s. columns: (J, 3, 20) derivatives of the prediction by the states. slow:
-    (J, 3, 6) by the slow errors. weight: (J, 3) per axis. fold: (J,).
+    (J, 3, 6) by the slow errors. weight: (J, 3) per axis. fold: (J,). up: (J, 21) derivatives of the DVL's velocity
+    upwards by the states, and that velocity (m/s); 0 without attitude. oriented: (J,) whether it has attitude.
     """
 
     times: Array
@@ -127,11 +128,13 @@ class PredictedRows(NamedTuple):
     slow: Array
     weight: Array
     fold: NDArray[np.int64]
+    up: Array
+    oriented: Mask
 
     def part(self, at: slice) -> PredictedRows:
         """Return the rows of a slice."""
-        t, r, c, s, w, f = self
-        return PredictedRows(t[at], r[at], c[at], s[at], w[at], f[at])
+        t, r, c, s, w, f, u, o = self
+        return PredictedRows(t[at], r[at], c[at], s[at], w[at], f[at], u[at], o[at])
 
 
 def spline_slopes(times: Array, values: Array) -> Array:
@@ -256,6 +259,8 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     own[:, :, REFERENCE_DELAY] = cross(turning, arm) - accelerating
     turn = np.where(in_body[:, None], 0.0, 1.0)
     own[:, :, REFERENCE_DELAY] -= turn * cross(rates, body)
+    upwards = rotation[:, 2] * oriented[use, None]
+    up = np.column_stack([np.einsum("ni,nik->nk", upwards, own), (upwards * body).sum(axis=1)])
     cycles = heading_cycles(rotation)
     off = np.where(in_body, 0.0, cycles @ x[HEADING])
     onto = np.where(in_body[:, None, None], np.eye(3), _about_up(off) @ rotation)
@@ -268,9 +273,8 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     slow[:, :, :3] = np.eye(3)
     slow[:, :, 3:] = -turn[:, :, None] * skew(predicted_velocity)
     residual = reference.velocity[use] - predicted_velocity - turn * x[REFERENCE_ERROR]
-    return PredictedRows(
-        reference.times[use], residual, columns, slow, block.measured[use].astype(float), block.fold[use]
-    )
+    weight = block.measured[use].astype(float)
+    return PredictedRows(reference.times[use], residual, columns, slow, weight, block.fold[use], up, oriented[use])
 
 
 def _about_up(angle: Array) -> Array:

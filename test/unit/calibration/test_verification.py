@@ -127,7 +127,9 @@ def test_verification_does_not_depend_on_how_samples_are_gathered(block_size):
     assert other.corrected == pytest.approx(one.corrected, rel=1e-9)
 
 
-def judged(held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, std=1e-3, own_error=0.0, open=0.0, **parameters):
+def judged(
+    held_out=GOOD, degrees=1.0, scale=0.0, convergence=Convergence.FINE, std=1e-3, own_error=0.0, open=0.0, **parameters
+):
     state = GaussianState(np.array([0.0, np.tan(np.deg2rad(degrees)), 0.0, scale]), std**2 * np.eye(4))
     p = Parameters(**parameters)
     return verify(MODELS["M3"], state, convergence, held_out, p, own_error=own_error, drift_open=open)
