@@ -32,7 +32,7 @@ def pitch_found(climb, error_up: float) -> tuple[float, float]:
     rates = np.column_stack([change[:, 2, 1], change[:, 0, 2], change[:, 1, 0]])
     rates = np.vstack([rates, rates[-1:]])
     dvl = body @ rotation_from_rpy((ROLL, PITCH, YAW)) + rng.normal(0.0, 0.01, body.shape)
-    reference = earth + [0.0, 0.0, error_up] + rng.normal(0.0, 0.02, earth.shape)
+    reference = earth + np.array([0.0, 0.0, error_up]) + rng.normal(0.0, 0.02, earth.shape)
     calibrator = Calibrator(Parameters(), block_size=256)
     for at in range(len(time)):
         stamp = START_NS + round(1e9 * time[at])
