@@ -190,7 +190,7 @@ def test_on_a_circle_what_takes_an_unknown_lever_arm_as_known_is_rejected_with_w
     samples = straight(yaw_rate=0.15)
     unknown = calibrate(samples, NOISE, verified=True)
     known_to_full = [each.code for each in unknown.verification("full").reasons]
-    assert unknown.verification("full").verdict is Severity.MARGINAL
+    assert unknown.verification("full").verdict is Severity.REJECT
     assert {"LEVER_ARM_NOT_SHOWN", "NO_ANGLE_SHOWN"} & {*known_to_full}
     for name in ("M3", "M4"):
         verification = unknown.verification(name)

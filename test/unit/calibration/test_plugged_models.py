@@ -83,7 +83,7 @@ def test_an_estimator_of_another_package_is_one_class_beside_its_entry(calibrate
     assert rise == pytest.approx(-0.02 * 1.0, abs=0.05) and rise != 0.0  # pitch times speed, which it knows nothing of
     assert calibrated["states"]["Y1"] == pytest.approx(calibrated["by_blocks"]["Y1"], abs=1e-12)
     assert calibrated["std"]["Y1"][-1] < 0.01
-    assert calibrated["verdicts"]["Y1"] == "marginal"
+    assert calibrated["verdicts"]["Y1"] == "reject"
     assert calibrated["selected"] == "full"  # what another package brings is never taken by itself
 
 
