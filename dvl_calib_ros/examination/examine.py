@@ -41,7 +41,14 @@ SLOW_REFERENCE = 0.8
 NO_IMU = "DOCTOR_NO_IMU"
 # ratios of speeds outside this range mean different units
 UNIT_FACTORS = (0.7, 1.4)
-UNITS = {1000.0: "mm/s", 100.0: "cm/s", 1.0 / 0.514444: "knots", 3.6: "km/h", 1.0 / 0.3048: "feet/s"}
+UNITS = {
+    1000.0: "mm/s",
+    100.0: "cm/s",
+    1.0 / 0.514444: "knots",
+    3.6: "km/h",
+    1.0 / 0.3048: "feet/s",
+    0.6: "degrees and minutes, ddmm.mmmm, read as degrees",
+}
 # a vehicle counts as moving if this share of its samples is faster than min_speed
 MOVES_SHARE = 0.05
 

@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.examination.examine import Examination, examine
+from dvl_calib_ros.examination.examine import Examination, _units, examine
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -347,3 +348,10 @@ def test_of_messages_at_one_instant_no_rate_is_told(tmp_path, capsys, count):
         main([command, str(tmp_path / "one.mcap")])
         out = capsys.readouterr().out
         assert "one.mcap" in out and "Hz)" not in out and "e+" not in out
+
+
+def test_positions_read_from_degrees_and_minutes_are_named():
+    """ddmm.mmmm / 100 taken for degrees: a minute is 1/100 instead of 1/60 of a degree."""
+    dvl, reference = (SimpleNamespace(values=np.full((20, 3), each)) for each in (1.0, 0.602))
+    (said,) = _units(dvl, reference)
+    assert said.code == "DOCTOR_UNITS" and "ddmm.mmmm" in said.says
