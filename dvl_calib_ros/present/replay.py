@@ -158,10 +158,11 @@ def replayed(
     commands
         Commands to type next.
     """
-    result, history, drift = run.result, run.history, run.navigation
+    result, history = run.result, run.history
     shown = [name for name in result.estimates if name in models or name == result.selected]
     verification = result.verifications.get(result.selected)
     rejected = verification is not None and verification.verdict is Severity.REJECT
+    drift = None if rejected else run.navigation
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
     first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
     notes = [note for note in run.notes if first is None or note != str(first)]
