@@ -220,6 +220,16 @@ def test_only_two_functions_print():
     }  # fmt: skip
 
 
+def test_the_node_logs_by_one_class_alone():
+    """Others may log a text that stands in the code, for rclpy's filters."""
+    found = []
+    for source in sorted((ROOT / "dvl_calib_ros").rglob("*.py")):
+        for node in ast.walk(ast.parse(source.read_text())):
+            if isinstance(node, ast.Call) and "get_logger()." in ast.unparse(node.func):
+                found += [source.name] if not isinstance(node.args[0], ast.Constant) else []
+    assert set(found) == {"services.py"}
+
+
 # ------------------------------------------------------------------ cells of spreadsheets
 
 
