@@ -139,6 +139,7 @@ def replayed(
     *,
     details: bool = False,
     warnings: Sequence[str] | None = None,
+    found: Sequence[str] = (),
     commands: Sequence[str] = (),
 ) -> Document:
     """Lay out the result of a replay.
@@ -155,13 +156,16 @@ def replayed(
         Whether a terminal also shows the models and the counts.
     warnings
         Warnings; None for all notes, with those of other models folded away.
+    found
+        Discovered topics and parameters in sentences, for a terminal.
     commands
         Commands to type next.
     """
-    result, history, drift = run.result, run.history, run.navigation
+    result, history = run.result, run.history
     shown = [name for name in result.estimates if name in models or name == result.selected]
     verification = result.verifications.get(result.selected)
     rejected = verification is not None and verification.verdict is Severity.REJECT
+    drift = None if rejected else run.navigation
     others = tuple(f"{name}: " for name in result.estimates if name != result.selected)
     first = next((each for each in run.findings if each.code == "BAG_NO_IMU"), None)
     notes = [note for note in run.notes if first is None or note != str(first)]
@@ -198,6 +202,7 @@ def replayed(
                 if drift and history
                 else None,
             ),
+            section("Found in the recording", *(Sentence(each, soft=True) for each in found), where=Where.TERMINAL),
             section(
                 "",
                 Commands([("next" if not k else "", each) for k, each in enumerate(commands)]) if commands else None,

@@ -122,10 +122,12 @@ _STYLES = {"good": "green", "off": "yellow", "far": "yellow", "bad": "red"}
 
 def shown(document: Document) -> Iterator[Any]:
     """Yield rich's renderables of a document, without its warnings."""
-    from rich.text import Text
+    yield from answer_shown(document)
+    yield from sections_shown(document)
 
-    if document.lead:
-        yield from _found(document.lead)
+
+def answer_shown(document: Document) -> Iterator[Any]:
+    """Yield rich's renderables of a document's answer, and of the finding that leads it."""
     answer = document.answer
     if answer is not None:
         sentences = list(answer.sentences)
@@ -133,6 +135,12 @@ def shown(document: Document) -> Iterator[Any]:
             sentences = [" ".join([answer.advice, *sentences])]
         yield Text.assemble((answer.word, f"bold {COLOURS[answer.severity]}"), ": ", sentences[0])
         yield from map(Text, sentences[1:])
+    if document.lead:
+        yield from _found(document.lead)
+
+
+def sections_shown(document: Document) -> Iterator[Any]:
+    """Yield rich's renderables of a document's sections."""
     for section in document.sections:
         if section.where is Where.PAGE or not section.items:
             continue
@@ -158,7 +166,6 @@ def shown(document: Document) -> Iterator[Any]:
 
 def _found(reason: Reason) -> Iterator[Padding]:
     from rich.padding import Padding
-    from rich.text import Text
 
     yield Padding(Text(reason.says, COLOURS[reason.severity]), (0, 0, 0, 2))
     yield Padding(Text.assemble(reason.remedy, " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))

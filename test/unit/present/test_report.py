@@ -103,7 +103,7 @@ def test_after_a_reject_there_is_no_mounting_and_no_drift_that_it_would_be_worth
     text = Page(tmp_path / "report.html").text
     first = text[: text.index("Estimates")]
     assert "reject" in first and "configured" not in first and "DVL on the vehicle" not in first
-    assert "ready to paste" not in text and "of drift per km" not in text
+    assert "ready to paste" not in text and "Effect on navigation" not in text
 
 
 def test_warnings_of_models_that_were_not_chosen_are_folded_away(tmp_path, made, monkeypatch):
