@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -26,10 +27,11 @@ _BESIDE = 3
 
 
 class Folding:
-    """Table unchanged if it fits, else split into tables that repeat the first columns, else one line per cell."""
+    """Table that fits: unchanged, transposed, split into tables that repeat the first columns, or one line per cell."""
 
-    def __init__(self, table: RichTable) -> None:
+    def __init__(self, table: RichTable, transposed: RichTable | None = None) -> None:
         self._table = table
+        self._transposed = transposed
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         table, width = self._table, options.max_width
@@ -39,8 +41,11 @@ class Folding:
             return
         if table.title:
             yield _shown(console, table.title, "table.title")
+        turned = self._transposed
         groups = _groups(table.columns, needed, width - 1)
-        if groups is None:
+        if turned is not None and sum(_keep_short(console, options, column) for column in turned.columns) + 1 <= width:
+            yield turned
+        elif groups is None:
             yield from _lines(console, table)
         else:
             yield from (_part(table, group) for group in groups)
@@ -172,7 +177,12 @@ def _found(reason: Reason) -> Iterator[Padding]:
 
 
 def rich_table(table: Table) -> Folding:
-    """Return a table for rich, folded if the terminal is too narrow."""
+    """Return a table for rich, transposed or folded if the terminal is too narrow."""
+    turned = table.transposed
+    return Folding(_made(table), None if turned is None else _made(replace(turned, title="", notes=())))
+
+
+def _made(table: Table) -> RichTable:
     from rich import box
 
     made = RichTable(
@@ -188,7 +198,7 @@ def rich_table(table: Table) -> Folding:
         made.add_column(_cell(name), justify="left" if is_word else "right", no_wrap=not is_word, overflow="fold")
     for index, row in enumerate(table.rows):
         made.add_row(*map(_cell, row), style="bold" if index == table.marked else None)
-    return Folding(made)
+    return made
 
 
 def _cell(cell: str | Cell) -> Text:
