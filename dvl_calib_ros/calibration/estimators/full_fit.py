@@ -32,23 +32,17 @@ from ..models.own import (
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
-from ..numerics.robust import median
 from ..numerics.samples import Index
 from .full_delay_search import better_delay
-from .full_forward_model import FitBlock, PredictedRows, predicted
+from .full_forward_model import FitBlock, predicted
 from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
-from .slow_errors import Bins, Chain, Eliminated, LogNormal, SlowErrors, binned_rows, gram_of, normal_points, scatter
+from .section_rows import GATE, SECTION_S, SectionRows, masked_median, section_starts, usual_square
+from .slow_errors import Chain, Eliminated, LogNormal, SlowErrors, gram_of, normal_points, scatter
 
 DEG = math.pi / 180.0
 OF_DAY = FULL.of_day
 LINEARISED = np.r_[PHI, SCALE, LEVER_ARM, DELAY, REFERENCE_DELAY]  # states that are not linear
 OF_VEHICLE = np.delete(np.arange(N_STATE), OF_DAY)
-# Interval between knots of the slow errors, and length of bins of rows, s. A bin holds at least BIN_INTERVALS DVL
-# intervals.
-SECTION_S, BIN_S, BIN_INTERVALS = 10.0, 0.5, 2.0
-DENSER = 0.7  # references are denser than the DVL below this ratio of intervals
-# Squared residual of three axes, in variances, that 1 % of good rows exceed. Beyond it a row has weight gate / misfit.
-GATE = 11.3
 # The point of linearisation is renewed when an angle, scale, lever arm or delay has moved by this number of σ.
 FAR = 1.0
 # Gauss-Newton steps at a renewal: at most STEPS, or until a step is below LAST_STEP σ.
@@ -68,8 +62,6 @@ LEVEL_M, NOT_LEVEL, CLIMB_MPS = 1.0, 0.1, 0.3
 OFFSET, OFFSET_MPS = 0.1, 0.05
 # Smallest white noise of a velocity, m/s. Degrees of freedom needed to estimate the noise of bins.
 LEAST_NOISE_MPS, FEWEST = 1e-4, 6
-# Mean of the smaller 90 % of squares of a standard normal variable.
-TRIMMED_SQUARE = 0.623
 # Squared residual of three axes, in variances, beyond which a row is an outlier.
 GATED = 4.0 * GATE
 # A sample of a slow DVL is rejected if the references near it then fit better: by LEAST_GAIN (chi-square), and to this
@@ -373,31 +365,31 @@ class JointFit:
         times = np.concatenate([part.rows.times for part in parts if part.rows is not None])
         return times, np.concatenate([part.misfit(day.single) for part in parts])
 
-    def _parts(self, block: FitBlock, x: Array) -> list[_SectionRows]:
+    def _parts(self, block: FitBlock, x: Array) -> list[SectionRows]:
         """Return the sections of a block about a state (20,) of its day."""
         rows = predicted(block, x, self._parameters)
-        starts = _starts(block)
+        starts = section_starts(block)
         if rows is None:
-            return [_SectionRows(from_s, None, block) for from_s in starts]
+            return [SectionRows(from_s, None, block) for from_s in starts]
         bounds = np.searchsorted(rows.times, [*starts, block.end_s + 1e-9]).tolist()
         each = (rows.part(slice(a, b)) if b > a else None for a, b in pairwise(bounds))
-        return [_SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
+        return [SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
 
-    def _measure_noise(self, day: _Day, parts: Sequence[_SectionRows]) -> None:
+    def _measure_noise(self, day: _Day, parts: Sequence[SectionRows]) -> None:
         """Estimate the white noise of single rows and of bins from their scatter within sections."""
         left = [part.left for part in parts if part.rows is not None]
         if not left:
             return
         levels = np.array([part.level for part in parts if part.rows is not None])
-        day.level = _masked_median(levels)
-        day.level_std = np.maximum(_masked_median(np.abs(levels - day.level)) / MEDIAN_ABSOLUTE, GROSS_MPS / GROSS)
-        day.single = np.maximum(_usual_square(np.concatenate(left)), LEAST_NOISE_MPS**2)
+        day.level = masked_median(levels)
+        day.level_std = np.maximum(masked_median(np.abs(levels - day.level)) / MEDIAN_ABSOLUTE, GROSS_MPS / GROSS)
+        day.single = np.maximum(usual_square(np.concatenate(left)), LEAST_NOISE_MPS**2)
         each = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
         total, freedom = (np.sum(sums, axis=0) for sums in zip(*each, strict=True))
         white = np.maximum(total / np.maximum(freedom, 1.0), LEAST_NOISE_MPS**2)
         day.white = np.where(freedom < FEWEST, day.single, white)
 
-    def _add_parts(self, day: _Day, parts: Sequence[_SectionRows], x: Array) -> None:
+    def _add_parts(self, day: _Day, parts: Sequence[SectionRows], x: Array) -> None:
         """Add sections to their day's chain. x: (20,) point of linearisation."""
         for part in parts:
             if day.chain is None:
@@ -573,71 +565,3 @@ def _with_bias_in_mounting(x: Array, p: Array) -> GaussianState:
     gain = p[:, BIAS] @ np.linalg.inv(p[BIAS, BIAS])
     moved = gain @ x[BIAS]
     return GaussianState(x - moved, p + np.outer(moved, moved))
-
-
-class _SectionRows:
-    """Rows of one section. level: (3,) m/s, median. left: (J, 3) m/s about the median, nan along unmeasured axes."""
-
-    def __init__(self, from_s: float, rows: PredictedRows | None, block: FitBlock) -> None:
-        self.from_s, self.rows, self._bin_s = from_s, rows, _bin_s(block)
-        self.slope_variance = block.slope_variance
-        self._bins: Bins | None = None
-        if rows is not None:
-            residual = np.where(rows.weight > 0.0, rows.residual, np.nan)
-            self.level = _masked_median(residual)
-            self.left = residual - self.level
-
-    def misfit(self, single: Array) -> Array:
-        """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
-        found: Array = (np.nan_to_num(self.left) ** 2 / single).sum(axis=1)
-        return found
-
-    def up(self, x: Array) -> Array | None:
-        """Return the mean velocity upwards as in `_Section`. x: (20,) point of linearisation."""
-        assert self.rows is not None
-        known = self.rows.oriented & (self.rows.weight[:, 2] > 0.0)
-        if not known.any():
-            return None
-        mean: Array = self.rows.up[known].mean(axis=0)
-        mean[-1] -= mean[:-1] @ x
-        return mean
-
-    def bins(self, single: Array) -> Bins:
-        """Average the rows over bins, with robust weights. single: see `misfit`."""
-        assert self.rows is not None
-        if self._bins is None:
-            weight = np.minimum(1.0, GATE / np.maximum(self.misfit(single), 1e-9))
-            self._bins = binned_rows(self.rows, weight, self.from_s, self.from_s + SECTION_S, self._bin_s)
-        return self._bins
-
-
-def _usual_square(values: Array) -> Array:
-    """Return the variance (3,) of (J, 3) without nan, by the smaller 90 % of the squares, against outliers."""
-    found = np.zeros(3)
-    for axis, column in enumerate(values.T):
-        squares = np.sort(column[np.isfinite(column)] ** 2)
-        kept = squares[: math.ceil(0.9 * len(squares))]
-        found[axis] = kept.mean() / TRIMMED_SQUARE if len(kept) else 0.0
-    return found
-
-
-def _masked_median(values: Array) -> Array:
-    """Return the median (3,) of (J, 3) without nan; 0 for an axis without values."""
-    finite = np.isfinite(values)
-    if finite.all():
-        return np.sort(values, axis=0)[len(values) // 2]
-    columns = [column[known] for column, known in zip(values.T, finite.T, strict=True)]
-    return np.array([median(column) if len(column) else 0.0 for column in columns])
-
-
-def _bin_s(block: FitBlock) -> float:
-    """Return the bin length, s: longer where references are denser than DVL samples, because they then share these."""
-    times = block.reference.times
-    if len(times) < 2 or len(block.dvl.times) < 2:
-        return BIN_S
-    apart = (times[-1] - times[0]) / (len(times) - 1)
-    return max(BIN_S, BIN_INTERVALS * block.interval_s) if apart < DENSER * block.interval_s else BIN_S
-
-
-def _starts(block: FitBlock) -> list[float]:
-    return [block.from_s + SECTION_S * n for n in range(round((block.end_s - block.from_s) / SECTION_S))]
