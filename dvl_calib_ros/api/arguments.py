@@ -37,8 +37,11 @@ def storage_and_compression(storage: str, compression: str) -> tuple[Storage, Co
 
 
 def as_paths(bags: Bags) -> list[Path]:
-    """Return one or several recordings as paths. Raises InputError for none."""
-    found = [Path(bags)] if isinstance(bags, str | os.PathLike) else [Path(bag) for bag in bags]
+    """Return one or several recordings as paths. Raises InputError for none, or for anything else."""
+    try:
+        found = [Path(bags)] if isinstance(bags, str | os.PathLike) else [Path(bag) for bag in bags]
+    except TypeError:
+        raise InputError(f"bags={bags!r}: expected the path of a bag, or a list of paths") from None
     if not found:
         raise InputError("no bag is named; name one at least")
     return found

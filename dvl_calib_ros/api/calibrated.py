@@ -43,6 +43,8 @@ class Mounting:
         standard deviations, nan if the model has no lever arm.
     position_m
         Position of the DVL in the body, m; None if the position of the reference point is unknown.
+    not_observable
+        Names of estimated quantities that the data do not make observable, as in the report.
     time_offset_s, time_offset_std_s
         Delay of the DVL's stamps, s, estimated or else configured; of several recordings the last one's
         (`Result.delays`).
@@ -64,6 +66,7 @@ class Mounting:
     base_frame: str
     dvl_frame: str
     position_m: tuple[float, float, float] | None = None
+    not_observable: tuple[str, ...] = ()
 
     @property
     def urdf(self) -> str:
@@ -73,17 +76,25 @@ class Mounting:
         return origin_tag(self.position_m, np.radians(self.rpy_deg))
 
     def __str__(self) -> str:
-        angles = (
-            f"{name} {angle:.2f}° ± {std:.2f}°"
-            for name, angle, std in zip(("roll", "pitch", "yaw"), self.rpy_deg, self.std_deg, strict=True)
-        )
-        parts = [*angles]
-        if not all(map(math.isnan, self.xyz_std_m)):
-            arm = zip("xyz", self.xyz_m, self.xyz_std_m, strict=True)
-            parts.append("lever arm " + ", ".join(f"{axis} {value:.2f} ± {std:.2f} m" for axis, value, std in arm))
-        if not math.isnan(self.time_offset_std_s):
-            parts.append(f"stamps late {self.time_offset_s:.3f} ± {self.time_offset_std_s:.3f} s")
+        angles = zip(("roll", "pitch", "yaw"), self.rpy_deg, self.std_deg, strict=True)
+        parts = [f"{name} {angle:.2f}° ± {std:.2f}°{self._remark(name)}" for name, angle, std in angles]
+        arm = zip("xyz", self.xyz_m, self.xyz_std_m, strict=True)
+        if all(map(math.isnan, self.xyz_std_m)):
+            parts.append("lever arm {:g} {:g} {:g} m as configured, not estimated".format(*self.xyz_m))
+        else:
+            values = (
+                f"{axis} {value:.2f} ± {std:.2f} m{self._remark(f'lever arm {axis}')}" for axis, value, std in arm
+            )
+            parts.append(f"lever arm {', '.join(values)}")
+        if math.isnan(self.time_offset_std_s):
+            parts.append(f"stamps late {self.time_offset_s:g} s as configured, not estimated")
+        else:
+            offset = f"{self.time_offset_s:.3f} ± {self.time_offset_std_s:.3f} s"
+            parts.append(f"stamps late {offset}{self._remark('stamps late')}")
         return printable(f"{self.dvl_frame} in {self.base_frame}: {', '.join(parts)}")
+
+    def _remark(self, name: str) -> str:
+        return " (not observable)" if any(each.startswith(name) for each in self.not_observable) else ""
 
     __repr__ = __str__
 
@@ -169,6 +180,7 @@ class Calibration:
             parameters.base_frame,
             self.replayed.dvl_frame,
             result.position_in_body,
+            tuple(each.name for each in quantities(result) if not each.shown),
         )
 
     def correct(self, velocity_dvl: Array, angular_velocity: Array | None = None) -> Array:

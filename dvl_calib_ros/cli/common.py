@@ -95,13 +95,18 @@ def options_given(arguments: argparse.Namespace) -> list[str]:
     return options(topics, arguments.overrides, arguments.params)
 
 
+def found_lines(discovery: Discovery, bags: Sequence[Path]) -> list[str]:
+    """Return the discovered values with their sources in sentences, first the topics of the bags."""
+    names = ", ".join(bag.name or str(bag) for bag in bags)
+    return [f"{names}: {discovery.found[0]}", *discovery.found[1:]]
+
+
 def print_found(discovery: Discovery, bags: Sequence[Path], first_only: bool = False) -> None:
     """Print the discovered values with their sources, dim. first_only: only the topics."""
     from rich.markup import escape
 
     out = console()
-    names = ", ".join(bag.name or str(bag) for bag in bags)
-    for sentence in (f"{names}: {discovery.found[0]}", *([] if first_only else discovery.found[1:])):
+    for sentence in found_lines(discovery, bags)[: 1 if first_only else None]:
         out.print(f"[dim]{escape(sentence)}[/]")
 
 
@@ -202,20 +207,26 @@ def print_warnings(notes: Sequence[str]) -> None:
     errors = console(stderr=True)
     try:
         for note in notes:
-            errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=True)
+            errors.print(f"[yellow]warning:[/] {escape(note)}", soft_wrap=not sys.stderr.isatty())
     except OSError:
         give_up(sys.stderr)  # the result is still printed if standard error is closed
 
 
-def print_document(document: Document) -> None:
-    """Print a result, with its warnings on standard error."""
+def print_document(document: Document, warnings: Sequence[str] = ()) -> None:
+    """Print a result: the answer, its warnings on standard error, then the sections.
+
+    warnings: further ones, before those of the document.
+    """
     from rich.text import Text
 
-    from ..present.terminal import shown
+    from ..present.terminal import answer_shown, sections_shown
 
-    print_warnings(document.warnings)
     out = console()
-    for each in shown(document):
+    for each in answer_shown(document):
+        out.print(each)
+    sys.stdout.flush()
+    print_warnings([*warnings, *document.warnings])
+    for each in sections_shown(document):
         out.print(each, soft_wrap=isinstance(each, Text) and bool(each.no_wrap))
 
 

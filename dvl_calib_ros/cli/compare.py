@@ -4,8 +4,7 @@ Each RESULT is a result file of the node or of replay --save, or a bag, which is
 mounting with lever arm, scale and delay is compared, weighted by the stated σ; models and configured mountings may
 differ.
 
-Exit code 0: the same mounting within 2 σ. 1: moved, by more than 4 σ. 2: bad usage or input. 3: suspicious, between the
-two.
+Exit code 0: the same mounting within 2 σ. 2: bad usage or input. 3: suspicious, 2 to 4 σ. 4: moved, by more than 4 σ.
 """
 
 from __future__ import annotations
@@ -49,12 +48,13 @@ def run(arguments: argparse.Namespace) -> int:
     common.check_outputs(arguments, "json", "report")
     write_report = report_writer(arguments)
     names = _names(paths)
-    calibrations = [_load_or_calibrate(arguments, path, name) for path, name in zip(paths, names, strict=True)]
+    notes: list[str] = []
+    calibrations = [_load_or_calibrate(arguments, path, name, notes) for path, name in zip(paths, names, strict=True)]
     check_distinct(calibrations)
     comparison = compare(calibrations)
     try:
         common.deliver(
-            lambda: common.print_document(present.comparison(comparison)),
+            lambda: common.print_document(present.comparison(comparison), notes),
             (arguments.json, lambda path: common.write_json(path, comparison_document(comparison))),
             (arguments.report, lambda path: write_report(path, comparison)),
         )
@@ -69,8 +69,8 @@ def _names(paths: Sequence[Path]) -> list[str]:
     return short if len(set(short)) == len(short) else list(map(str, paths))
 
 
-def _load_or_calibrate(arguments: argparse.Namespace, path: Path, name: str) -> Extrinsics:
-    """Load a result file, or calibrate with a bag."""
+def _load_or_calibrate(arguments: argparse.Namespace, path: Path, name: str, notes: list[str]) -> Extrinsics:
+    """Load a result file, or calibrate with a bag and append its warnings to `notes`."""
     from ..bags.files import is_bag
     from ..files.mounting import load_extrinsics
 
@@ -83,5 +83,5 @@ def _load_or_calibrate(arguments: argparse.Namespace, path: Path, name: str) -> 
     discovery = common.discovered(arguments, recording, parameters)
     with common.progress(f"replaying {name}") as on_progress:
         found = calibrated(recording, discovery.parameters, discovery.topics, name, on_progress)
-    common.print_warnings(found.notes)
+    notes += [f"{name}: {note}" for note in found.notes]
     return found.extrinsics

@@ -46,18 +46,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Diagnose, print, save. Return 1 if the data show no cause."""
+    """Diagnose, print, save. Return 1 if the data do not answer."""
     if arguments.simulator:
         return run_against_simulator(arguments, DEFAULTS)
     check_without(arguments)
     from ..diagnosis.answer.compensation import compensated, parameter_file
-    from ..diagnosis.answer.results import diagnosis_document
+    from ..diagnosis.answer.results import DiagnosisVerdict, diagnosis_document
     from ..diagnosis.answer.simulated_twin import write_twins
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.model.recorded_streams import recording_names
     from ..disk.atomic import own_stream, save_all
     from ..present import diagnosis as present
-    from ..verdict.kinds import Severity
 
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
@@ -75,7 +74,6 @@ def run(arguments: argparse.Namespace) -> int:
     recording = common.opened(arguments.bags, parameters)
     discovery = common.discovered(arguments, recording, parameters)
     parameters = discovery.diagnosed
-    common.print_warnings(discovery.doubts)
     with common.progress("diagnosing") as on_progress:
         diagnosis = diagnose(
             recording,
@@ -89,7 +87,8 @@ def run(arguments: argparse.Namespace) -> int:
     written: list[Path] = []
 
     def answer() -> None:
-        common.print_document((present.diagnosis if arguments.verbose else present.first_screen)(diagnosis))
+        layout = present.diagnosis if arguments.verbose else present.first_screen
+        common.print_document(layout(diagnosis), discovery.doubts)
         common.print_found(discovery, arguments.bags, first_only=not arguments.verbose)
         if written:
             common.console().print(f"wrote {', '.join(map(str, written))}", soft_wrap=True, markup=False)
@@ -112,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
         (arguments.twin, write_all_twins),
         (arguments.report, lambda path: write_report(path, diagnosis)),
     )
-    return int(diagnosis.reasons[0].severity is Severity.REJECT)
+    return int(diagnosis.verdict in (DiagnosisVerdict.UNKNOWN, DiagnosisVerdict.INSUFFICIENT_EXCITATION))
 
 
 def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
@@ -194,7 +193,7 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
     document = closed_gap_document(found) if isinstance(found, ClosedGap) else unpaired_document(found)
 
     def answer() -> None:
-        common.print_document(DOCUMENTS[type(found)](found))
+        common.print_document(DOCUMENTS[type(found)](found), [*real[1].doubts, *made[1].doubts])
         common.print_found(real[1], arguments.bags)
         common.print_found(made[1], arguments.simulator)
 
@@ -215,6 +214,5 @@ def _open_side(
     side_arguments = argparse.Namespace(**{**vars(arguments), "params": params})
     recording = common.opened(bags, common.load(side_arguments))
     discovery = common.discovered(side_arguments, recording, common.load(side_arguments))
-    common.print_warnings(discovery.doubts)
     parameters = common.load(side_arguments, defaults).replace(**discovery.values)
     return RecordedSide(recording, parameters, discovery.topics), discovery

@@ -90,15 +90,21 @@ def run(arguments: argparse.Namespace) -> int:
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
     from ..present import replay as present
 
-    common.print_found(discovery, arguments.bags)
     findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])
     known = {str(found) for found in replayed.findings}
     warnings = [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
     named = common.options_given(arguments)
     commands = present.next_commands(replayed, arguments.bags, arguments.save, named, bool(findings))
-    common.print_document(
-        present.replayed(replayed, arguments.bags, models, details=bool(models), warnings=warnings, commands=commands)
+    document = present.replayed(
+        replayed,
+        arguments.bags,
+        models,
+        details=bool(models),
+        warnings=warnings,
+        found=common.found_lines(discovery, arguments.bags),
+        commands=commands,
     )
+    common.print_document(document)
 
 
 def shown_findings(replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> list[Reason]:

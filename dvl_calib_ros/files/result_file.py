@@ -102,7 +102,7 @@ def result_document(
         "used": estimate.used,
         "gated": estimate.gated,
         "convergence": estimate.convergence.value,
-        "found": {each.name: _in_words(each) for each in quantities(result)},
+        "found": _Lines(_found(result)),
         "mounting": {
             "static_transform_publisher": None if arguments is None else f"{_PUBLISHER} {arguments}",
             "urdf_origin": origin_tag(position, rpy_from_rotation(of_frame)),
@@ -158,6 +158,16 @@ def days_document(result: Result) -> dict[str, Any]:
     }
 
 
+def _found(result: Result) -> dict[str, str]:
+    """Return each quantity with its σ, and which configured values the model does not estimate."""
+    found = {each.name: _in_words(each) for each in quantities(result)}
+    configured = {"lever arm": result.parameters["lever_arm"], "stamps late": [result.parameters["dvl_time_offset"]]}
+    for (name, values), unit in zip(configured.items(), ("m", "s"), strict=True):
+        if not any(each.startswith(name) for each in found):
+            found[name] = f"{' '.join(f'{value + 0.0:g}' for value in values)} {unit} as configured, not estimated"
+    return found
+
+
 def _in_words(found: Quantity) -> str:
     unit = found.unit.strip().replace("°", "deg")  # ASCII, because the node prints a result that it cannot save
     return f"{found.value:.2f} +- {found.std:.2f} {unit}" + ("" if found.shown else " (not observable in this data)")
@@ -183,10 +193,26 @@ def static_transform_arguments(position: Any, rotation: Array, parent: str, chil
     return f"{arguments} {frames}"
 
 
+class _Lines(dict[str, str]):
+    """Mapping with one line per entry in YAML."""
+
+
+# the same output, four times faster
+_Base: Any = yaml.CSafeDumper if yaml.__with_libyaml__ else yaml.SafeDumper
+
+
+class _Dumper(_Base):  # type: ignore[misc]  # its own, for the representer
+    pass
+
+
+_Dumper.add_representer(
+    _Lines, lambda dumper, lines: dumper.represent_mapping("tag:yaml.org,2002:map", lines.items(), flow_style=False)
+)
+
+
 def result_text(document: Mapping[str, Any]) -> str:
-    """Return a result document as YAML, with a command or a row of a matrix on one line."""
-    dumper = yaml.CSafeDumper if yaml.__with_libyaml__ else yaml.SafeDumper  # the same output, four times faster
-    return str(yaml.dump(dict(document), Dumper=dumper, sort_keys=False, default_flow_style=None, width=1 << 20))
+    """Return a result document as YAML, with a quantity, a command or a row of a matrix on one line."""
+    return str(yaml.dump(dict(document), Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=1 << 20))
 
 
 def check_in_folder(path: Path, folder: Path) -> None:

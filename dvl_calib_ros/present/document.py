@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from .figure_style import Picture
 
 
+# columns that a page is too narrow for, and rows that become columns instead
+WIDE = 8
+FEW = 5
 # characters of a bar
 BAR = 20
 # errors of a held-out verification, in the order of drawing
@@ -97,6 +100,20 @@ class Table(_Printable):
     notes: Sequence[str] = ()
     dense: bool = False
     words: int = 1
+
+    @property
+    def transposed(self) -> Table | None:
+        """The table with rows and columns exchanged; None if cells are sentences, which need the width of a row."""
+        if not self.rows or any(isinstance(cell, Cell) for row in self.rows for cell in row):
+            return None
+        names, *columns = zip(self.head, *self.rows, strict=True)
+        return replace(self, head=names, rows=columns, marked=None, words=1)
+
+    @property
+    def on_page(self) -> Table:
+        """The table for a page, transposed if it has many columns and few rows."""
+        is_wide = len(self.head) > WIDE and len(self.rows) <= FEW
+        return (self.transposed if is_wide else None) or self
 
     def frame(self) -> pandas.DataFrame:
         """Return a DataFrame, in which columns of σ and observability (no ?) follow a numeric column.

@@ -34,6 +34,11 @@ def breakable(text: str) -> Markup:
     return Markup(re.sub(r"([/_])(?=\w)", r"\1<wbr>", str(escape(text))))
 
 
+def whole(text: str) -> str:
+    """Return a number with its unit, unbroken and with minus signs."""
+    return text.replace("-", "−").replace(" ", "\u00a0")
+
+
 def plain(value: Any) -> str:
     """Format a parameter."""
     if isinstance(value, list):
@@ -50,7 +55,7 @@ def _environment() -> jinja2.Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"breakable": breakable, "plain": plain}
+    environment.filters |= {"breakable": breakable, "plain": plain, "whole": whole}
     return environment
 
 

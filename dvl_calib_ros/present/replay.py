@@ -139,6 +139,7 @@ def replayed(
     *,
     details: bool = False,
     warnings: Sequence[str] | None = None,
+    found: Sequence[str] = (),
     commands: Sequence[str] = (),
 ) -> Document:
     """Lay out the result of a replay.
@@ -155,6 +156,8 @@ def replayed(
         Whether a terminal also shows the models and the counts.
     warnings
         Warnings; None for all notes, with those of other models folded away.
+    found
+        Discovered topics and parameters in sentences, for a terminal.
     commands
         Commands to type next.
     """
@@ -199,6 +202,7 @@ def replayed(
                 if drift and history
                 else None,
             ),
+            section("Found in the recording", *(Sentence(each, soft=True) for each in found), where=Where.TERMINAL),
             section(
                 "",
                 Commands([("next" if not k else "", each) for k, each in enumerate(commands)]) if commands else None,

@@ -242,7 +242,8 @@ def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Se
     axes.text(0.64 * length, 0.0, "ahead", va="center", fontsize=8.0, color=INK)
     for rotation, colour, label in ((nominal, FAINT, "as configured"), (found, AFTER, "as found")):
         _axes_of_dvl(axes, rotation[[across, up]], (place[across], place[up]), _AXIS * length, colour, label)
-    axes.set_xlim(-0.6 * length, 0.85 * length)
+    axes.update_datalim([(-0.6 * length, 0.0), (0.85 * length, 0.0)])
+    axes.autoscale_view()
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("ahead, m")
     axes.set_ylabel(f"{name}, m")

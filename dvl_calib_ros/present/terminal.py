@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
@@ -26,10 +27,11 @@ _BESIDE = 3
 
 
 class Folding:
-    """Table unchanged if it fits, else split into tables that repeat the first columns, else one line per cell."""
+    """Table that fits: unchanged, transposed, split into tables that repeat the first columns, or one line per cell."""
 
-    def __init__(self, table: RichTable) -> None:
+    def __init__(self, table: RichTable, transposed: RichTable | None = None) -> None:
         self._table = table
+        self._transposed = transposed
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         table, width = self._table, options.max_width
@@ -39,8 +41,11 @@ class Folding:
             return
         if table.title:
             yield _shown(console, table.title, "table.title")
+        turned = self._transposed
         groups = _groups(table.columns, needed, width - 1)
-        if groups is None:
+        if turned is not None and sum(_keep_short(console, options, column) for column in turned.columns) + 1 <= width:
+            yield turned
+        elif groups is None:
             yield from _lines(console, table)
         else:
             yield from (_part(table, group) for group in groups)
@@ -122,10 +127,12 @@ _STYLES = {"good": "green", "off": "yellow", "far": "yellow", "bad": "red"}
 
 def shown(document: Document) -> Iterator[Any]:
     """Yield rich's renderables of a document, without its warnings."""
-    from rich.text import Text
+    yield from answer_shown(document)
+    yield from sections_shown(document)
 
-    if document.lead:
-        yield from _found(document.lead)
+
+def answer_shown(document: Document) -> Iterator[Any]:
+    """Yield rich's renderables of a document's answer, and of the finding that leads it."""
     answer = document.answer
     if answer is not None:
         sentences = list(answer.sentences)
@@ -133,6 +140,12 @@ def shown(document: Document) -> Iterator[Any]:
             sentences = [" ".join([answer.advice, *sentences])]
         yield Text.assemble((answer.word, f"bold {COLOURS[answer.severity]}"), ": ", sentences[0])
         yield from map(Text, sentences[1:])
+    if document.lead:
+        yield from _found(document.lead)
+
+
+def sections_shown(document: Document) -> Iterator[Any]:
+    """Yield rich's renderables of a document's sections."""
     for section in document.sections:
         if section.where is Where.PAGE or not section.items:
             continue
@@ -158,14 +171,18 @@ def shown(document: Document) -> Iterator[Any]:
 
 def _found(reason: Reason) -> Iterator[Padding]:
     from rich.padding import Padding
-    from rich.text import Text
 
     yield Padding(Text(reason.says, COLOURS[reason.severity]), (0, 0, 0, 2))
     yield Padding(Text.assemble(reason.remedy, " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
 
 
 def rich_table(table: Table) -> Folding:
-    """Return a table for rich, folded if the terminal is too narrow."""
+    """Return a table for rich, transposed or folded if the terminal is too narrow."""
+    turned = table.transposed
+    return Folding(_made(table), None if turned is None else _made(replace(turned, title="", notes=())))
+
+
+def _made(table: Table) -> RichTable:
     from rich import box
 
     made = RichTable(
@@ -181,7 +198,7 @@ def rich_table(table: Table) -> Folding:
         made.add_column(_cell(name), justify="left" if is_word else "right", no_wrap=not is_word, overflow="fold")
     for index, row in enumerate(table.rows):
         made.add_row(*map(_cell, row), style="bold" if index == table.marked else None)
-    return Folding(made)
+    return made
 
 
 def _cell(cell: str | Cell) -> Text:

@@ -107,9 +107,17 @@ def test_the_mounting_is_printed_with_arm_and_delay_and_findings_are_of_the_sele
     assert not any(each.says.startswith(("M1: ", "M7: ", "F1: ")) for each in calibration.findings)
 
 
+def test_values_that_no_data_support_are_marked_where_the_mounting_is_printed(bag):
+    said = str(dc.replay(bag, model="M3", lever_arm=(1.0, 0.0, -0.5), history=False).mounting)
+    assert "lever arm 1 0 -0.5 m as configured, not estimated" in said
+    assert "stamps late 0 s as configured, not estimated" in said
+    assert "roll" in said and "(not observable)" in said.partition("pitch")[0]
+
+
 @pytest.mark.parametrize(
     ("call", "expected"),
     [
+        (lambda run, to: dc.replay(3), "bags=3: expected the path"),
         (lambda run, to: dc.simulate(to, duration=30.0), "'seconds'"),
         (lambda run, to: dc.simulate(to, waves=0.3), "Waves(height="),
         (lambda run, to: dc.simulate(to, trajectory="foo"), "box"),

@@ -107,13 +107,24 @@ def test_the_summary_is_on_the_first_screen_of_a_phone(browser, report):
     page.close()
 
 
-def test_on_a_phone_every_table_is_whole_and_every_value_has_its_heading(browser, any_report):
-    page, _ = opened(browser, any_report, PHONE)
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_every_table_is_whole_and_every_value_has_its_heading(browser, any_report, size):
+    page, _ = opened(browser, any_report, size)
     tables = page.evaluate(
         """() => [...document.querySelectorAll('.scroll')].map(e => [e.scrollWidth <= e.clientWidth,
              [...e.querySelectorAll('td')].every(td => td.dataset.heading !== undefined)])"""
     )
     assert tables and all(whole and headed for whole, headed in tables)
+    page.close()
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_no_number_on_a_tile_is_broken_from_its_unit(browser, reports, size):
+    page, _ = opened(browser, reports["replay"], size)
+    tiles = page.evaluate("[...document.querySelectorAll('.number')].map(e => [e.innerText, e.clientWidth])")
+    assert tiles
+    for text, width in tiles:
+        assert width >= 150 and not re.search(r"\d (%|m|s)\b", text)  # a no-break space is between them
     page.close()
 
 

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import io
+import os
+import pty
 import re
+import struct
+import subprocess
+import sys
+import termios
 from collections import Counter
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -67,6 +76,37 @@ def test_a_command_says_every_number_and_name_on_any_terminal(monkeypatch, capsy
         missing = set(words(wide)) - set(words(narrow))
         of_names = {"model"}  # the head of the column of names, which a list has not
         assert [word for word in missing - of_names if len(word) < width] == []
+
+
+def on_a_terminal(folder: Path, columns: int, *arguments: str) -> list[str]:
+    """The lines of a command on a terminal, as its user sees them, without colours and bars."""
+    source, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    command = [sys.executable, "-m", "dvl_calib_ros.cli.main", *arguments]
+    asked = subprocess.Popen(command, cwd=folder, stdout=terminal, stderr=terminal, env={**os.environ, "TERM": "xterm"})
+    os.close(terminal)
+    seen = b""
+    with contextlib.suppress(OSError):  # the terminal is closed with the command
+        while part := os.read(source, 65536):
+            seen += part
+    os.close(source)
+    assert asked.wait() in (0, 1)
+    plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", seen.decode()).replace("\r\n", "\n")
+    return [line.rpartition("\r")[2].rstrip() for line in plain.splitlines() if line and "━━" not in line]
+
+
+def test_a_recording_too_short_to_diagnose_is_exit_code_1(monkeypatch, capsys, folder):
+    monkeypatch.chdir(folder)
+    assert main(["diagnose", "one"]) == 1
+    assert capsys.readouterr().out.startswith("insufficient_excitation: ")
+
+
+@pytest.mark.parametrize("command", ["replay", "doctor", "diagnose"])
+def test_the_verdict_is_the_first_line_and_warnings_break_between_words(folder, command):
+    wide, narrow = (on_a_terminal(folder, columns, command, "two", "-p", "gnss_frame:=body") for columns in (500, 80))
+    assert re.match(r"(accept|marginal|reject|yes|partly|no|insufficient_excitation): ", narrow[0])
+    assert max(map(len, narrow)) <= 80
+    assert set(words(" ".join(narrow))) == set(words(" ".join(wide)))
 
 
 VALUES = {

@@ -116,7 +116,7 @@ class ComparisonAnswer(NamedTuple):
 ANSWERS = {
     "same": ComparisonAnswer(Severity.ACCEPT, 0),
     "suspicious": ComparisonAnswer(Severity.MARGINAL, 3),
-    "moved": ComparisonAnswer(Severity.REJECT, 1),
+    "moved": ComparisonAnswer(Severity.REJECT, 4),
 }
 
 

@@ -59,6 +59,20 @@ def saved(tmp_path, result) -> Path:
     return tmp_path / "result.yaml"
 
 
+def test_the_first_lines_hold_every_quantity_on_its_own_line_and_what_to_paste(result):
+    first = result_text(result_document(result)).splitlines()[:30]
+    for each in quantities(result):
+        assert any(line.startswith(f"  {each.name}: {each.value:.2f} +- {each.std:.2f} ") for line in first)
+    assert any("urdf_origin: <origin" in line for line in first) and not any(line.startswith("  - [") for line in first)
+
+
+def test_a_configured_value_that_the_model_does_not_estimate_says_so(bag):
+    run = replayed(bag, lever_arm=(1.0, 0.0, -0.5), dvl_position="from_reference", model="M3")
+    text = result_text(result_document(run.result))
+    assert "  lever arm: 1 0 -0.5 m as configured, not estimated\n" in text
+    assert "  stamps late: 0 s as configured, not estimated\n" in text
+
+
 def test_every_model_comes_back_bit_for_bit(saved, result):
     _, loaded = load_result(saved)
     assert tuple(loaded) == BY_VELOCITY
