@@ -10,12 +10,13 @@ import numpy as np
 import yaml
 
 from ...calibration.models.parameters import SCHEMA, Parameters
+from ...calibration.numerics.frames import Array
 from ...calibration.numerics.samples import VelocityFrame
 from ...effects.registry import EFFECTS
 from ...errors import InputError
 from ..fit.cross_validation import fitted_without, folds_of
-from ..model.hypothesis import is_time_of_run
-from ..search.arm_clock_ambiguity import ARM, ARM_PARAMETERS, TWO_CLOCKS
+from ..model.hypothesis import Hypothesis, is_time_of_run
+from ..search.arm_clock_ambiguity import ARM, ARM_PARAMETERS, CLOCKS, TWO_CLOCKS
 from .results import Diagnosis, FoundEffect
 
 OFFSETS = {
@@ -128,15 +129,30 @@ def corrections(diagnosis: Diagnosis, recording: int | None = None) -> dict[str,
 
 
 def _is_one_correction(diagnosis: Diagnosis, effect: FoundEffect) -> bool:
-    """Return whether an effect and those that explain the data as well have the same correction.
+    """Return whether an effect and those that explain the data as well set the same clocks against each other.
 
-    A DVL delay and a reference advance have, where no attitude with a clock of its own turns one into the other.
+    A shift of all three clocks changes nothing, nor does the attitude's clock where the reference is in the body frame.
     """
     if not effect.equivalent_to:
         return True
-    recordings = () if diagnosis.selection is None else diagnosis.selection.fitter.problem.recordings
-    in_body = all(each.frame is VelocityFrame.BODY for each in recordings)
-    return in_body and {effect.name, *effect.equivalent_to} <= {*TWO_CLOCKS}
+    if diagnosis.selection is None or not {effect.name, *effect.equivalent_to} <= {*CLOCKS}:
+        return False
+    selection = diagnosis.selection
+    if all(each.frame is VelocityFrame.BODY for each in selection.fitter.problem.recordings):
+        return {effect.name, *effect.equivalent_to} <= {*TWO_CLOCKS}
+    rivals = [rival for each in selection.selected if each.effect.name == effect.name for rival in each.rivals]
+    own, (_, low, high) = _beside_attitude(selection.fit.hypothesis), effect.parameters["seconds"]
+    alike = [each for each in rivals if np.all(np.abs(_beside_attitude(each) - own) < 0.5 * (high - low))]
+    return all(any(name in rival.values for rival in alike) for name in effect.equivalent_to)
+
+
+def _beside_attitude(hypothesis: Hypothesis) -> Array:
+    """Return how late the clocks of DVL and reference are beside that of the attitude, s, (2, recordings)."""
+    none = ({"seconds": 0.0},)
+    dvl, reference, attitude = (
+        np.array([each["seconds"] for each in hypothesis.values.get(name, none)]) for name in CLOCKS
+    )
+    return np.stack(np.broadcast_arrays(dvl - attitude, reference - attitude))
 
 
 def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | None = None) -> Parameters:

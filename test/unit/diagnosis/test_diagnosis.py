@@ -446,8 +446,9 @@ def test_only_a_correction_that_changes_a_parameter_and_lowers_the_held_out_erro
         wrong = replace(diagnosis, effects=(replace(arm, parameters=sizes),))
         with pytest.raises(InputError, match="the error does not fall: lever_arm"):
             verified_corrections(Parameters(), wrong, [None])
-    for others in ({"name": "velocity_bias"}, {"name": "dvl_time_offset", "equivalent_to": ("attitude_time_offset",)}):
-        other = replace(diagnosis, effects=(replace(arm, **others),))
+    late = {"name": "dvl_time_offset", "equivalent_to": ("attitude_time_offset",), "parameters": {"seconds": (2, 1, 3)}}
+    for changes in ({"name": "velocity_bias"}, late):
+        other = replace(diagnosis, effects=(replace(arm, **changes),))
         with pytest.raises(InputError, match="no parameter corrects what was found"):
             verified_corrections(Parameters(), other, [None])
 
