@@ -228,10 +228,7 @@ def residual_trend(
     return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
         *_circular(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
-        *_beam(
-            fast, both, moving, _turned(body_from_enu, 0.5 * (before + after)),
-            np.eye(3) if rotation_dvl_from_body is None else rotation_dvl_from_body,
-        ),
+        *_beam(fast, both, moving, np.eye(3) if rotation_dvl_from_body is None else rotation_dvl_from_body),
     )  # fmt: skip
 
 
@@ -247,34 +244,32 @@ def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> A
     return known
 
 
-def _beam(
-    fit: _Fit, columns: Array, moving: Array, beside: Array, rotation_dvl_from_body: Array
-) -> tuple[float, float, float]:
+def _beam(fit: _Fit, columns: Array, moving: Array, rotation_dvl_from_body: Array) -> tuple[float, float, float]:
     """Return the most significant share by which one beam reads low, its σ, and its azimuth in the DVL, degrees.
 
     The velocity is the least-squares solution of four beams. A beam that reads high looks like the opposite one that
-    reads low, but for scales. columns: (N, 3, n) of the fit. moving, beside: (N, 3) m/s, body, velocity and the mean of
-    its neighbours: instrumental variables, because the noise of `moving` is in the residual and would look like a beam.
+    reads low, but for scales. columns: (N, 3, n) of the fit. moving: (N, 3) m/s, body.
     """
     t, weight, found = rotation_dvl_from_body, fit.weight, []
     flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)
     few = of_few(np.array([len(fit.starts) - 1.0]))[0]
+    # the noise of the DVL, which is in `moving` as well, looks like a beam in signals that are smaller
+    noise = float(np.einsum("n,ni,ni->", weight, fit.rest, fit.rest))
     for degrees in AZIMUTHS_DEG:
         along = math.radians(degrees)
         beam = np.array([flat * math.cos(along), flat * math.sin(along), -down])
         solution = beam / [2.0 * flat**2, 2.0 * flat**2, 4.0 * down**2]
-        one_beam = (t.T @ np.outer(solution, beam) @ t).T
-        low, instrument = (
-            each @ one_beam - columns @ (fit.p @ np.einsum("n,nij,ni->j", weight, columns, each @ one_beam))
-            for each in (moving, beside)
-        )
-        moment = max(float(np.einsum("n,ni,ni->", weight, instrument, low)), 1e-12)
-        share = float(np.einsum("n,ni,ni->", weight, instrument, fit.rest)) / moment
-        rest = fit.rest - share * low
-        scores = np.add.reduceat(weight * (instrument * rest).sum(axis=1), fit.starts) / moment
+        low = moving @ (t.T @ np.outer(solution, beam) @ t).T
+        alone = low - columns @ (fit.p @ np.einsum("n,nij,ni->j", weight, columns, low))
+        square = float(np.einsum("n,ni,ni->", weight, alone, alone))
+        if square <= noise:
+            continue
+        share = float(np.einsum("n,ni,ni->", weight, alone, fit.rest)) / square
+        rest = fit.rest - share * alone
+        scores = np.add.reduceat(weight * (alone * rest).sum(axis=1), fit.starts) / square
         std = few * float(_std(scores[None], QUICK_STRETCHES)[0])
         found.append((abs(share), std, (degrees + 180.0 * (share < 0.0)) % 360.0))
-    return max(found, key=lambda each: each[0] / each[1])
+    return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
 
 
 def _beside(time: Array, values: Array, starts: Index) -> Array:
