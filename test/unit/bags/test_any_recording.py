@@ -393,7 +393,7 @@ def test_thousands_of_channels_are_opened_in_a_time_that_goes_with_their_number(
         assert len(list(bag.messages(bag.topics))) == 4
     recording = open_recording([tmp_path / "many.mcap"])
     assert len(recording.types) == 60_000
-    assert time.process_time() - began < 10.0  # it was minutes; 4 s are usual
+    assert time.process_time() - began < 20.0  # it was minutes; 2 to 6 s are usual
 
 
 # ---------------------------------------------------------------------- what is no damage
