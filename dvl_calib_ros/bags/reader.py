@@ -38,7 +38,7 @@ class BagReader:
     """Context manager that reads one or more recordings as one, in order of log time.
 
     known: type -> known versions of its definition, for recordings without. notes: messages to the user on damage,
-    complete after the last message. Raises InputError for a path that is no bag.
+    complete after the last message. topics: topic -> message type. Raises InputError for a path that is no bag.
     """
 
     def __init__(self, paths: Sequence[Path], known: Mapping[str, Sequence[str]] | None = None) -> None:
@@ -52,6 +52,7 @@ class BagReader:
         except BaseException:
             self._stack.close()
             raise
+        self.topics = {channel.topic: channel.msgtype for source in self._sources for channel in source.counts}
 
     def __enter__(self) -> BagReader:
         return self
@@ -64,11 +65,6 @@ class BagReader:
     def close(self) -> None:
         """Remove decompressed files."""
         self._stack.close()
-
-    @property
-    def topics(self) -> dict[str, str]:
-        """Topic -> message type."""
-        return {channel.topic: channel.msgtype for source in self._sources for channel in source.counts}
 
     def channels(self, topic: str) -> list[Channel]:
         """Return all channels of a topic; one, unless the recording is inconsistent."""

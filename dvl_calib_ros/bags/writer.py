@@ -206,14 +206,15 @@ class _Part:
     def __init__(self, writer: Writer) -> None:
         self.writer = writer
         self.connections: dict[Channel, Any] = {}
+        self._definitions: dict[str, Definition | None] = {}
 
     def fits(self, channel: Channel) -> bool:
         """Return whether the file has no other definition of the channel's type."""
-        same = [each for each in self.connections if each.msgtype == channel.msgtype]
-        return all(each.definition == channel.definition for each in same)
+        return self._definitions.get(channel.msgtype, channel.definition) == channel.definition
 
     def add(self, channel: Channel) -> None:
         topic, msgtype, definition = channel
+        self._definitions[msgtype] = definition
         text = definition.text if definition else ""
         digest = _type_hash(definition, msgtype)
         self.connections[channel] = self.writer.add_connection(topic, msgtype, msgdef=text, rihs01=digest)

@@ -12,6 +12,9 @@ from ..calibration.numerics.frames import Array, attitude_enu_flu_from_ned_frd, 
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from ..messages.encode import WaterReading
 
+# 2000 deg/s, the largest range of common gyros
+FASTEST_RADPS = 35.0
+
 
 def imu_samples(stamps_ns: Sequence[int], rpy: Array) -> list[ImuSample]:
     """Convert roll, pitch, yaw (N, 3) rad of a forward-right-down body in north-east-down, at increasing stamps."""
@@ -32,9 +35,15 @@ def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
     """
     from scipy.spatial.transform import Rotation, RotationSpline
 
+    rates: Array = np.zeros((len(time), 3))
     if len(time) < 2:
-        return np.zeros((len(time), 3))
-    rates: Array = RotationSpline(time, Rotation.from_matrix(rotation_enu_from_body))(time, 1)
+        return rates
+    attitudes = Rotation.from_matrix(rotation_enu_from_body)
+    turned = (attitudes[:-1].inv() * attitudes[1:]).magnitude()
+    cuts = np.flatnonzero(turned > FASTEST_RADPS * np.diff(time)) + 1  # the curve would swing to infinity there
+    for part in np.split(np.arange(len(time)), cuts):
+        if len(part) > 1:
+            rates[part] = RotationSpline(time[part], attitudes[part])(time[part], 1)
     return rates
 
 

@@ -46,9 +46,11 @@ from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.urdf import read_urdf
 from dvl_calib_ros.fleet_catalogue.parquet_parts import ASIDE, Catalogue, CataloguePart
 from dvl_calib_ros.fleet_catalogue.recording_entry import Entry
+from dvl_calib_ros.logs.column_map import read_table
+from dvl_calib_ros.logs.dvl_log import DvlLog
 from dvl_calib_ros.logs.dvl_logs import read_dvl_log
 from dvl_calib_ros.logs.nmea import read_rmc
-from dvl_calib_ros.logs.trajectories import read_columns
+from dvl_calib_ros.logs.trajectories import read_attitude, read_columns
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.messages.live_feed import MessageFeed
@@ -243,9 +245,13 @@ def run_trajectory(data: bytes) -> None:
     path = _file(f"fuzzed_dvl.{'csv' if data[:1] < b'a' else 'npy'}", data[1:])
     try:
         time, values, _ = read_columns(path, "m/s")
+        if path.suffix == ".csv":
+            read_table(path, "time=1,vx=2,vy=3,vz=4", 0, np.eye(3), 0.0)
+        attitudes = read_attitude(path, 0, [])
     except InputError as error:
         assert len(str(error)) < 10_000
         return
+    assert all(np.isfinite([*each.orientation, *each.angular_velocity]).all() for each in attitudes)
     assert values.shape == (len(time), 3) and np.isfinite(values).all() and (np.diff(time) > 0.0).all()
 
 
@@ -253,10 +259,13 @@ def run_log(data: bytes) -> None:
     """The first byte says what the log is called."""
     path = _file(f"fuzzed.{('log', 'BIN', 'tlog', 'nmea')[data[0] % 4] if data else 'log'}", data[1:])
     try:
-        samples = read_rmc(path, 0.0, []) if path.suffix == ".nmea" else read_dvl_log(path).samples
+        log = DvlLog(read_rmc(path, 0.0, []), Counter()) if path.suffix == ".nmea" else read_dvl_log(path)
     except InputError as error:
         assert len(str(error)) < 10_000
         return
+    samples = log.samples
+    assert all(np.isfinite([*each.orientation, *each.angular_velocity]).all() for each in log.attitudes)
+    assert all(np.isfinite(each.velocity).all() for each in log.references)
     stamps = [each.stamp_ns for each in samples]
     assert stamps == sorted(set(stamps)) and all(np.isfinite(each.velocity).all() for each in samples)
 

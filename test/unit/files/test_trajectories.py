@@ -147,6 +147,19 @@ WRONG = {
 }  # fmt: skip
 
 
+def test_an_attitude_that_nothing_can_turn_to_leaves_the_rates_of_the_others(tmp_path):
+    """A damaged row, 87 µs after another: the smooth curve through all of them had no end."""
+    time = 0.1 * np.arange(40)
+    sound = np.column_stack([time, 0.05 * np.sin(time), 0.02 * np.cos(time), 0.1 * time])
+    wild = np.insert(sound, 20, [time[19] + 87e-6, 1e300, -0.5, 3.0], axis=0)
+    header = "Time [s],Roll [rad],Pitch [rad],Yaw [rad]\n"
+    both = [csv(tmp_path / f"{n}_attitude.csv", rows, header) for n, rows in enumerate((sound, wild))]
+    expected, found = (np.array([each.angular_velocity for each in read_attitude(path, 0, [])]) for path in both)
+    far = np.abs(np.arange(40) - 19.5) > 8  # a smooth curve swings next to it
+    np.testing.assert_allclose(np.delete(found, 20, axis=0)[far], expected[far], atol=0.01)
+    assert np.isfinite(found).all()
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_what_is_wrong_in_a_file_is_said_with_file_and_row_and_nothing_is_written(tmp_path, name):
     content, expected = WRONG[name]
