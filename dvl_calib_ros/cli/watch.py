@@ -247,10 +247,15 @@ def _warnings(status: Status) -> list[str]:
 
 
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
-    """Yield the mounting, the first warning, streams, drift by axis and headings."""
+    """Yield mounting and first warning, streams, drift by axis and headings. A narrow view begins with the warning."""
     is_usable, colour = _is_usable(status), COLOURS.get(status.level, "red")
-    why = "see below" if status.get("next code") == "NEXT_REJECTED" else "not observable yet"
+    why = "see the warning" if status.get("next code") == "NEXT_REJECTED" else "not observable yet"
     between = [Row("")] if width >= WIDE else []
+    first = [Row(each, colour if status.level else "yellow", most=2) for each in warnings[:1]]
+    if len(warnings) > 1:
+        first.append(Row(f"+{len(warnings) - 1} more (w)", colour))
+    if width < WIDE:
+        yield from first
     yield from between
     yield Row("mounting now") if is_usable else Row(f"mounting: not to be used, {why}", colour, most=2)
     for each in MOUNTING:
@@ -259,10 +264,8 @@ def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
             yield Row(text, "" if is_usable else "dim")
     if is_usable and (sound := status.values.get("speed of sound", "")):
         yield Row(f"speed of sound  {sound}", most=2)
-    if warnings:
-        yield Row(warnings[0], colour if status.level else "yellow", most=2)
-    if len(warnings) > 1:
-        yield Row(f"+{len(warnings) - 1} more (w)", colour)
+    if width >= WIDE:
+        yield from first
     yield from between
     yield Row("   ".join(_stream(status, *each) for each in STREAMS))
     yield from (_goal(status, *each, width) for each in GOALS[1:] if f"goal {each[0]} [%]" in status.values)

@@ -185,6 +185,9 @@ next: drive straight, west (270°), about
 75 s ± 43 s until good enough
 s save  r r forget  w warnings  q quit
 14:03:22 saved to /data/calibration.yaml
+no usable DVL message for 7 s; check the
+sensor, its driver and the topic …
++2 more (w)
 mounting now
 roll    0.108 ±1.177°
 pitch  -0.512 ±0.322°
@@ -194,9 +197,6 @@ arm y   0.000 m, as set
 arm z  -0.120 m, as set
 scale   0.412 ±0.120 %
 delay   0.102 ±0.011 s
-no usable DVL message for 7 s; check the
-sensor, its driver and the topic …
-+2 more (w)
 DVL 5.0 Hz, 0 s ago   reference 1.0 Hz,
 3 s ago   IMU 50.0 Hz, 0 s ago""",
 }
@@ -235,6 +235,15 @@ def test_all_that_an_operator_needs_is_seen_on_a_small_terminal(monkeypatch, siz
     assert saved == SEEN[size]
     fixed = [first.splitlines()[:4], *(each.splitlines()[:4] for each in told)]
     assert fixed == [saved.splitlines()[:4]] * 4, "what an operator looks for stays at its place"
+
+
+def test_a_long_answer_hides_no_warning_on_a_small_terminal():
+    values = MOUNTED | {f"finding {number}": each for number, each in enumerate(WARNINGS, start=1)}
+    found = status(2, "; ".join(WARNINGS), **values, next="straight legs on opposite headings, at two speeds")
+    console = Console(file=io.StringIO(), width=40, height=20, force_terminal=True, color_system=None)
+    console.print(View(found, 100.5, (), "/data/calibration.yaml is kept: its result is better " * 3))
+    shown = console.file.getvalue().splitlines()
+    assert len(shown) <= 20 and "+2 more (w)" in shown and any("no usable DVL message" in each for each in shown)
 
 
 @pytest.mark.parametrize("size", [(80, 24), (40, 20), (40, 12)])
