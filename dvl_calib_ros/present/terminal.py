@@ -173,7 +173,8 @@ def _found(reason: Reason) -> Iterator[Padding]:
     from rich.padding import Padding
 
     yield Padding(Text(reason.says, COLOURS[reason.severity]), (0, 0, 0, 2))
-    yield Padding(Text.assemble(reason.remedy, " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
+    remedy = [reason.remedy, " "] if reason.remedy else []
+    yield Padding(Text.assemble(*remedy, (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
 
 
 def rich_table(table: Table) -> Folding:
