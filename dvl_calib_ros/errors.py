@@ -24,6 +24,13 @@ def printable(text: str) -> str:
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
+# what begins a formula in spreadsheets; the wide forms in Excel for East Asian languages
+_FORMULA = tuple("=+-@\uff1d\uff0b\uff0d\uff20")
+
+
 def as_cell(value: object) -> object:
-    """Return a value for a spreadsheet cell; text that would run as a formula is quoted."""
-    return f"'{value}" if isinstance(value, str) and value.startswith(("=", "+", "-", "@")) else value
+    """Return a value for a spreadsheet cell: text on one line, quoted if it would run as a formula."""
+    if not isinstance(value, str):
+        return value
+    text = printable(value)
+    return f"'{text}" if text.lstrip().startswith(_FORMULA) else text

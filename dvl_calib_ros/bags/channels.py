@@ -130,7 +130,9 @@ PLAIN_CDR = (b"\0\0", b"\0\1")
 
 # the longest definition in ROS has 9 kB, including nested ones, and the largest array 48 elements
 LONGEST_DEFINITION = 1 << 18
-LARGEST_ARRAYS = 1 << 16
+LARGEST_ARRAY = 1 << 16
+# a decoder has a line of code per field and array element, and is compiled in 0.3 ms per line
+MOST_VALUES = 1 << 13
 # number of cached type stores: making one takes longer than reading a minute, and recordings share them
 KEPT = 32
 _FIELD = re.compile(r"[A-Za-z]\w*", re.ASCII)
@@ -211,26 +213,41 @@ def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
 
 def _without_constants(types: dict[str, Any]) -> dict[str, Any]:
     """Remove the constants from types. Raises DefinitionError for definitions that no driver has."""
-    arrays = 0
     for name, (_, fields) in types.items():
         for field, (kind, description) in fields:
             if not _TYPE.fullmatch(name) or not _FIELD.fullmatch(field):
                 raise DefinitionError(f"{name!r} or its field {field!r} is no name")
-            if kind == Nodetype.ARRAY:  # decoders have a line of code per element
-                arrays += description[1]
-    if arrays > LARGEST_ARRAYS:
-        raise DefinitionError(f"arrays of {arrays} elements")
+            # no elements take no bytes: a sequence of such messages would be decoded for ever
+            if kind == Nodetype.ARRAY and not 0 < description[1] <= LARGEST_ARRAY:
+                raise DefinitionError(f"{field} is an array of {description[1]} elements")
     _check_finite(types)
     return {name: ([], fields) for name, (_, fields) in types.items()}
 
 
 def _check_finite(types: dict[str, Any]) -> None:
-    """Raise DefinitionError for a type that contains itself."""
+    """Raise DefinitionError for a type that contains itself, or too many fields; a sequence counts as one element."""
     inner = {name: {_message_type_of(description) for _, description in fields} for name, (_, fields) in types.items()}
     try:
-        TopologicalSorter(inner).prepare()
+        order = [*TopologicalSorter(inner).static_order()]
     except CycleError as error:
         raise DefinitionError(f"the definition of {min(error.args[1])} contains itself") from error
+    sizes: dict[str, int] = {}
+    for name in order:
+        _, fields = types.get(name, ((), ()))
+        sizes[name] = max(1, sum(_n_values(description, sizes) for _, description in fields))
+        if sizes[name] > MOST_VALUES:
+            raise DefinitionError(f"the definition of {name} unfolds to more than {MOST_VALUES} fields")
+
+
+def _n_values(description: Any, sizes: Mapping[str, int]) -> int:
+    """Return the number of values that are decoded for a field; numbers of an array are decoded at once."""
+    kind, what = description
+    size = sizes[_message_type_of(description)]
+    if kind != Nodetype.ARRAY:
+        return size
+    (element, element_what), n_elements = what
+    is_number = element == Nodetype.BASE and element_what[0] not in ("string", "wstring")
+    return size if is_number else size * int(n_elements)
 
 
 def _message_type_of(description: Any) -> str:

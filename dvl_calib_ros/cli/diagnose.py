@@ -50,12 +50,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.simulator:
         return run_against_simulator(arguments, DEFAULTS)
     check_without(arguments)
-    from ..diagnosis.answer.compensation import compensated, parameter_file
+    from ..diagnosis.answer.compensation import parameter_file, verified_corrections
     from ..diagnosis.answer.results import DiagnosisVerdict, diagnosis_document
     from ..diagnosis.answer.simulated_twin import write_twins
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.model.recorded_streams import recording_names
     from ..disk.atomic import own_stream, save_all
+    from ..errors import InputError
     from ..present import diagnosis as present
 
     parameters = common.load(arguments)
@@ -84,21 +85,27 @@ def run(arguments: argparse.Namespace) -> int:
             forget=True,
         )
 
-    written: list[Path] = []
+    written: list[str] = []
 
     def answer() -> None:
         layout = present.diagnosis if arguments.verbose else present.first_screen
         common.print_document(layout(diagnosis), discovery.doubts)
         common.print_found(discovery, arguments.bags, first_only=not arguments.verbose)
-        if written:
-            common.console().print(f"wrote {', '.join(map(str, written))}", soft_wrap=True, markup=False)
+        for line in written:
+            common.console().print(line, soft_wrap=True, markup=False)
 
     def apply(path: Path) -> None:
-        days: dict[Path, int | None] = {path: None}
+        days: dict[int | None, Path] = {None: path}
         if any(effect.by_recording for effect in diagnosis.effects):
-            days |= {of_each[name]: index for index, (name, _) in enumerate(diagnosis.recordings)}
-        save_all({at: parameter_file(compensated(parameters, diagnosis, day)).encode() for at, day in days.items()})
-        written.extend(at for at in days if own_stream(at) is None)
+            days |= {index: of_each[name] for index, (name, _) in enumerate(diagnosis.recordings)}
+        try:
+            found = verified_corrections(parameters, diagnosis, [*days])
+        except InputError as error:
+            raise InputError(f"--apply {path}: {error}") from None
+        save_all({days[day]: parameter_file(each.parameters).encode() for day, each in found.items()})
+        written.extend(
+            f"wrote {days[day]}: {each.sentence}" for day, each in found.items() if own_stream(days[day]) is None
+        )
 
     def write_all_twins(folder: Path) -> None:
         for twin in diagnosis.twins:

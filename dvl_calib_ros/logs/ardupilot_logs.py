@@ -30,17 +30,32 @@ _FIX = 3
 _LONGEST_S = 5.0
 
 
-def read_ardupilot_log(path: Path) -> DvlLog:
-    """Read a log of either kind. Raises InputError if pymavlink is not installed, or the log has no DVL."""
+def is_dataflash(start: bytes) -> bool:
+    """Return whether these bytes begin a DataFlash log."""
+    return start.startswith(b"\xa3\x95")
+
+
+def is_telemetry(start: bytes) -> bool:
+    """Return whether these bytes begin with two messages of MAVLink, each behind its 8 bytes of time."""
+    marker, length, flags = (start[8:11] + bytes(3))[:3]
+    head = {0xFE: 8, 0xFD: 12 + 13 * (flags & 1)}.get(marker)
+    return head is not None and start[16 + head + length : 17 + head + length] in (b"\xfe", b"\xfd")
+
+
+def read_ardupilot_log(path: Path, start: bytes) -> DvlLog:
+    """Read the log that begins with `start`. Raises InputError if pymavlink is not installed, or the log has no DVL.
+
+    pymavlink's own choice of a reader is by name: it runs a file in a folder `bin`, and connects to `udp:`.
+    """
     try:
-        from pymavlink import mavutil
+        from pymavlink import DFReader, mavutil
     except ImportError as error:
         raise InputError(f"{path}: is read by pymavlink; pip install 'dvl_calib_ros[ardupilot]'") from error
     read = _VehicleMessages()
     wanted = list(_TAKERS)
     try:
         with _silenced():
-            log = mavutil.mavlink_connection(str(path), notimestamps=False)
+            log = (DFReader.DFReader_binary if is_dataflash(start) else mavutil.mavmmaplog)(str(path))
             with closing(log):
                 while (message := log.recv_match(type=wanted)) is not None:
                     read.take(message)

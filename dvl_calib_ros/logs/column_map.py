@@ -50,6 +50,8 @@ def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float
     text: the map. start_ns: stamp of time 0. rotation: (3, 3) to forward-left-up. std: m/s; 0: covariance not given.
     """
     names = column_map(text)
+    if not path.is_file():  # a pipe would block
+        raise InputError(f"{path}: no such file")
     try:
         lines = path.read_text(encoding="utf-8-sig").rstrip("\0").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -28,13 +29,13 @@ from ..calibration.numerics.frames import FLU_FROM_FRD, Array
 from ..calibration.numerics.samples import DvlSample
 from ..errors import InputError
 from ..messages.encode import WaterReading
+from .ardupilot_logs import is_dataflash, is_telemetry, read_ardupilot_log
 from .dvl_log import DvlLog, imu_samples
 from .nortek_logs import is_nortek_log, read_nortek_log
 from .pd0_nmea import GENERAL_NMEA, Nmea
 from .text_logs import is_pd6, is_sentences, read_pd6, read_sentences
 
 PD0_START = b"\x7f\x7f"
-_DATAFLASH_START, _MAVLINK_STARTS = b"\xa3\x95", (b"\xfe", b"\xfd")
 # number of bytes that identify a file's kind
 _SNIFFED = 65536
 _FIXED_LEADER, _VARIABLE_LEADER, _BOTTOM_TRACK = 0x0000, 0x0080, 0x0600
@@ -56,25 +57,18 @@ def is_dvl_log(path: Path) -> bool:
             start = file.read(_SNIFFED)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    if _is_ardupilot_log(path, start) or is_nortek_log(start) or is_pd6(start) or is_sentences(start):
+    kinds = (is_dataflash, is_telemetry, is_nortek_log, is_pd6, is_sentences)
+    if any(is_kind(start) for is_kind in kinds):
         return True
     return (PD0_START in start[:4096] and _next_ensemble(start, 0) is not None) or _holds_json(start)
-
-
-def _is_ardupilot_log(path: Path, start: bytes) -> bool:
-    """Check the first bytes; a telemetry log has 8 bytes of time before each message, so its name counts as well."""
-    is_telemetry = path.suffix.lower() == ".tlog" and start[8:9] in _MAVLINK_STARTS
-    return is_telemetry or start.startswith(_DATAFLASH_START)
 
 
 def read_dvl_log(path: Path) -> DvlLog:
     """Read a log of any kind. Raises InputError if it is none, or has no usable velocity."""
     with path.open("rb") as file:
         start = file.read(_SNIFFED)
-    if _is_ardupilot_log(path, start):
-        from .ardupilot_logs import read_ardupilot_log  # imports this module
-
-        log = read_ardupilot_log(path)
+    if is_dataflash(start) or is_telemetry(start):
+        log = read_ardupilot_log(path, start)
     else:
         content = path.read_bytes()
         held = [kind for kind, (holds, _) in _KINDS.items() if holds(content)]
@@ -97,7 +91,7 @@ def _read_nortek(_: Path, content: bytes) -> DvlLog:
 
 
 def _holds_json(content: bytes) -> bool:
-    return b'"vx"' in content
+    return re.search(rb'"vx"\s*:', content) is not None
 
 
 def _read_json(path: Path, content: bytes) -> DvlLog:

@@ -209,7 +209,7 @@ def import_recording(
     notes: list[str] = []
     if options.columns:
         log = read_table(dvl, options.columns, start_ns, body_from(options.frame), options.dvl_std)
-    elif dvl.is_file() and dvl.suffix not in (".csv", ".npy") and is_dvl_log(dvl):
+    elif dvl.is_file() and is_dvl_log(dvl):
         log = read_dvl_log(dvl)
     else:
         log = DvlLog(read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes), Counter())

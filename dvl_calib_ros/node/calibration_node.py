@@ -37,7 +37,7 @@ from ..calibration.streams.position_velocities import check_model
 from ..discovery.gravity import believed_heading
 from ..discovery.transforms import Frames, not_default, placement
 from ..disk.atomic import check_writable
-from ..errors import InputError, printable
+from ..errors import InputError
 from ..files.output_paths import check_outputs
 from ..files.parameter_files import NODE_NAME
 from ..files.result_file import (
@@ -94,7 +94,7 @@ class CalibrationNode(AnsweringNode):
         if parameters.initial_calibration:
             initial = load_initial_calibration(Path(parameters.initial_calibration), parameters.mounting_rpy)
         if parameters.prior_source == "initial_window":
-            self.get_logger().warning(str(finding("PRIOR_HOLDS_ERROR")))
+            self.warn(str(finding("PRIOR_HOLDS_ERROR")))
         kalman.prepare()
         self._worker = ThreadPoolExecutor(1, "g2")
         self._initial = initial
@@ -125,7 +125,7 @@ class CalibrationNode(AnsweringNode):
         self._estimate_publisher = self._publisher(TwistWithCovarianceStamped, "~/estimate", latched)
         self._iac_publisher = self._publisher(TwistWithCovarianceStamped, "~/iac/estimate", latched)
         self._mounting_publisher = self._publisher(PoseWithCovarianceStamped, "~/mounting", latched)
-        self._mounting = MountingOutput(self, self._mounting_publisher, parameters.publish_tf, self._warn)
+        self._mounting = MountingOutput(self, self._mounting_publisher, parameters.publish_tf, self.warn)
         self._corrected_publisher = self._publisher(TwistWithCovarianceStamped, "~/calibrated_twist", 100)
         self._diagnostics_publisher = self._publisher(DiagnosticArray, "/diagnostics", 10)
         self._inputs: dict[str, Any] = {}
@@ -179,7 +179,7 @@ class CalibrationNode(AnsweringNode):
         try:
             found = searching.step()
         except InputError as error:
-            self._warn(f"{error}; topics are not searched")
+            self.warn(f"{error}; topics are not searched")
             searching.close()
             self._discovering = None
             return
@@ -189,10 +189,10 @@ class CalibrationNode(AnsweringNode):
         discovery, parameters = found
         self._found = [finding("TOPICS_FOUND", own=self._inputs["dvl/twist"].topic_name, found=discovery.found[0])]
         for sentence in discovery.found[1:]:
-            self.get_logger().info(printable(sentence))
-        self._warn(str(self._found[0]))
+            self.info(sentence)
+        self.warn(str(self._found[0]))
         for doubt in discovery.doubts:
-            self._warn(doubt)
+            self.warn(doubt)
         topics = discovery.topics
         names = {"dvl/twist": topics.dvl, "gnss/twist": topics.gnss, "imu/data": topics.imu}
         present = {name for name, _ in self.get_topic_names_and_types()}
@@ -219,9 +219,9 @@ class CalibrationNode(AnsweringNode):
     ) -> None:
         """Start a calibration with these parameters. feed: its earlier messages are fed again."""
         self._calibrator = Calibrator(
-            parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self._warn, worker=self._worker
+            parameters, initial=initial, block_size=BLOCK_SIZE, on_event=self.warn, worker=self._worker
         )
-        self._feed = feed or MessageFeed(self._calibrator, self._warn)
+        self._feed = feed or MessageFeed(self._calibrator, self.warn)
         self._feed.begin_again(self._calibrator)
         self._lever_arm: Sequence[float] | None = parameters.lever_arm if any(parameters.lever_arm) else None
 
@@ -249,9 +249,7 @@ class CalibrationNode(AnsweringNode):
         if parameters.replace(**found.values) == parameters.replace(**place):  # nothing was estimated with these values
             self._calibrator.set_parameters(parameters.replace(**place))
             return
-        self.get_logger().info(
-            f"{printable(found.said)}; the calibration starts with it (set use_transforms to false to ignore it)"
-        )
+        self.info(f"{found.said}; the calibration starts with it (set use_transforms to false to ignore it)")
         self._restart(parameters.replace(**found.values))
 
     def _restart(self, parameters: Parameters, feed: MessageFeed | None = None) -> None:
@@ -266,14 +264,11 @@ class CalibrationNode(AnsweringNode):
         events = PublisherEventCallbacks(use_default_callbacks=False)
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
-    def _warn(self, sentence: str) -> None:
-        self.get_logger().warning(printable(sentence))
-
     def _log_configuration(self) -> None:
         default = Parameters().as_dict()
         given = self._calibrator.parameters.as_dict()
         changed = {name: value for name, value in given.items() if value != default[name]}
-        self.get_logger().info(f"model {given['model']}; parameters not at their default: {changed or 'none'}")
+        self.info(f"model {given['model']}; parameters not at their default: {changed or 'none'}")
 
     # ------------------------------------------------------------------ input
 
@@ -288,7 +283,7 @@ class CalibrationNode(AnsweringNode):
 
         def on_incompatible(event: Any) -> None:
             if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
-                self.get_logger().info(f"{topic}: a publisher is best effort; subscribing as best effort")
+                self.info(f"{topic}: a publisher is best effort; subscribing as best effort")
                 assert self.executor is not None  # it runs this callback
                 self.executor.create_task(resubscribe)
 
@@ -436,7 +431,7 @@ class CalibrationNode(AnsweringNode):
         calibrator = self._calibrator
         parameters = self._late_clocks.parameters(calibrator.registration_so_far, calibrator.parameters)
         if parameters is not None:
-            self._warn(" ".join(map(str, self._late_clocks.found)))
+            self.warn(" ".join(map(str, self._late_clocks.found)))
             self._restart(parameters, self._feed)
         if self._late_clocks.stand and not self._awaits_heading_std:
             self._feed.kept.forget()
@@ -504,7 +499,7 @@ class CalibrationNode(AnsweringNode):
             response.message = str(error)
         except InputError as error:
             response.message = str(error)
-            self.get_logger().error(response.message)
+            self.error(response.message)
         else:
             response.success, response.message = True, f"saved to {path}"
         return response
@@ -545,7 +540,7 @@ class CalibrationNode(AnsweringNode):
         self._calibrator.set_parameters(self._changed(parameters))
         self._feed.decoder.parameters = self._calibrator.parameters
         if self._calibrator.selected != before:
-            self.get_logger().info(f"running {self._calibrator.selected} instead of {before}")
+            self.info(f"running {self._calibrator.selected} instead of {before}")
             self._publish_estimate()
 
     def _changed(self, parameters: list[Parameter]) -> Parameters:

@@ -26,6 +26,7 @@ from ..calibration.numerics.samples import Stream
 from ..calibration.registration.clock_domains import arrival_offset
 from ..calibration.results.results import Estimate, scale_and_delay
 from ..calibration.streams.aligner import whereabouts
+from ..errors import printable
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding, of_consequence
@@ -178,7 +179,7 @@ def diagnose(
         found = of_consequence(found, calibrator.parameters.target_drift)
     found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
     status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
-    status.message = "; ".join(map(str, found)) or f"{estimate.model} {estimate.convergence.value}"
+    status.message = printable("; ".join(map(str, found))) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,
         "why": selection.reason(calibrator.parameters).sentence,
@@ -197,7 +198,7 @@ def diagnose(
     }
     for number, each in enumerate(found, start=1):
         values[f"finding {number}"] = str(each)
-    status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    status.values = [KeyValue(key=key, value=printable(str(value))) for key, value in values.items()]
     return status
 
 

@@ -70,7 +70,7 @@ class Listener:
 
     def _on_answer(self, future: Any) -> None:
         error = future.exception()
-        text = future.result().message if error is None else printable(str(error))
+        text = printable(future.result().message if error is None else str(error))
         self.is_waiting = False
         self.answer = f"{time.strftime('%H:%M:%S')} {text}"  # the time distinguishes equal answers
 

@@ -14,11 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NamedTuple
 
-from rclpy.node import Node
-
 from ..calibration.models.parameters import Parameters
 from ..discovery.topic_choice import may_be_dvl
 from ..errors import InputError
+from .services import AnsweringNode
 
 if TYPE_CHECKING:
     from ..discovery.discovery import Discovery
@@ -54,7 +53,7 @@ class Discovering:
 
     def __init__(
         self,
-        node: Node,
+        node: AnsweringNode,
         named: dict[str, str | None],
         parameters: Parameters,
         given: Collection[str],
@@ -103,7 +102,7 @@ class Discovering:
 
     def _begin(self) -> None:
         topics = ", ".join(self._may_be_dvl())
-        self._node.get_logger().info(f"the DVL's topic has no publisher; examining the others ({topics}) ...")
+        self._node.info(f"the DVL's topic has no publisher; examining the others ({topics}) ...")
         try:
             from ..bags.writer import BagWriter
             from .topic_recorder import TopicRecorder
@@ -124,7 +123,7 @@ class Discovering:
         except InputError as error:
             if str(error) != self._said:  # the search repeats, the message does not
                 self._said = str(error)
-                self._node.get_logger().warning(self._said)
+                self._node.warn(self._said)
             return None
 
     def close(self) -> None:

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterType
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from ..calibration.models.parameter_spec import ParameterSpec
 from ..calibration.models.parameters import SCHEMA, Parameters
 from ..files.parameter_files import is_ros_parameter, names_of_others
+from .services import AnsweringNode
 
 _TYPES = {
     "string": ParameterType.PARAMETER_STRING,
@@ -40,7 +40,7 @@ def descriptor(spec: ParameterSpec) -> ParameterDescriptor:
     return described
 
 
-def declare_parameters(node: Node, files: Sequence[Path] = ()) -> Parameters:
+def declare_parameters(node: AnsweringNode, files: Sequence[Path] = ()) -> Parameters:
     """Declare every parameter with its value at the start. Raises ParameterError and InputError.
 
     The node must have declared its overrides automatically: unknown names are then seen, which ROS 2 would ignore, and
@@ -57,7 +57,7 @@ def declare_parameters(node: Node, files: Sequence[Path] = ()) -> Parameters:
         node.undeclare_parameter(name)
     foreign = sorted(others & given.keys())
     if foreign:
-        node.get_logger().info(f"not ours, though set for all nodes: {', '.join(foreign)}")
+        node.info(f"not ours, though set for all nodes: {', '.join(foreign)}")
     parameters = Parameters.from_mapping({name: value for name, value in given.items() if name not in others})
     for name, spec in SCHEMA.items():
         node.declare_parameter(name, parameters.as_dict()[name], descriptor(spec), ignore_override=True)

@@ -1,4 +1,4 @@
-"""A node that survives errors in service requests, and reports topics that it cannot create."""
+"""A node that survives errors in service requests, and logs and answers only what is fit for a terminal."""
 
 from __future__ import annotations
 
@@ -11,17 +11,33 @@ from ..errors import InputError, printable
 
 
 class AnsweringNode(Node):  # type: ignore[misc]
-    """Node of rclpy whose services, parameter services included, log an error instead of ending the node."""
+    """Node of rclpy whose services, parameter services included, log an error instead of ending the node.
+
+    What it logs, and what its services say, may hold names from outside: control characters are escaped.
+    """
+
+    # a method for each: rclpy refuses a second severity of one line of code
+    def info(self, text: str) -> None:
+        """Log a text."""
+        self.get_logger().info(printable(text))
+
+    def warn(self, text: str) -> None:
+        """Log a warning."""
+        self.get_logger().warning(printable(text))
+
+    def error(self, text: str) -> None:
+        """Log an error."""
+        self.get_logger().error(printable(text))
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **options: Any) -> Any:
         """Create a service; a request that raises an error is logged and answered with an empty response."""
 
         def answer(request: Any, response: Any) -> Any:
             try:
-                return callback(request, response)
+                return _printable(callback(request, response))
             except Exception as error:  # rclpy raises ValueError for an unknown parameter type
-                why = printable(f"{type(error).__name__}: {error}")
-                self.get_logger().error(f"{srv_name}: a request cannot be answered ({why}); nothing more of it is done")
+                why = f"{type(error).__name__}: {error}"
+                self.error(f"{srv_name}: a request cannot be answered ({why}); nothing more of it is done")
                 return srv_type.Response()
 
         return super().create_service(srv_type, srv_name, answer, **options)
@@ -37,12 +53,21 @@ class AnsweringNode(Node):  # type: ignore[misc]
         return _or_refused(topic, lambda: make(msg_type, topic, *arguments, **options))
 
 
+def _printable(response: Any) -> Any:
+    """Escape control characters in what a response says: std_srvs' message, and reasons of parameters' results."""
+    for part in (response, getattr(response, "result", None), *getattr(response, "results", ())):
+        for name in ("message", "reason"):
+            if hasattr(part, name):
+                setattr(part, name, printable(getattr(part, name)))
+    return response
+
+
 def _or_refused(topic: str, make: Callable[[], Any]) -> Any:
     try:
         return make()
     # rclpy raises its own type for names, the middleware another for one topic with two types
     except Exception as error:
-        why = printable(" ".join(str(error).split()))
+        why = " ".join(str(error).split())
         raise InputError(
             f"topic {topic!r} cannot be had ({why}); name another: one for each sensor, of letters, digits, _ and /"
         ) from error

@@ -127,7 +127,7 @@ class SimulatorNode(AnsweringNode):
             return
         if self._follower is None or now_ns < self._last_ns:
             if self._follower is not None:
-                self.get_logger().info("odometry went back in time; starting again")
+                self.info("odometry went back in time; starting again")
             self._follower, self._start_ns = Follower(self._scenario, now_ns), now_ns
         elif now_ns == self._last_ns:
             return

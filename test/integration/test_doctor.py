@@ -210,7 +210,7 @@ SOUND_RUNS: dict[str, dict[str, Any]] = {
     "a figure eight": {"trajectory": "figure8", "seed": 1},
     "free": {"trajectory": "free", "seed": 2},
     "straight": {"trajectory": "straight", "seed": 3},
-    "a body reference": {"gnss_frame": VelocityFrame.BODY, "seed": 4},
+    "a body reference": {"gnss_frame": VelocityFrame.BODY, "seed": 4, "seconds": 180.0},
     "a receiver of 1 Hz": {"gnss_rate": 1.0, "seed": 5},
     "a fast DVL": {"dvl_rate": 10.0, "seed": 6},
     "a slow DVL": {"dvl_rate": 1.0, "seed": 7, "seconds": 240.0},

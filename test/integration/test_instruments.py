@@ -85,7 +85,8 @@ def test_the_scale_is_taken_out_at_its_cause(saved):
     assert json.loads(chosen.text)["parameters"]["speed_of_sound"] == chosen.settings[1].new
     cerulean = instrument_settings(calibrated, "cerulean", {"velocity_adjustment": 1.01, "roll": 2.0})
     assert cerulean.settings[1].new == pytest.approx(1.01 / too_much, abs=1e-5)
-    assert cerulean.text.splitlines()[0].startswith("SET-SENSOR-ORIENTATION 2, 0, -1.7")
+    roll, pitch, yaw = map(float, cerulean.text.splitlines()[0].removeprefix("SET-SENSOR-ORIENTATION").split(","))
+    assert (roll, pitch) == (2.0, 0.0) and yaw == pytest.approx(-math.degrees(0.03), abs=0.2)
     untold = instrument_settings(calibrated, "waterlinked")
     assert str(untold.settings[0]).startswith("mounting_rotation_offset: 0 (as delivered) -> ")
     assert [each.name for each in untold.settings] == ["mounting_rotation_offset"]

@@ -133,18 +133,32 @@ def test_no_text_gets_through_a_definition_into_code(text, kind):
         assert all(re.fullmatch(r"\w+", field, re.ASCII) for field, _ in fields)
 
 
+def nested(bodies: list[str]) -> str:
+    """Return a definition whose types are these: the first, and C, D, E and so on."""
+    first, *others = bodies
+    return (
+        first + "".join(f"\n{'=' * 80}\nMSG: a/{'CDEFGHIJKLMNOP'[i]}\n{each}" for i, each in enumerate(others)) + "\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("kind", "text"),
     [
         (MSG, "string[900000000] a\n"),
-        (MSG, "".join(f"string[60000] a{i}\n" for i in range(9))),
+        (MSG, "string[60000] a\n"),
+        (MSG, nested(["a/C[60000] a", "uint8 x"])),
+        (MSG, "uint8[0] a\n"),
+        (MSG, nested(["a/C[0] a"])),
+        (MSG, nested([f"a/{'CDEFGHIJKLMNOP'[i]} x\na/{'CDEFGHIJKLMNOP'[i]} y" for i in range(14)] + ["uint8 x"])),
+        (MSG, nested(["a/C[21] x", "a/D[21] x", "a/E[21] x", "uint8 x"])),
+        (MSG, "".join(f"uint8 a{i}\n" for i in range(9000))),
         (MSG, "int32 a # " + "x" * (1 << 19) + "\n"),
         (IDL, "module a { module msg { const long X = 1 << 99999999999; struct B { long x; }; }; };"),
         (IDL, "module a { module msg { const long X = " + "(" * 40 + "1" + ")" * 40 + "; struct B { long x; }; }; };"),
     ],
 )
 def test_a_definition_that_would_take_all_memory_or_for_ever_is_refused(kind, text):
-    with pytest.raises(DefinitionError):
+    with pytest.raises(DefinitionError, match=r"of 900|of 60|of 0|unfolds|characters|computed"):
         typestore(Definition(kind, text), "a/msg/B")
 
 
@@ -159,7 +173,7 @@ def test_messages_of_a_refused_definition_are_counted_not_fatal(tmp_path, capsys
             writer.add_message(channel, log_ns, b"\0\1\0\0" + bytes(64), log_ns)
         writer.finish()
     with BagReader([path]) as bag:
-        assert [(message, "arrays of 900000000" in why) for _, _, message, why in bag.messages(["dvl/twist"])] == [
+        assert [(message, "array of 900000000" in why) for _, _, message, why in bag.messages(["dvl/twist"])] == [
             (None, True)
         ] * 3
     assert main(["replay", str(path)]) == 2

@@ -2,65 +2,187 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import yaml
 
 from ...calibration.models.parameters import SCHEMA, Parameters
-from ..search.arm_clock_ambiguity import ARM_PARAMETERS
-from .results import Diagnosis
+from ...calibration.numerics.frames import Array
+from ...calibration.numerics.samples import VelocityFrame
+from ...effects.registry import EFFECTS
+from ...errors import InputError
+from ..fit.cross_validation import fitted_without, folds_of
+from ..model.hypothesis import Hypothesis, is_time_of_run
+from ..search.arm_clock_ambiguity import ARM, ARM_PARAMETERS, CLOCKS, TWO_CLOCKS
+from .results import Diagnosis, FoundEffect
 
 OFFSETS = {
     "dvl_time_offset": "dvl_time_offset",
     "reference_time_offset": "reference_time_offset",
     "attitude_time_offset": "imu_time_offset",
 }
-
-
+# Effects that a parameter corrects
+CORRECTED = (ARM, *OFFSETS, "water_lock", "clock_drift", "time_offset_jump")
 # A velocity that begins no later is there all the time
 WHOLE_RUN_S = 5.0
 
 
-def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | None = None) -> Parameters:
-    """The parameters with what was found on top: the rest of a lever arm, of a clock's offset, drift and jump.
+@dataclass(frozen=True)
+class Correction:
+    """Parameters with a correction, verified on held-out data.
+
+    changed: values by name, of the parameters that differ. errors: held-out rms without and with it, m/s.
+    """
+
+    parameters: Parameters
+    changed: Mapping[str, Any]
+    errors: tuple[float, float]
+
+    @property
+    def sentence(self) -> str:
+        """The changed values, and the held-out error without and with them."""
+        values = ", ".join(f"{name} {_rounded(value)}" for name, value in self.changed.items())
+        return f"{values}; held-out error {1e3 * self.errors[0]:.1f} to {1e3 * self.errors[1]:.1f} mm/s"
+
+
+def verified_corrections(
+    parameters: Parameters, diagnosis: Diagnosis, days: Sequence[int | None]
+) -> dict[int | None, Correction]:
+    """Return the corrections that change a parameter, of the vehicle (None) or of a recording by index.
+
+    Raises
+    ------
+    InputError
+        If none changes a parameter, or one does not lower the error on held-out data.
+
+    """
+    found = {}
+    for day in days:
+        corrected = compensated(parameters, diagnosis, day)
+        before = parameters.as_dict()
+        changed = {name: value for name, value in corrected.as_dict().items() if value != before[name]}
+        if not changed:
+            continue
+        found[day] = Correction(corrected, changed, held_out_errors(diagnosis, day))
+        if not found[day].errors[1] < found[day].errors[0]:
+            raise InputError(f"not written, since the error does not fall: {found[day].sentence}")
+    if not found:
+        names = ", ".join(" or ".join((each.name, *each.equivalent_to)) for each in diagnosis.effects)
+        raise InputError(f"not written: no parameter corrects what was found ({names or 'no effect'})")
+    return found
+
+
+def held_out_errors(diagnosis: Diagnosis, recording: int | None) -> tuple[float, float]:
+    """Return the held-out rms error (m/s) without a correction and with exactly its values; only φ and δk are fitted.
+
+    recording: index, whose error and correction is wanted; None: of all, with what belongs to the vehicle.
+    """
+    assert diagnosis.selection is not None
+    selection = diagnosis.selection
+    problem = selection.fitter.problem
+    n = len(problem.recordings)
+    of_each = [corrections(diagnosis, None if recording is None else index) for index in range(n)]
+    effects = [effect for effect in selection.fit.effects if any(effect.name in each for each in of_each)]
+    values = {effect.name: tuple(each.get(effect.name, {}) for each in of_each) for effect in effects}
+    hypotheses = selection.base.hypothesis, selection.fit.hypothesis.with_effects(effects, n, values)
+    errors = np.zeros((2, len(problem.bin_of)))
+    fold_of = folds_of(problem)
+    for fold, fits in fitted_without(selection.fitter, hypotheses, selection.fit.noise, fold_of, frozenset(values)):
+        at = (fold_of == fold)[problem.bin_of]
+        for fit, square in zip(fits, errors, strict=True):
+            square[at] = (problem.errors(fit.seen)[at] ** 2).sum(axis=1)
+    if recording is not None:
+        errors = errors[:, problem.recording_of[problem.bin_of] == recording]
+    before, after = np.sqrt(errors.mean(axis=1)).tolist()
+    return before, after
+
+
+def corrections(diagnosis: Diagnosis, recording: int | None = None) -> dict[str, dict[str, float]]:
+    """Return the values, by effect, that parameters of the calibration correct.
 
     recording: of several, whose own (of the day) are wanted; None: only what belongs to the vehicle, and the day's
-    where there is but one recording. Only the first name of a set is taken, and of a lever arm that may be a clock the
-    parts that are one for sure. What the calibration has no parameter for is left alone.
+    where there is but one recording. A size whose interval holds zero is left out, and an effect that others
+    explain as well, as these need another correction; but for a lever arm, whose interval allows for that.
     """
-    values: dict[str, Any] = {}
-    for effect in sorted(diagnosis.effects, key=lambda each: each.name == "time_offset_jump"):
-        parameter_values = effect.parameters
+    found: dict[str, dict[str, float]] = {}
+    for effect in diagnosis.effects:
+        parameters = effect.parameters
         if effect.by_recording:
             if recording is None:
                 continue
-            parameter_values = effect.by_recording.get(diagnosis.recordings[recording][0], {})
-        found = {name: value for name, (value, _, _) in parameter_values.items()}
-        if not found:
+            parameters = effect.by_recording.get(diagnosis.recordings[recording][0], {})
+        if effect.name not in CORRECTED or (effect.name != ARM and not _is_one_correction(diagnosis, effect)):
             continue
-        if effect.name == "lever_arm":
-            sure = {
-                name: value
-                for name, (value, low, high) in parameter_values.items()
-                if not effect.equivalent_to or low > 0.0 or high < 0.0
-            }
+        times = {spec.name for spec in EFFECTS[effect.name].parameters if is_time_of_run(spec)}
+        sizes = {name: value for name, (value, low, high) in parameters.items() if name not in times and low * high > 0}
+        begin_end = {name: value for name, (value, _, _) in parameters.items() if name in times}
+        if effect.name == "water_lock":
+            if begin_end["from_s"] >= WHOLE_RUN_S or np.isfinite(begin_end["to_s"]):
+                continue
+            begin_end["from_s"] = 0.0
+        if sizes and "again_seconds" not in parameters:  # of two jumps, one would leave the other
+            found[effect.name] = sizes | begin_end
+    return found
+
+
+def _is_one_correction(diagnosis: Diagnosis, effect: FoundEffect) -> bool:
+    """Return whether an effect and those that explain the data as well set the same clocks against each other.
+
+    A shift of all three clocks changes nothing, nor does the attitude's clock where the reference is in the body frame.
+    """
+    if not effect.equivalent_to:
+        return True
+    if diagnosis.selection is None or not {effect.name, *effect.equivalent_to} <= {*CLOCKS}:
+        return False
+    selection = diagnosis.selection
+    if all(each.frame is VelocityFrame.BODY for each in selection.fitter.problem.recordings):
+        return {effect.name, *effect.equivalent_to} <= {*TWO_CLOCKS}
+    rivals = [rival for each in selection.selected if each.effect.name == effect.name for rival in each.rivals]
+    own, (_, low, high) = _beside_attitude(selection.fit.hypothesis), effect.parameters["seconds"]
+    alike = [each for each in rivals if np.all(np.abs(_beside_attitude(each) - own) < 0.5 * (high - low))]
+    return all(any(name in rival.values for rival in alike) for name in effect.equivalent_to)
+
+
+def _beside_attitude(hypothesis: Hypothesis) -> Array:
+    """Return how late the clocks of DVL and reference are beside that of the attitude, s, (2, recordings)."""
+    none = ({"seconds": 0.0},)
+    dvl, reference, attitude = (
+        np.array([each["seconds"] for each in hypothesis.values.get(name, none)]) for name in CLOCKS
+    )
+    return np.stack(np.broadcast_arrays(dvl - attitude, reference - attitude))
+
+
+def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | None = None) -> Parameters:
+    """Return the parameters with the `corrections` of a diagnosis added."""
+    values: dict[str, Any] = {}
+    found = corrections(diagnosis, recording)
+    for name, each in sorted(found.items(), key=lambda item: item[0] == "time_offset_jump"):
+        if name == ARM:
             axes = zip(parameters.lever_arm, ARM_PARAMETERS, strict=True)  # a height is not always shown
-            values["lever_arm"] = tuple(known + sure.get(axis, 0.0) for known, axis in axes)
-        elif effect.name in OFFSETS:
-            name = OFFSETS[effect.name]
-            values[name] = values.get(name, getattr(parameters, name)) + found["seconds"]
-        elif effect.name == "water_lock" and found["from_s"] < WHOLE_RUN_S and np.isinf(found["to_s"]):
+            values["lever_arm"] = tuple(known + each.get(axis, 0.0) for known, axis in axes)
+        elif name in OFFSETS:
+            values[OFFSETS[name]] = getattr(parameters, OFFSETS[name]) + each["seconds"]
+        elif name == "water_lock":
             east, north = parameters.reference_velocity_offset
-            values["reference_velocity_offset"] = (east - found["east_mps"], north - found["north_mps"])
-        elif effect.name == "clock_drift":
-            values["dvl_clock_drift"] = parameters.dvl_clock_drift + found["seconds_per_hour"] / 3600.0
-        elif effect.name == "time_offset_jump" and "again_seconds" not in found:  # of two, one would leave the other
+            values["reference_velocity_offset"] = (east - each.get("east_mps", 0.0), north - each.get("north_mps", 0.0))
+        elif name == "clock_drift":
+            values["dvl_clock_drift"] = parameters.dvl_clock_drift + each["seconds_per_hour"] / 3600.0
+        else:
             offset = values.get("dvl_time_offset", parameters.dvl_time_offset)
             first_ns = diagnosis.recordings[recording or 0][1]
-            values["dvl_time_jump"] = found["seconds"]
-            values["dvl_time_jump_at"] = 1e-9 * first_ns + found["at_s"] + offset + 0.5 * found["seconds"]
+            values["dvl_time_jump"] = each["seconds"]
+            values["dvl_time_jump_at"] = 1e-9 * first_ns + each["at_s"] + offset + 0.5 * each["seconds"]
     return parameters.replace(**values)
+
+
+def _rounded(value: Any) -> str:
+    """Return a value, or a list of them, to micrometres and microseconds."""
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_rounded, value))}]"
+    return str(round(value, 6))
 
 
 def parameter_file(parameters: Parameters) -> str:

@@ -18,7 +18,7 @@ from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.numerics.tests import holm
 from dvl_calib_ros.cli import common
 from dvl_calib_ros.diagnosis.answer import confidence_intervals, held_out_validation
-from dvl_calib_ros.diagnosis.answer.compensation import compensated
+from dvl_calib_ros.diagnosis.answer.compensation import compensated, verified_corrections
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.answer.held_out_validation import confirmed
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict, FoundEffect, diagnosis_document
@@ -434,6 +434,23 @@ def test_a_clock_that_leaps_twice_is_one_effect_with_both_leaps_and_no_single_on
     (leaps,) = (effect.parameters for effect in diagnosis.effects if effect.name == "time_offset_jump")
     assert leaps["at_s"][0] == pytest.approx(100.0, abs=5.0) and leaps["again_at_s"][0] == pytest.approx(200.0, abs=5.0)
     assert compensated(Parameters(), diagnosis).dvl_time_jump == 0.0
+
+
+def test_only_a_correction_that_changes_a_parameter_and_lowers_the_held_out_error_is_applied():
+    diagnosis = diagnosed(effects=[LEVER], gnss_std=0.02)
+    (correction,) = verified_corrections(Parameters(), diagnosis, [None]).values()
+    assert "lever_arm [-1.9" in correction.sentence and correction.errors[1] < correction.errors[0]
+    (arm,) = diagnosis.effects
+    for factor in (-1.0, 4.0):
+        sizes = {name: tuple(factor * each for each in triple) for name, triple in arm.parameters.items()}
+        wrong = replace(diagnosis, effects=(replace(arm, parameters=sizes),))
+        with pytest.raises(InputError, match="the error does not fall: lever_arm"):
+            verified_corrections(Parameters(), wrong, [None])
+    late = {"name": "dvl_time_offset", "equivalent_to": ("attitude_time_offset",), "parameters": {"seconds": (2, 1, 3)}}
+    for changes in ({"name": "velocity_bias"}, late):
+        other = replace(diagnosis, effects=(replace(arm, **changes),))
+        with pytest.raises(InputError, match="no parameter corrects what was found"):
+            verified_corrections(Parameters(), other, [None])
 
 
 def as_sent(run: Run) -> Run:
@@ -980,7 +997,11 @@ def test_one_lever_arm_and_a_delay_for_each_day_are_fitted_together_and_whole_da
     assert set(diagnosis.gap.by_recording) == {"day0", "day1", "day2"}
     assert diagnosis.gap.after < 1.1 * np.sqrt(3.0) * 0.02
     assert compensated(Parameters(), diagnosis).dvl_time_offset == 0.0
-    assert compensated(Parameters(), diagnosis, 1).dvl_time_offset == pytest.approx(-1.1, abs=0.03)
+    written = verified_corrections(Parameters(), diagnosis, [0, 1, 2])
+    assert written[1].parameters.dvl_time_offset == pytest.approx(-1.1, abs=0.03)
+    for correction in written.values():
+        assert correction.changed.keys() == {"lever_arm", "dvl_time_offset"}
+        assert correction.errors[1] < 1.1 * np.sqrt(3.0) * 0.02 < 0.7 * correction.errors[0]
 
 
 def test_a_mounting_that_moved_between_days_is_named_with_its_size():
@@ -1246,7 +1267,8 @@ def test_the_first_screen_is_24_rows_of_80_and_ends_with_what_was_written(
     output, errors = succeed(capsys, "diagnose", bag_with_lever_arm, "--apply", tmp_path / "applied.yaml")
     rows = (errors + output).splitlines()
     assert len(rows) <= 24 and "lever_arm" in output.splitlines()[0]
-    assert rows[-1] == f"wrote {tmp_path / 'applied.yaml'}" and (tmp_path / "applied.yaml").exists()
+    assert rows[-1].startswith(f"wrote {tmp_path / 'applied.yaml'}: lever_arm [0.") and "held-out error" in rows[-1]
+    assert (tmp_path / "applied.yaml").exists()
     assert all(any(row.startswith(word) for row in rows) for word in ("To do for lever_arm", "Cost: ", "Next: "))
     assert "Where the gap lies" not in output
     assert "Where the gap lies" in succeed(capsys, "diagnose", bag_with_lever_arm, "--verbose")[0]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
+from collections import Counter
 from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
@@ -17,6 +19,7 @@ from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion
 from dvl_calib_ros.logs.dvl_logs import is_dvl_log, read_dvl_log
 from dvl_calib_ros.logs.nmea import read_rmc
+from dvl_calib_ros.logs.trajectories import ImportOptions, import_files
 
 KNOT = 1852.0 / 3600.0
 
@@ -41,6 +44,33 @@ def test_a_log_of_the_autopilot_is_dvl_gnss_and_attitude(write, tmp_path, capsys
     succeed(capsys, "import", path, "-o", tmp_path / "bag")
     with BagReader([tmp_path / "bag"]) as bag:
         assert {"/dvl/twist", "/gnss/twist", "/imu/data"} <= {f"/{name.strip('/')}" for name in bag.topics}
+
+
+@pytest.mark.parametrize(
+    "name", ["dive", "dive.log", "dive.csv", "dive.elf", "bin/dive.log2", "udp:dive", "dive.BIN", "dive.tlog"]
+)
+@pytest.mark.parametrize("write", [telemetry, dataflash])
+def test_a_log_of_the_autopilot_is_known_by_its_content_whatever_its_name(write, name, tmp_path, monkeypatch):
+    pytest.importorskip("pymavlink", reason="needs the extra ardupilot")
+    (tmp_path / "bin").mkdir()
+    monkeypatch.chdir(tmp_path)
+    import_files(write(Path(name)), None, None, tmp_path / "bag", ImportOptions())
+    with BagReader([tmp_path / "bag"]) as bag:
+        counts = Counter(channel.topic for _, channel, _ in bag.raw_messages(bag.topics))
+    assert counts["dvl/twist"] == 35 and counts["imu/data"] == 40
+
+
+@pytest.mark.parametrize("suffix", ["", ".BIN", ".tlog", ".log", ".csv", ".npy", ".PD0"])
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+@pytest.mark.parametrize("role", ["dvl", "--gnss", "--attitude", "--columns"])
+def test_a_pipe_or_a_folder_of_any_name_does_not_hang_an_import(role, make, suffix, tmp_path, capsys):
+    make(path := tmp_path / f"pipe{suffix}")
+    table = tmp_path / "one_dvl.csv"
+    table.write_text("t,x,y,z\n" + "".join(f"{i},1,0,0\n" for i in range(9)))
+    arguments = {"dvl": (path,), "--columns": (path, "--columns", "time=t,vx=x,vy=y,vz=z")}.get(
+        role, (table, role, path)
+    )
+    assert "pipe" in fail(capsys, "import", *arguments, "-o", tmp_path / "bag")
 
 
 def test_of_a_telemetry_log_one_vehicle_is_read(tmp_path):

@@ -24,7 +24,8 @@ def searching(*topics):
         get_publishers_info_by_topic=lambda _: [],
         create_subscription=lambda _, topic, taken, *__, **___: SimpleNamespace(topic_name=topic, taken=taken),
         destroy_subscription=lambda _: None,
-        get_logger=lambda: SimpleNamespace(info=lambda _: None, warning=lambda _: None),
+        info=lambda _: None,
+        warn=lambda _: None,
     )
     named = {"dvl": None, "gnss": None, "imu": None}
     return Discovering(node, named, Parameters(), (), ThreadPoolExecutor(1))
