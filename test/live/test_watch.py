@@ -180,7 +180,7 @@ headings  N█  NE   E▄  SE   S   SW   W   NW
 [INFO] model auto""",
     (40, 20): """\
 model full   12 min 34 s
-drift  ██████░░  75 %  3.45 m/km, goal 2
+drift  ████░░  75 %  3.45 m/km, goal 2
 next: drive straight, west (270°), about
 75 s ± 43 s until good enough
 s save  r r forget  w warnings  q quit
@@ -262,6 +262,18 @@ def test_faults_silence_and_waiting_are_said():
     assert "nothing heard" not in drawn(status(), 100.0 + SILENCE_S)
     assert "nothing heard of the node for 9 s" in drawn(status(), 109.0)
     assert "waiting for the node" in drawn(None, 0.0)
+
+
+def test_before_a_sample_nothing_looks_like_an_estimate_and_a_long_goal_is_one_line():
+    before = status(usable="no", **{"samples used": "0", "worth": "50.36", "goal worth [%]": "0"})
+    text = drawn(before, 100.0, width=40)
+    assert "yaw     3.036°, as set" in text and "±0.116" not in text
+    assert "\ndrift  ░░░░░░   0 %  50.36 m/km, goal 2\n" in text
+
+
+def test_a_log_line_is_shown_without_its_stamp():
+    text = drawn(status(), 100.0, ["[INFO] [1795830187.907451278] [dvl_calibration]: model auto"])
+    assert "\nmodel auto\n" in text and "1795830187" not in text
 
 
 def test_only_the_last_lines_of_the_log_are_shown_whatever_is_in_them():
@@ -380,7 +392,7 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
             message.header.stamp.sec, message.header.frame_id = 1000 + i, "dvl_link"
             message.twist.twist.linear.x = 1.5
             publisher.publish(message)
-        for text in ("mounting now", "drift", "next: ", ": model auto", "s save"):
+        for text in ("mounting now", "drift", "next: ", "model auto; parameters", "s save"):
             screen.until(text)
         assert not saved.exists()
         screen.key(b"s")
@@ -434,7 +446,7 @@ def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_ru
         first = watching.stdout.readline()
         watching.send_signal(signal.SIGINT)
         _, errors = watching.communicate(timeout=30)
-        assert first.startswith("F1 collecting: roll 0.000 ±")
+        assert first.startswith("F1 collecting: roll 0.000°, as set")
         assert (watching.returncode, errors) == (0, "")
         assert node.poll() is None
 
