@@ -7,10 +7,13 @@ Without options, show it. Each file is replaced atomically and its previous vers
 from __future__ import annotations
 
 import argparse
+import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import printable
 from ..standard_streams import show
 from . import common
 
@@ -88,7 +91,7 @@ def run(arguments: argparse.Namespace) -> None:
     applied = write_calibration(calibrated, targets, arguments.force, arguments.dry_run)
     show(*(f"note: {note}" for note in applied.notes))
     is_refused = calibrated.objections and not arguments.force
-    refused = ["nothing to apply; --force shows and writes it anyway"]
+    refused = ["not to be applied, see the warnings; --force shows and writes it anyway"]
     _print_lines(calibrated, refused if is_refused else _mounting_lines(calibrated))
     if arguments.dry_run:
         show(*(applied.changes.splitlines() or ["nothing would change"]))
@@ -150,10 +153,12 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     """Return the calibrated mounting as lines to print."""
     import numpy as np
 
+    from ..calibration.numerics.frames import near_angles
     from ..files.mounting import POSITION_UNKNOWN, scale_advice
     from ..files.urdf import numbers
 
-    degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(calibrated.rpy))
+    near = near_angles(calibrated.rpy, calibrated.parameters.mounting_rpy)  # as in the report, 180.4° not -179.6°
+    degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(near))
     known = calibrated.position is not None
     transform = (
         f"ros2 run tf2_ros static_transform_publisher {calibrated.static_transform}" if known else POSITION_UNKNOWN
@@ -185,6 +190,24 @@ def _metres(values: Sequence[float]) -> str:
 
 
 def _print_lines(calibrated: CalibratedMounting, lines: Sequence[str]) -> None:
-    """Print lines after the warnings about the calibration."""
+    """Print lines, then the warnings about the calibration."""
+    for line in lines:
+        show(*([line] if line.startswith(TO_COPY) else _wrapped(line)))
+    sys.stdout.flush()
     common.print_warnings([f"{calibrated.path}: {each}" for each in (*calibrated.objections, *calibrated.doubts)])
-    show(*lines)
+
+
+# beginnings of lines that are copied, and stay in one piece
+TO_COPY = ("TF:", "URDF:", "<", "  ")
+
+
+def _wrapped(line: str) -> list[str]:
+    """Return a line, broken between words on a terminal."""
+    if not sys.stdout.isatty():
+        return [line]
+    import textwrap
+
+    width = shutil.get_terminal_size().columns
+    return textwrap.wrap(
+        printable(line), width, subsequent_indent="        ", break_long_words=False, break_on_hyphens=False
+    )

@@ -20,6 +20,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Read everything, write it, report the losses."""
     from ..bags.recover import recover
     from ..bags.writer import Compression, Storage
+    from ..present.numbers import counted
 
     common.check_outputs(arguments, folders=["output"])
     storage, compression = Storage(arguments.storage), Compression(arguments.compression)
@@ -27,5 +28,5 @@ def run(arguments: argparse.Namespace) -> None:
         recovered = recover(arguments.bags, arguments.output, storage, compression, on_progress)
     common.print_warnings(recovered.notes)
     for topic, count in recovered.counts.items():
-        show(f"{topic}: {count} messages")
-    show(f"{arguments.output}: {sum(recovered.counts.values())} messages")
+        show(f"{topic}: {counted(count, 'message')}")
+    show(f"{arguments.output}: {counted(sum(recovered.counts.values()), 'message')}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import re
 import select
 import subprocess
 import sys
@@ -189,7 +190,7 @@ class View:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield lines, at most the terminal's height."""
         width, height = options.max_width, options.size.height
-        tail = [Row(line, "dim", most=1) for line in self.log[-LOG_LINES:]]
+        tail = [Row(_message(line), "dim", most=1) for line in self.log[-LOG_LINES:]]
         fixed, body, warnings = (
             [Row("waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)", "yellow")],
             tail,
@@ -232,7 +233,7 @@ class View:
             _goal(status, *GOALS[0], width),
             Row(following, "bold green" if "GOOD" in code else "bold", most=lines, least=lines),
             Row(KEYS, "dim", most=lines),
-            Row(self.event, "cyan", most=4),
+            Row(self.event, "cyan", most=4 if "(y/n)" in self.event else 2),
         ]
 
 
@@ -247,10 +248,15 @@ def _warnings(status: Status) -> list[str]:
 
 
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
-    """Yield the mounting, the first warning, streams, drift by axis and headings."""
+    """Yield mounting and first warning, streams, drift by axis and headings. A narrow view begins with the warning."""
     is_usable, colour = _is_usable(status), COLOURS.get(status.level, "red")
-    why = "see below" if status.get("next code") == "NEXT_REJECTED" else "not observable yet"
+    why = "see the warning" if status.get("next code") == "NEXT_REJECTED" else "not observable yet"
     between = [Row("")] if width >= WIDE else []
+    first = [Row(each, colour if status.level else "yellow", most=2) for each in warnings[:1]]
+    if len(warnings) > 1:
+        first.append(Row(f"+{len(warnings) - 1} more (w)", colour))
+    if width < WIDE:
+        yield from first
     yield from between
     yield Row("mounting now") if is_usable else Row(f"mounting: not to be used, {why}", colour, most=2)
     for each in MOUNTING:
@@ -259,10 +265,8 @@ def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
             yield Row(text, "" if is_usable else "dim")
     if is_usable and (sound := status.values.get("speed of sound", "")):
         yield Row(f"speed of sound  {sound}", most=2)
-    if warnings:
-        yield Row(warnings[0], colour if status.level else "yellow", most=2)
-    if len(warnings) > 1:
-        yield Row(f"+{len(warnings) - 1} more (w)", colour)
+    if width >= WIDE:
+        yield from first
     yield from between
     yield Row("   ".join(_stream(status, *each) for each in STREAMS))
     yield from (_goal(status, *each, width) for each in GOALS[1:] if f"goal {each[0]} [%]" in status.values)
@@ -298,14 +302,15 @@ def _stream(status: Status, name: str, shown: str) -> str:
 
 def _quantity(status: Status, name: str, unit: str, shown: str) -> str:
     value, std = status.get(f"mounting {name} [{unit}]"), status.get(f"sigma mounting {name} [{unit}]")
-    return f"{name:5} {value:>7}" + (f" ±{std}{shown}" if std[:1].isdigit() else f"{shown}, as set").ljust(11)
+    is_estimated = std[:1].isdigit() and status.values.get("samples used") != "0"  # without a sample σ is the prior's
+    return f"{name:5} {value:>7}" + (f" ±{std}{shown}" if is_estimated else f"{shown}, as set").ljust(11)
 
 
 def _goal(status: Status, key: str, shown: str, width: int) -> Row:
     percent = min(_number(status.get(f"goal {key} [%]")), 100.0)
     names = {"worth": "worth", "side": "worth to the side", "ahead": "worth ahead"}
     goal = f", goal {status.get('target')}" if key == "worth" else ""
-    bar = max(0, min(BAR, width - 32))
+    bar = max(0, min(BAR, width - 34))
     full = round(bar * percent / 100.0)
     text = f"{shown:7}{'█' * full}{'░' * (bar - full)} {percent:3.0f} %  {status.get(names[key])} m/km{goal}"
     return Row(text, "green" if percent >= 100.0 else "yellow")
@@ -418,10 +423,15 @@ def show(
                     return
             if keys.has_left():
                 return
-            news = (log[-1] if log else "", keys.said)
+            news = (_message(log[-1]) if log else "", keys.said)
             event = next((new for new, old in zip(news, before, strict=True) if new != old), event)
             before = news
             live.update(View(status, now_s, log, event, keys.page), refresh=True)
+
+
+def _message(logged: str) -> str:
+    """Return a line of the node's log without time and name of the node."""
+    return re.sub(r"^\[(\w+)\] \[[\d.]+\] \[[^\]]*\]: ", "", logged)
 
 
 def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:

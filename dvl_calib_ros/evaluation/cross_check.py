@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import combinations
@@ -15,7 +15,7 @@ from ..bag_replay.replay import replay
 from ..calibration.assessment.dead_reckoning import Navigation, dead_reckoned, navigation_document
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.build_observations import Observer
-from ..calibration.models import MODELS, Needs
+from ..calibration.models import BY_VELOCITY, MODELS, Needs
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.error_model import correction_matrix
 from ..calibration.numerics.frames import Array
@@ -134,16 +134,20 @@ def cross_check(
         uncorrected=uncorrected,
         corrected=corrected,
         notes=tuple(
-            f"{bag}: {note}"
-            for bag, each in zip(bags, found, strict=True)
-            for note in (*each.failed, *each.notes)
-            if not note.startswith(tuple(f"{name}: " for name in MODELS if name not in models))
+            f"{bag}: {note}" for bag, each in zip(bags, found, strict=True) for note in _notes_of(each, models)
         ),
         parameters=parameters.as_dict(),
         selected=tuple(each.selected[0] for each in found),
         navigation=_navigation(bags, found),
         found=tuple(f"{bag}: {'; '.join(each.found)}" for bag, each in zip(bags, found, strict=True) if each.found),
     )
+
+
+def _notes_of(replayed: _Replayed, models: Sequence[str]) -> Iterator[str]:
+    """Yield the notes on the models asked for; if all are, only on the selected one."""
+    asked = {replayed.selected[0]} if set(models) == set(BY_VELOCITY) else set(models)
+    others = tuple(f"{name}: " for name in MODELS if name not in asked)
+    yield from (note for note in (*replayed.failed, *replayed.notes) if not note.startswith(others))
 
 
 def _with_own_delay(terms: Terms, verified: _Replayed) -> Terms:

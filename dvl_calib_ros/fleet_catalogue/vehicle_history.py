@@ -101,7 +101,7 @@ class VehicleHistory:
 
 
 class NeedsPerson(NamedTuple):
-    """A reason why recordings need a person, in the words for the first.
+    """A reason why recordings of a vehicle need a person, in the words for the first.
 
     code: of the reason of a verdict, or SAME_DATA; '' of an error.
     """
@@ -109,6 +109,7 @@ class NeedsPerson(NamedTuple):
     code: str
     why: str
     recordings: tuple[str, ...]
+    vehicle: str = ""
 
 
 def histories(entries: Sequence[Catalogued]) -> list[VehicleHistory]:
@@ -133,7 +134,10 @@ def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[Need
         if key in first:
             doubled.append(
                 NeedsPerson(
-                    "SAME_DATA", f"the same data as {first[key].recording}: only that is used", (each.recording,)
+                    "SAME_DATA",
+                    f"the same data as {first[key].recording}: only that is used",
+                    (each.recording,),
+                    each.vehicle,
                 )
             )
         else:
@@ -143,17 +147,17 @@ def distinct(entries: Sequence[Catalogued]) -> tuple[list[Catalogued], list[Need
 
 
 def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
-    """Return recordings without a calibration or with a rejected one, by reason; the most frequent first."""
-    groups: dict[tuple[str, str], list[Catalogued]] = defaultdict(list)
+    """Return recordings without a calibration or with a rejected one, by vehicle and reason, most frequent first."""
+    groups: dict[tuple[str, str, str], list[Catalogued]] = defaultdict(list)
     for each in entries:
         row = each.rows[0]
         if each.error:
-            groups["", each.error].append(each)
+            groups[each.vehicle, "", each.error].append(each)
         elif row["verdict"] == "reject":
-            groups[row["codes"][0] if row["codes"] else "", ""].append(each)
+            groups[each.vehicle, row["codes"][0] if row["codes"] else "", ""].append(each)
     found = [
-        NeedsPerson(code, error or members[0].rows[0]["reason"], tuple(each.recording for each in members))
-        for (code, error), members in groups.items()
+        NeedsPerson(code, error or members[0].rows[0]["reason"], tuple(each.recording for each in members), vehicle)
+        for (vehicle, code, error), members in groups.items()
     ]
     return sorted(found, key=lambda each: -len(each.recordings))
 

@@ -12,6 +12,8 @@ from .document import Answer, Columns, Commands, Document, FindingLine, Section,
 from .numbers import options, typed
 
 SHOWN_NOTE = "A full bar is fine (target_drift); red is not observable, yellow is between."
+NO_REFERENCE = "Without a reference only pitch is observable, and yaw on opposite headings."
+NO_SAMPLE = "Nothing is observable without a usable sample."
 ANSWERS = {
     "yes": (Severity.ACCEPT, "This recording can calibrate the DVL."),
     "partly": (Severity.MARGINAL, "This recording can calibrate a part of the DVL's errors."),
@@ -33,7 +35,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"
     also = "else " if lead or examined.notes else ""
-    nothing = "Without a reference only pitch is observable, and yaw on opposite headings."
+    nothing = NO_SAMPLE if examined.has_reference else NO_REFERENCE
     return Document(
         title="Examination of a recording",
         subtitle=names,

@@ -62,7 +62,11 @@ def fleet(result: Fleet) -> Document:
         sentences = ["No vehicle has an angle that is observable on two days, so nothing can be compared."]
     sentences.append(f"{counted(persons, 'recording')} of {recordings} {'needs' if persons == 1 else 'need'} a person.")
     done = f"{counted(result.calibrated, 'recording')} calibrated now, {result.unchanged} unchanged"
-    sitting = [VehicleNow(each, now(each)) for each in sorted(vehicles, key=_urgency)]
+    sitting = [
+        VehicleNow(each, now(each), [person for person in result.persons if person.vehicle == each.name])
+        for each in vehicles
+    ]
+    sitting.sort(key=lambda each: each.urgency)
     speeds = [
         VehicleSpeeds(each, sorted((day for day in each.days if day.shown[SCALE]), key=lambda day: day.value[SCALE]))
         for each in vehicles
@@ -84,12 +88,22 @@ def fleet(result: Fleet) -> Document:
         answer=Answer(result.word, severity, sentences),
         warnings=result.notes,
         sections=[
-            Section("Vehicles", [replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True)]),
+            Section(
+                "Vehicles",
+                [
+                    *(Sentence(f"{each.history.name}: {each.word}. {each.why}") for each in sitting),
+                    replace(table_by(VEHICLES, sitting, (MOUNTING_NOTE,)), dense=True),
+                ],
+            ),
             section(
                 "Recordings that need a person",
-                table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=2),
+                table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=3),
             ),
-            *(_trend(each.name, each.compared) for each, _ in sitting if each.compared is not None),
+            *(
+                _trend(each.history.name, each.history.compared)
+                for each in sitting
+                if each.history.compared is not None
+            ),
             section(
                 "Speed of sound",
                 table_by(SPEEDS, [each for each in speeds if each.days], (SPEED_NOTE,)),
@@ -104,13 +118,6 @@ def fleet(result: Fleet) -> Document:
     )
 
 
-def _urgency(vehicle: VehicleHistory) -> int:
-    """Return the sort key: vehicles whose mounting moved first, then those without a comparison."""
-    if vehicle.compared is None:
-        return WORDS.index("same") if vehicle.days else WORDS.index("suspicious")
-    return WORDS.index(vehicle.compared.word) + (vehicle.compared.word == "same")
-
-
 def now(vehicle: VehicleHistory) -> Extrinsics | None:
     """Return the mounting since it last moved; None if no recording is usable."""
     days = vehicle.days
@@ -123,10 +130,11 @@ def now(vehicle: VehicleHistory) -> Extrinsics | None:
 
 
 class VehicleNow(NamedTuple):
-    """A vehicle with its current mounting, None if no recording is usable."""
+    """A vehicle with its current mounting, None if no recording is usable, and its recordings that need a person."""
 
     history: VehicleHistory
     mounting: Extrinsics | None
+    persons: Sequence[NeedsPerson]
 
     @property
     def word(self) -> str:
@@ -135,11 +143,25 @@ class VehicleNow(NamedTuple):
 
     @property
     def why(self) -> str:
-        """Why the days are not compared; '' if they are."""
-        if self.history.compared is not None:
-            return ""
-        days = len(self.history.days)
-        return {0: "No recording is usable.", 1: "One day alone."}.get(days, "No angle is observable on two days.")
+        """Reason for the word, and how many recordings need a person."""
+        compared, days = self.history.compared, len(self.history.days)
+        if compared is not None:
+            said = reasons(compared)[0].full_sentence
+        elif days:
+            said = "One day alone." if days == 1 else "No angle is observable on two days."
+        else:
+            said = full(self.persons[0].why).partition(". ")[0].removesuffix(".") + "." if self.persons else ""
+        waiting = sum(len(each.recordings) for each in self.persons)
+        needs = f"{counted(waiting, 'recording')} {'needs' if waiting == 1 else 'need'} a person."
+        return f"{said} {needs}" if waiting else said
+
+    @property
+    def urgency(self) -> tuple[int, bool]:
+        """Sort key: moved mountings, suspicious ones, vehicles without a calibration, recordings that need a person."""
+        if self.history.compared is None and not self.history.days:
+            return WORDS.index("suspicious") + 1, False
+        is_same = self.history.compared is None or self.word == "same"
+        return len(WORDS) if is_same else WORDS.index(self.word), not self.persons
 
     @property
     def seen_from(self) -> str:
@@ -163,7 +185,7 @@ VEHICLES: Columns[VehicleNow] = {
     "recordings": lambda each: str(each.history.recordings),
     "days": lambda each: str(len(each.history.days)),
     "mounting": lambda each: Cell(
-        each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text"), each.why
+        each.word + (f" ({each.moved}×)" if each.moved > 1 else ""), KINDS.get(each.word, "text")
     ),
     "seen from, °": lambda each: each.seen_from,
     **columns_for(
@@ -180,6 +202,7 @@ VEHICLES: Columns[VehicleNow] = {
 }
 SEVERAL_NOTE = "With several recordings the sentence is about the first."
 PERSONS: Columns[NeedsPerson] = {
+    "": lambda each: each.vehicle,
     "recordings": lambda each: str(len(each.recordings)),
     "why": lambda each: Cell(
         full(each.why) + (f" [{each.code}]" if each.code else ""),

@@ -358,9 +358,9 @@ def next_commands(
     verdict = run.result.verifications[run.result.selected].verdict
     if verdict is Severity.REJECT:
         moved = run.recordings is not None and run.recordings.moved
-        found, doctor = typed("compare" if moved else "diagnose", bags, *options), typed("doctor", bags)
+        found, doctor = (typed(command, bags, *options) for command in ("compare" if moved else "diagnose", "doctor"))
         return [found, doctor] if moved else [doctor, found]
     if saved is None:
         return [typed("replay", bags, *options, "--save", "calibration.yaml")]
     commands = [typed("apply", [saved], "--urdf", "robot.urdf")]
-    return commands + ([typed("doctor", bags)] if doubts else [])
+    return commands + ([typed("doctor", bags, *options)] if doubts else [])

@@ -132,7 +132,9 @@ def shown(document: Document) -> Iterator[Any]:
 
 
 def answer_shown(document: Document) -> Iterator[Any]:
-    """Yield rich's renderables of a document's answer, and of the finding that leads it."""
+    """Yield rich's renderables of a document's answer, after the finding that leads it."""
+    if document.lead:
+        yield from _found(document.lead)
     answer = document.answer
     if answer is not None:
         sentences = list(answer.sentences)
@@ -140,8 +142,6 @@ def answer_shown(document: Document) -> Iterator[Any]:
             sentences = [" ".join([answer.advice, *sentences])]
         yield Text.assemble((answer.word, f"bold {COLOURS[answer.severity]}"), ": ", sentences[0])
         yield from map(Text, sentences[1:])
-    if document.lead:
-        yield from _found(document.lead)
 
 
 def sections_shown(document: Document) -> Iterator[Any]:
@@ -173,7 +173,8 @@ def _found(reason: Reason) -> Iterator[Padding]:
     from rich.padding import Padding
 
     yield Padding(Text(reason.says, COLOURS[reason.severity]), (0, 0, 0, 2))
-    yield Padding(Text.assemble(reason.remedy, " ", (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
+    remedy = [reason.remedy, " "] if reason.remedy else []
+    yield Padding(Text.assemble(*remedy, (f"[{reason.code}]", "dim")), (0, 0, 0, 4))
 
 
 def rich_table(table: Table) -> Folding:

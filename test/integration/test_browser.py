@@ -159,6 +159,7 @@ def test_on_a_phone_no_table_of_a_fleet_is_scrolled_and_every_value_has_its_head
     )
     assert len(tables) >= 2 and all(fits for fits, _ in tables)
     assert next(headings for _, headings in tables if headings)[2:5] == ["mounting", "seen from, °", "roll, °"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE[0]
     page.close()
 
 

@@ -292,6 +292,17 @@ def test_what_to_type_next_keeps_the_options_that_were_given(tmp_path, capsys):
     assert f"next  dvl-calib replay {sound} {shlex.join(given)} --save calibration.yaml" in out
 
 
+def test_nothing_is_observable_without_a_sample_and_the_next_command_keeps_the_options(tmp_path, capsys):
+    bag, fast = simulated(tmp_path / "bag"), ("-p", "min_speed:=4.9")
+    out, _ = succeed(capsys, "doctor", bag, *fast)
+    assert out.startswith("no: ") and "Nothing is observable without a usable sample." in out
+    assert "Without a reference" not in out
+    out, _ = succeed(capsys, "replay", bag, *fast)
+    assert out.startswith("reject: Do not use this calibration. No sample was used")
+    commands = out[out.index("\nnext") :].strip().splitlines()
+    assert commands and all("-p min_speed:=4.9" in command for command in commands)
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("variance", [-1.0, 0.0, math.nan])
 def test_of_positions_with_variances_that_are_none_no_error_is_claimed(variance, tmp_path, capsys):

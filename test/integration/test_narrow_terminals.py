@@ -109,6 +109,12 @@ def test_the_verdict_is_the_first_line_and_warnings_break_between_words(folder, 
     assert set(words(" ".join(narrow))) == set(words(" ".join(wide)))
 
 
+def test_prose_of_apply_breaks_between_words_and_what_is_copied_stays_whole(folder):
+    wide, narrow = (on_a_terminal(folder, columns, "apply", "result.yaml") for columns in (500, 80))
+    assert all(len(line) <= 80 or line.startswith(("TF:", "URDF:")) for line in narrow)
+    assert set(words(" ".join(narrow))) == set(words(" ".join(wide)))
+
+
 VALUES = {
     "model": "full", "why": "auto: GNSS is available", "gnss": "GNSS is available", "convergence": "coarse",
     "phi_x [deg]": "0.8834", "std phi_x [deg]": "1.4004", "progress phi_x [%]": "25.0",

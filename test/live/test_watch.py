@@ -180,11 +180,14 @@ headings  N█  NE   E▄  SE   S   SW   W   NW
 [INFO] model auto""",
     (40, 20): """\
 model full   12 min 34 s
-drift  ██████░░  75 %  3.45 m/km, goal 2
+drift  ████░░  75 %  3.45 m/km, goal 2
 next: drive straight, west (270°), about
 75 s ± 43 s until good enough
 s save  r r forget  w warnings  q quit
 14:03:22 saved to /data/calibration.yaml
+no usable DVL message for 7 s; check the
+sensor, its driver and the topic …
++2 more (w)
 mounting now
 roll    0.108 ±1.177°
 pitch  -0.512 ±0.322°
@@ -194,9 +197,6 @@ arm y   0.000 m, as set
 arm z  -0.120 m, as set
 scale   0.412 ±0.120 %
 delay   0.102 ±0.011 s
-no usable DVL message for 7 s; check the
-sensor, its driver and the topic …
-+2 more (w)
 DVL 5.0 Hz, 0 s ago   reference 1.0 Hz,
 3 s ago   IMU 50.0 Hz, 0 s ago""",
 }
@@ -237,6 +237,15 @@ def test_all_that_an_operator_needs_is_seen_on_a_small_terminal(monkeypatch, siz
     assert fixed == [saved.splitlines()[:4]] * 4, "what an operator looks for stays at its place"
 
 
+def test_a_long_answer_hides_no_warning_on_a_small_terminal():
+    values = MOUNTED | {f"finding {number}": each for number, each in enumerate(WARNINGS, start=1)}
+    found = status(2, "; ".join(WARNINGS), **values, next="straight legs on opposite headings, at two speeds")
+    console = Console(file=io.StringIO(), width=40, height=20, force_terminal=True, color_system=None)
+    console.print(View(found, 100.5, (), "/data/calibration.yaml is kept: its result is better " * 3))
+    shown = console.file.getvalue().splitlines()
+    assert len(shown) <= 20 and "+2 more (w)" in shown and any("no usable DVL message" in each for each in shown)
+
+
 @pytest.mark.parametrize("size", [(80, 24), (40, 20), (40, 12)])
 def test_w_shows_all_warnings_a_screen_at_a_time(monkeypatch, size):
     found = status(2, "; ".join(WARNINGS), **{f"finding {n}": each for n, each in enumerate(WARNINGS, start=1)})
@@ -253,6 +262,18 @@ def test_faults_silence_and_waiting_are_said():
     assert "nothing heard" not in drawn(status(), 100.0 + SILENCE_S)
     assert "nothing heard of the node for 9 s" in drawn(status(), 109.0)
     assert "waiting for the node" in drawn(None, 0.0)
+
+
+def test_before_a_sample_nothing_looks_like_an_estimate_and_a_long_goal_is_one_line():
+    before = status(usable="no", **{"samples used": "0", "worth": "50.36", "goal worth [%]": "0"})
+    text = drawn(before, 100.0, width=40)
+    assert "yaw     3.036°, as set" in text and "±0.116" not in text
+    assert "\ndrift  ░░░░░░   0 %  50.36 m/km, goal 2\n" in text
+
+
+def test_a_log_line_is_shown_without_its_stamp():
+    text = drawn(status(), 100.0, ["[INFO] [1795830187.907451278] [dvl_calibration]: model auto"])
+    assert "\nmodel auto\n" in text and "1795830187" not in text
 
 
 def test_only_the_last_lines_of_the_log_are_shown_whatever_is_in_them():
@@ -371,7 +392,7 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
             message.header.stamp.sec, message.header.frame_id = 1000 + i, "dvl_link"
             message.twist.twist.linear.x = 1.5
             publisher.publish(message)
-        for text in ("mounting now", "drift", "next: ", ": model auto", "s save"):
+        for text in ("mounting now", "drift", "next: ", "model auto; parameters", "s save"):
             screen.until(text)
         assert not saved.exists()
         screen.key(b"s")
@@ -425,7 +446,7 @@ def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_ru
         first = watching.stdout.readline()
         watching.send_signal(signal.SIGINT)
         _, errors = watching.communicate(timeout=30)
-        assert first.startswith("F1 collecting: roll 0.000 ±")
+        assert first.startswith("F1 collecting: roll 0.000°, as set")
         assert (watching.returncode, errors) == (0, "")
         assert node.poll() is None
 

@@ -28,10 +28,11 @@ from dvl_calib_ros.calibration.checks.speed_of_sound import speed_of_sound
 from dvl_calib_ros.calibration.comparison.mounting_change import compare
 from dvl_calib_ros.fleet_catalogue import update as running
 from dvl_calib_ros.fleet_catalogue.parquet_parts import Catalogue
-from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued, histories
+from dvl_calib_ros.fleet_catalogue.vehicle_history import Catalogued, histories, need_person
 from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
 from dvl_calib_ros.present.comparison import QUANTITIES
 from dvl_calib_ros.present.comparison_figures import _draw
+from dvl_calib_ros.present.document import Sentence
 from dvl_calib_ros.present.figure_style import new_figure
 from dvl_calib_ros.present.fleet import fleet
 
@@ -117,7 +118,7 @@ def test_the_page_begins_with_who_needs_a_person_and_draws_an_inverted_dvl_witho
     moved = found.vehicles[0]
     alone = replace(moved, name="a_first", days=moved.days[:1], compared=None)
     table = fleet(replace(found, vehicles=(alone, moved))).tables["Vehicles"]
-    assert [row[0] for row in table.rows] == [moved.name, "a_first"] and table.rows[1][3].below == "One day alone."
+    assert [row[0] for row in table.rows] == [moved.name, "a_first"]
     for angles in ((179.9, -179.8), (-179.9, 179.7)):
         turned = [  # as of two DVLs
             replace(
@@ -371,6 +372,22 @@ def test_the_command_prints_the_answer_and_who_needs_a_person(made, dives, tmp_p
     said, _ = succeed(capsys, "fleet", dives, "--out", tmp_path / "out", "--jobs", "1")
     assert said.startswith("not compared") or said.startswith("moved")
     assert "1 recording of 5 needs a person" in said and "no.mcap" in said
+    assert said.count("\nauv1: ") == said.count("\nauv2: ") == 1  # one line per vehicle
+
+
+def test_each_vehicle_has_its_own_reason_the_most_urgent_first(made):
+    (moved,) = (each for each in made[0].vehicles if each.name == "auv1")
+    rows = ({"verdict": "reject", "codes": ["A"], "reason": f"reason of {name}", "error": ""} for name in "bc")
+    entries = [Catalogued(f"/dives/{name}/1", name, (row,)) for name, row in zip("bc", rows, strict=True)]
+    persons = tuple(need_person(entries))
+    assert [(each.vehicle, each.why) for each in persons] == [("b", "reason of b"), ("c", "reason of c")]
+    unusable = [replace(moved, name=name, days=(), compared=None, recordings=1) for name in "bc"]
+    good = replace(moved, name="a", compared=None, days=moved.days[:1])
+    document = fleet(replace(made[0], vehicles=(good, *unusable, moved), persons=persons))
+    lines = [item.text for item in document.sections[0].items if isinstance(item, Sentence)]
+    assert [line.partition(":")[0] for line in lines] == ["auv1", "b", "c", "a"]
+    assert lines[1] == "b: not compared. Reason of b. 1 recording needs a person."
+    assert lines[3] == "a: not compared. One day alone."
 
 
 @pytest.mark.parametrize(
