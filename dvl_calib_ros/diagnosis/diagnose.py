@@ -110,7 +110,7 @@ def diagnose_recordings(
     selection, rest = settled(selection, len(testable))
     residuals = held_out(selection)
     gap = measure_gap(selection, residuals)
-    stands, rest = confirmed(selection, rest, gap, len(testable))
+    stands, rest = confirmed(selection, rest, gap)
     if stands is not selection:
         selection = stands
         residuals = held_out(selection)
