@@ -18,6 +18,8 @@ from .gauss_newton import Fit, Fitter
 from .selection_criteria import NuisanceFit
 
 Integers = NDArray[np.intp]
+# Columns, and the residual (M, A) m/s that they are fitted to
+Predictor = tuple[NuisanceFit, Array]
 # Steps of a fit that starts from that to all of the data
 FOLD_STEPS = 6
 # Time constant, s, of the slowest noise that an effect is compared with: GNSS multipath lasts minutes
@@ -78,23 +80,24 @@ def _held_out(
         yield held, replace(held, gram=trained)
 
 
-def predictive_deviance(problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array) -> float:
-    """Return -2 log likelihood of stretches of time that columns were not fitted to, but for a constant.
+def predictive_gain(problem: Problem, noise: Noise, simpler: Predictor, richer: Predictor) -> float:
+    """Return the held-out deviance gain of one set of columns over a simpler one, each under its own noise.
 
-    The noise is estimated anew with the columns fitted, so that slow noise is one of the explanations compared.
-    residual: (M, A) m/s. noise: its level and frame.
+    The noise is estimated anew with either, so that slow noise is one of the explanations compared; each takes the one
+    that predicts better. noise: its level and frame.
     """
-    colour = replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
-    for _ in range(2):
-        left = residual + fitted.columns @ fitted.step(colour, residual).solution()
-        colour = colour.refitted(left, taken=colour.taken_by(fitted.columns, fitted.std))
-    return surprise_elsewhere(problem, colour, fitted, residual) + colour.log_size
-
-
-def predictive_gain(fitter: Fitter, fit: Fit, rest: Fit) -> float:
-    """Return the held-out deviance gain of a fit over another, each under its own noise."""
-    of_rest, of_fit = (
-        predictive_deviance(fitter.problem, each.noise, NuisanceFit.of_fit(fitter.problem, each), each.residual)
-        for each in (rest, fit)
+    noise = replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
+    colours = [_coloured_anew(noise, *each) for each in (simpler, richer)]
+    worse, better = (
+        min(surprise_elsewhere(problem, colour, *each) + colour.log_size for colour in colours)
+        for each in (simpler, richer)
     )
-    return of_rest - of_fit
+    return worse - better
+
+
+def _coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> Noise:
+    """Return the noise of what columns leave of a residual (M, A)."""
+    for _ in range(2):
+        left = residual + fitted.columns @ fitted.step(noise, residual).solution()
+        noise = noise.refitted(left, taken=noise.taken_by(fitted.columns, fitted.std))
+    return noise

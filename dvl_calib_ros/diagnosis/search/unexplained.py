@@ -18,7 +18,7 @@ from ...calibration.numerics.frames import Array
 from ...calibration.streams.interpolation import shortened
 from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
-from ..fit.cross_validation import predictive_deviance
+from ..fit.cross_validation import predictive_gain
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.parametric_bootstrap import simulated_recordings
 from ..fit.selection_criteria import NuisanceFit
@@ -285,11 +285,8 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
 def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
     """Return the held-out deviance gain of what the residual of a fit follows most clearly."""
     known = NuisanceFit.of_fit(problem, fit)
-    alone, both = (
-        predictive_deviance(problem, fit.noise, each, fit.residual)
-        for each in (known, known.and_rest(rest.clearest, fit.residual))
-    )
-    return alone - both
+    both = known.and_rest(rest.clearest, fit.residual)
+    return predictive_gain(problem, fit.noise, (known, fit.residual), (both, fit.residual))
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
