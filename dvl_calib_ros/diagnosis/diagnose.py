@@ -231,7 +231,10 @@ CODES = {
 
 
 def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
-    if matters(selection.fitter.problem, selection.fit, rest) or gap.not_expected > MOST_SLOW * gap.noise_floor:
+    if matters(selection.fitter.problem, selection.fit, rest):
+        return DiagnosisVerdict.UNKNOWN
+    # effects that leave more on held-out data than there is noise explain it no better than what they stand in for
+    if gap.not_expected > (1.0 if selection.selected else MOST_SLOW) * gap.noise_floor:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected and gap.shown < MATERIAL:
         return DiagnosisVerdict.UNKNOWN
