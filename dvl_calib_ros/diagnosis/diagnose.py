@@ -56,6 +56,8 @@ MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
 # Share of the gap's energy that effects have to close on held-out data to be what explains it
 MATERIAL = 0.2
+# Slow noise of instruments, as a multiple of their noise at high frequencies; more is an unknown cause
+MOST_SLOW = 1.5
 # What is left beyond the noise is told in the sentence from this share of the noise on
 WORTH_TELLING = 0.3
 
@@ -110,7 +112,7 @@ def diagnose_recordings(
     selection, rest = settled(selection, len(testable))
     residuals = held_out(selection)
     gap = measure_gap(selection, residuals)
-    stands, rest = confirmed(selection, rest, gap, len(testable))
+    stands, rest = confirmed(selection, rest, gap)
     if stands is not selection:
         selection = stands
         residuals = held_out(selection)
@@ -232,7 +234,9 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
     if matters(selection.fitter.problem, selection.fit, rest):
         return DiagnosisVerdict.UNKNOWN
     # effects that leave more on held-out data than there is noise explain it no better than what they stand in for
-    if selection.selected and (gap.not_expected > gap.noise_floor or gap.shown < MATERIAL):
+    if gap.not_expected > (1.0 if selection.selected else MOST_SLOW) * gap.noise_floor:
+        return DiagnosisVerdict.UNKNOWN
+    if selection.selected and gap.shown < MATERIAL:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)
@@ -385,8 +389,6 @@ def _reasons(
     reasons = [finding(code, **numbers)]
     if is_left and code != "GAP_UNKNOWN":
         reasons.append(finding("REST_UNEXPLAINED", rest=1e3 * gap.not_explained))
-    if rest.found and (is_left or is_unknown):
-        reasons.append(rest.follows)
-    elif is_unknown:
-        reasons.append(finding("REST_FOLLOWS_NOTHING"))
+    if is_unknown:
+        reasons.append(rest.follows if rest.found else finding("REST_FOLLOWS_NOTHING"))
     return tuple(reasons)

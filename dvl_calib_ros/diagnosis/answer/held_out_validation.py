@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import itertools
 
-import numpy as np
-
 from ...effects.base import Effect
+from ..fit.cross_validation import surprise_elsewhere
 from ..fit.gauss_newton import Fit
 from ..fit.selection_criteria import NuisanceFit, blocks_of, price, robust_p
 from ..model.forward_model import Problem
@@ -17,17 +16,10 @@ from ..search.unexplained import (
     is_of_group,
     matters,
     moved_by,
-    surprise_elsewhere,
-    told_elsewhere,
     unexplained,
 )
 from .gap_closure import Gap
 
-# p-value of a claim (adjusted) above which it must be sure to hold on data that was held out
-WEAK = 1e-3
-# Deviance that all effects together explain, up to which they must explain this share of it on stretches that they were
-# not fitted to as well: pairs that cancel but for noise do not, of real ones nine in ten do with a signal-to-noise of 5
-FAINT, BORNE_OUT = 200.0, 0.25
 # Of what effects explain, the shares that an unknown cause must explain to be asked whether it predicts better: at
 # first sight, beyond its price, and beyond what made-up recordings show to be chance; and what curves between samples
 # leave
@@ -103,37 +95,15 @@ def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
 
-def confirmed(
-    selection: EffectSelection, rest: Unexplained, gap: Gap, n_tested: int
-) -> tuple[EffectSelection, Unexplained]:
-    """A selection and what it leaves, as they are if it is borne out; else none of its effects, and what is left then.
+def confirmed(selection: EffectSelection, rest: Unexplained, gap: Gap) -> tuple[EffectSelection, Unexplained]:
+    """Return a selection and its residual's cause, or without any effect if the selection may enlarge the error.
 
-    What explains much may be told by one stretch alone, as a leap by one turn. It stands if no unknown cause does.
+    What one stretch alone tells, as a leap by one turn, is kept if no unknown cause explains the data instead.
     """
-    if not selection.selected or is_confirmed(selection, gap, n_tested):
+    if not selection.selected or gap.interval[0] > 0.0:
         return selection, rest
     none = selection.withdrawn()
     left = unexplained(none.fitter, none.fit)
-    is_told_once = none.fit.deviance - selection.fit.deviance >= FAINT and gap.shown_from > 0.0
-    if is_told_once and not matters(none.fitter.problem, none.fit, left):
+    if gap.shown_from > 0.0 and not matters(none.fitter.problem, none.fit, left):
         return selection, rest
     return none, left
-
-
-def is_confirmed(selection: EffectSelection, gap: Gap, n_tested: int) -> bool:
-    """Whether what was selected shrinks the error on held-out data; surely so, if it is not that unlikely by chance."""
-    fit = selection.fit
-    explained = selection.base.deviance - fit.deviance
-    if explained < FAINT:
-        columns, parameters = fit.columns[:, :, 6:], fit.hypothesis.parameters()
-        values = fit.hypothesis.vector()[6:] - np.array([each.spec.default for each in parameters])
-        without = fit.residual - columns @ values
-        problem = selection.fitter.problem
-        known = NuisanceFit.of(problem, fit.hypothesis, fit.seen, fit.columns[:, :, :6])
-        told = told_elsewhere(problem, fit.noise, known, columns, without)
-        if told < BORNE_OUT * (explained - len(values)):
-            return False
-    p = n_tested * float(np.exp(max(each.log_p for each in selection.selected)))
-    if np.isnan(gap.interval[0]):
-        return p <= WEAK and gap.after < gap.before
-    return gap.interval[0] > 0.0  # else, whatever its p, it does not hold elsewhere

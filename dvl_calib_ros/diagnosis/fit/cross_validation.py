@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +13,17 @@ from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
+from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .gauss_newton import Fit, Fitter
+from .selection_criteria import NuisanceFit
 
 Integers = NDArray[np.intp]
+# Columns, and the residual (M, A) m/s that they are fitted to
+Predictor = tuple[NuisanceFit, Array]
 # Steps of a fit that starts from that to all of the data
 FOLD_STEPS = 6
+# Time constant, s, of the slowest noise that an effect is compared with: GNSS multipath lasts minutes
+SLOWEST_S = 100.0
 
 
 def fitted_without(
@@ -45,3 +52,52 @@ def folds_of(problem: Problem) -> Integers:
 def stretch_of(time: Array) -> Integers:
     """Which of the stretches of time that are held out together times (M,) s are in; folds take them in turn."""
     return np.floor(time / SETTINGS.block).astype(np.intp)
+
+
+def surprise_elsewhere(problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array) -> float:
+    """How unlikely a residual (M, A) is, as deviance, on stretches of time that columns were not fitted to: of the same
+    data it is the lower, the better it is predicted.
+
+    By how well the columns are known there: of the only dive of a run, held out, no other stretch tells what an effect
+    of the pitch does, and none claims to.
+    """
+    folds = list(_held_out(problem, noise, fitted, residual))
+    held, trained = folds[0]
+    whole = replace(held, gram=held.gram + trained.gram).surprise()
+    return sum(whole - trained.surprise() for _, trained in folds)
+
+
+def _held_out(
+    problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array
+) -> Iterator[tuple[WhitenedLeastSquares, WhitenedLeastSquares]]:
+    """Of each fold, the least squares of the stretches held out, and of those that are fitted to."""
+    white, series = noise.whiten(fitted.columns), noise.whiten(residual)
+    rows = np.repeat(stretch_of(problem.time) % SETTINGS.folds, residual.shape[1])
+    parts = [(white[rows == fold], series[rows == fold]) for fold in np.unique(rows)]
+    each = [WhitenedLeastSquares.of(*part, fitted.std, fitted.centre) for part in parts]
+    for held in each:
+        trained = sum((other.gram for other in each if other is not held), start=np.zeros_like(held.gram))
+        yield held, replace(held, gram=trained)
+
+
+def predictive_gain(problem: Problem, noise: Noise, simpler: Predictor, richer: Predictor) -> float:
+    """Return the held-out deviance gain of one set of columns over a simpler one, each under its own noise.
+
+    The noise is estimated anew with either, so that slow noise is one of the explanations compared; each takes the one
+    that predicts better. noise: its level and frame.
+    """
+    noise = replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
+    colours = [_coloured_anew(noise, *each) for each in (simpler, richer)]
+    worse, better = (
+        min(surprise_elsewhere(problem, colour, *each) + colour.log_size for colour in colours)
+        for each in (simpler, richer)
+    )
+    return worse - better
+
+
+def _coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> Noise:
+    """Return the noise of what columns leave of a residual (M, A)."""
+    for _ in range(2):
+        left = residual + fitted.columns @ fitted.step(noise, residual).solution()
+        noise = noise.refitted(left, taken=noise.taken_by(fitted.columns, fitted.std))
+    return noise

@@ -28,10 +28,7 @@ class DiagnosisSettings:
     that no colour of the noise upsets.
 
     Judging: block, folds: of hold-out. noise_tolerance: so many standard errors may the noise of all frequencies lie
-    above that of the high ones. unexplained_energy: what is unexplained must have at least, in units of the noise
-    variance. unexplained_held_out: deviance that it must explain on stretches that it was not fitted to; there, what
-    is by chance or for how curves are interpolated makes it worse. No share of the gap is asked for: beside a large
-    effect anything is small. instead_of: deviance of effects that an unknown cause may stand in for; more would show
+    above that of the high ones. instead_of: deviance of effects that an unknown cause may stand in for; more would show
     without a test, and what a curve between samples leaves of it is more than noise. instead_share: of that, by which
     it must explain more.
     prior_angle, prior_scale: standard deviation of misalignment and scale, held so where the data says little (roll,
@@ -57,8 +54,6 @@ class DiagnosisSettings:
     block: float = 20.0
     folds: int = 5
     noise_tolerance: float = 3.0
-    unexplained_energy: float = 20.0
-    unexplained_held_out: float = 15.0
     instead_of: float = 1500.0
     instead_share: float = 0.15
     prior_angle: float = 0.1

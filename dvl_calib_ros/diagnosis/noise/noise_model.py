@@ -189,9 +189,14 @@ class Noise:
     def deviance(self, residual: Array) -> float:
         """-2 log likelihood of a residual (M, A), but for a constant."""
         white = self.whiten(residual)
+        return float(white @ white) + self.log_size
+
+    @property
+    def log_size(self) -> float:
+        """Log determinant of the covariance."""
         logarithms = np.log(self.level).sum() + sum(np.log(arma.std) for arma in self.axes) * len(self.level)
         first = sum(np.log(arma.ratio) for arma in self.axes) * len(self.segments)
-        return float(white @ white + 2.0 * (logarithms + first))
+        return float(2.0 * (logarithms + first))
 
     def robust(self, residual: Array) -> Array:
         """The residual (M, A) with its innovations winsorised: what least squares then makes of it is Huber's.

@@ -8,9 +8,11 @@ from functools import cache, partial
 import numpy as np
 
 from ...effects.base import Effect
-from ..fit.gauss_newton import Fit, Fitter
+from ..fit.cross_validation import predictive_gain
+from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
 from ..fit.selection_criteria import (
     WINDOW_STEPS,
+    NuisanceFit,
     best_of,
     blocks_of,
     finer_steps,
@@ -116,33 +118,21 @@ def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:
     )
 
 
-def without_nothing(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
-    """A fit without those effects that explain, under the noise as it is known now, no more than chance does.
-
-    At one speed a quadratic scale and the scale go anywhere together, and what noise of the DVL that makes is all they
-    explain.
-    """
+def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+    """Return a fit without effects that do not predict held-out data beyond chance, slow noise being an alternative."""
+    problem, n = fitter.problem, len(fit.seen)
     while fit.effects:
-        rests = [
-            (rest := fit_without(fitter, fit, effect), log_p_in_place(fitter, fit, rest, effect))
-            for effect in fit.effects
-        ]
-        worst, log_p = max(rests, key=lambda each: each[1])
-        if log_p < -float(np.log(n_effects)):
+        own, spare = (NuisanceFit.of_fit(problem, fit), fit.residual), []
+        for effect in fit.effects:
+            rest = fit_without(fitter, fit, effect)
+            gain = predictive_gain(problem, fit.noise, (NuisanceFit.of_fit(problem, rest), rest.residual), own)
+            gain += float(fit.own_noise @ fit.own_noise - rest.own_noise @ rest.own_noise)
+            chance = price(effect, n_effects, n, times_tried(effect)) - n_amplitudes(effect, n)
+            spare.append((gain - chance, rest))
+        worst, rest = min(spare, key=lambda each: each[0])
+        if worst > 0.0:
             return fit
-        fit = worst
-    return fit
-
-
-def only_confirmed(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
-    """A fit without effects that the scatter of the blocks does not bear out, whatever the noise's colour."""
-    block = blocks_of(fitter.problem)
-    while fit.effects:
-        p_values = {effect.name: robust_p(fit, effect, block) for effect in fit.effects}
-        worst = max(p_values, key=lambda name: p_values[name])
-        if p_values[worst] < SETTINGS.robust_level:
-            return fit
-        fit = fit_without(fitter, fit, next(effect for effect in fit.effects if effect.name == worst))
+        fit = rest
     return fit
 
 

@@ -43,9 +43,8 @@ from .backward_elimination import (
     eliminate,
     is_taken_back,
     once_where_confirmed,
-    only_confirmed,
+    only_predictive,
     repeated_effects,
-    without_nothing,
 )
 from .candidates import by_other_clocks, intermittent_effects, jumps_at_start, proposed, variants_about
 from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, jumps_in_stamps, leaping
@@ -163,11 +162,10 @@ def select(
         if names in seen_before:
             break
         seen_before.add(names)
-    fit = only_confirmed(fitter, eliminate(fitter, fit, len(effects)), len(effects))
+    fit = only_predictive(fitter, eliminate(fitter, fit, len(effects)), len(effects))
     fit = in_gaps(fitter, once_where_confirmed(fitter, fit, every, effects))
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
-    fit = without_nothing(fitter, fit, len(effects))
     fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
     guesses = _beside_moving_clocks(fitter, fit, guesses)

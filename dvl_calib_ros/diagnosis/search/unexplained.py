@@ -6,7 +6,7 @@ not know the vehicle's motion, so what follows it is systematic, whatever its ca
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -18,15 +18,13 @@ from ...calibration.numerics.frames import Array
 from ...calibration.streams.interpolation import shortened
 from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
-from ..fit.cross_validation import stretch_of
+from ..fit.cross_validation import predictive_gain
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.parametric_bootstrap import simulated_recordings
 from ..fit.selection_criteria import NuisanceFit
 from ..model.forward_model import Problem
 from ..model.seen import Seen
-from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
-from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .alternative_regressors import ALTERNATIVES, dictionary
 
 LEVEL = 0.001
@@ -279,19 +277,16 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
     return found
 
 
-def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
-    """Deviance that what the rest follows most clearly explains where it was not fitted to (`told_elsewhere`)."""
-    noise, known = fit.noise, NuisanceFit.of_fit(problem, fit)
-    if noise.is_coloured:  # else what is left is taken for slow noise, of which no stretch tells another
-        noise = _coloured_anew(noise, known, rest.clearest, fit.residual).noise
-    return told_elsewhere(problem, noise, known, rest.clearest, fit.residual)
-
-
 def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
-    """Whether what is left is large enough to be told, and there on stretches of the run that it was not fitted to."""
-    if not rest.found or rest.energy < SETTINGS.unexplained_energy:
-        return False
-    return holds_out(problem, fit, rest) > SETTINGS.unexplained_held_out
+    """Return whether what the residual follows predicts held-out data better than slow noise and chance do."""
+    return rest.found and holds_out(problem, fit, rest) > rest.price - rest.clearest.shape[2]
+
+
+def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
+    """Return the held-out deviance gain of what the residual of a fit follows most clearly."""
+    known = NuisanceFit.of_fit(problem, fit)
+    both = known.and_rest(rest.clearest, fit.residual)
+    return predictive_gain(problem, fit.noise, (known, fit.residual), (both, fit.residual))
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
@@ -302,21 +297,6 @@ def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     both = known.and_rest(raw, fit.residual)
     stands = both._replace(centre=np.zeros_like(both.centre))  # about where the fit stands, whatever its prior
     return stands.step(noise, fit.residual).solution()[: fit.columns.shape[2]]
-
-
-def told_elsewhere(problem: Problem, noise: Noise, known: NuisanceFit, raw: Array, residual: Array) -> float:
-    """Whitened squares of a residual (M, A) that columns raw (M, A, c), beside known ones, explain on stretches of time
-    that they were not fitted to.
-
-    One of many regressors may have a small p-value by chance or for an interpolation that is bent in sharp corners;
-    what is there tells of itself elsewhere. Known ones have a prior, without which the scale of a heave that is hardly
-    there would take in what is left.
-    """
-    of_known, gain = np.arange(len(known.std)), 0.0
-    for held, trained in _held_out(problem, noise, known.and_rest(raw, residual), residual):
-        base = trained.part(of_known)
-        gain += held.part(of_known).squares(base.solution()) - held.squares(trained.solution())
-    return gain
 
 
 def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: str | float) -> bool:
@@ -335,32 +315,6 @@ def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: st
     group = orthonormal(np.concatenate([calibration, noise.whiten(functions)], axis=1))
     left = asked - group @ (group.T @ asked)
     return bool(((left**2).sum(axis=0) < OF_GROUP * (asked**2).sum(axis=0)).all())
-
-
-def surprise_elsewhere(problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array) -> float:
-    """How unlikely a residual (M, A) is, as deviance, on stretches of time that columns were not fitted to: of the same
-    data it is the lower, the better it is predicted.
-
-    By how well the columns are known there: of the only dive of a run, held out, no other stretch tells what an effect
-    of the pitch does, and none claims to.
-    """
-    folds = list(_held_out(problem, noise, fitted, residual))
-    held, trained = folds[0]
-    whole = replace(held, gram=held.gram + trained.gram).surprise()
-    return sum(whole - trained.surprise() for _, trained in folds)
-
-
-def _held_out(
-    problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array
-) -> Iterator[tuple[WhitenedLeastSquares, WhitenedLeastSquares]]:
-    """Of each fold, the least squares of the stretches held out, and of those that are fitted to."""
-    white, series = noise.whiten(fitted.columns), noise.whiten(residual)
-    rows = np.repeat(stretch_of(problem.time) % SETTINGS.folds, residual.shape[1])
-    parts = [(white[rows == fold], series[rows == fold]) for fold in np.unique(rows)]
-    each = [WhitenedLeastSquares.of(*part, fitted.std, fitted.centre) for part in parts]
-    for held in each:
-        trained = sum((other.gram for other in each if other is not held), start=np.zeros_like(held.gram))
-        yield held, replace(held, gram=trained)
 
 
 def _chance(fitter: Fitter, fit: Fit, name: str) -> float:

@@ -12,9 +12,10 @@ from test_diagnosis import LEVER, fitted, recording_of, scenario, with_added
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.diagnosis.answer import held_out_validation
 from dvl_calib_ros.diagnosis.answer.gap_location import places
-from dvl_calib_ros.diagnosis.answer.held_out_validation import is_confirmed, settled
+from dvl_calib_ros.diagnosis.answer.held_out_validation import settled
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
+from dvl_calib_ros.diagnosis.fit.cross_validation import surprise_elsewhere
 from dvl_calib_ros.diagnosis.fit.gauss_newton import NEARBY, SURELY, Fitter
 from dvl_calib_ros.diagnosis.fit.selection_criteria import NuisanceFit
 from dvl_calib_ros.diagnosis.model.forward_model import make_problem
@@ -29,8 +30,6 @@ from dvl_calib_ros.diagnosis.search.unexplained import (
     holds_out,
     is_of_group,
     matters,
-    surprise_elsewhere,
-    told_elsewhere,
     unexplained,
 )
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -131,7 +130,7 @@ def test_what_is_left_of_a_heave_that_is_hardly_there_is_there_elsewhere_as_well
     fitter, fit = with_a_wave(118.0, (0.0, 0.0, 0.01))
     rest = unexplained(fitter, fit)
     assert rest.about == pytest.approx(118.0, rel=0.05)
-    assert holds_out(fitter.problem, fit, rest) > 0.8 * rest.energy
+    assert holds_out(fitter.problem, fit, rest) > 0.3 * rest.energy
     assert matters(fitter.problem, fit, rest)
 
 
@@ -170,16 +169,6 @@ def test_one_harmonic_of_the_heading_is_looked_for_by_itself():
     assert matters(fitter.problem, fit, rest)
 
 
-@pytest.mark.parametrize(("low", "stands"), [(-0.7, False), (0.1, True)])
-def test_what_may_make_it_worse_where_it_was_not_fitted_to_does_not_stand_however_sure(low, stands):
-    """A bias and a current of 12 s stood for a hysteresis, and closed 36 % of the gap, -72 to 100 %."""
-    selected = [SimpleNamespace(log_p=-200.0)]
-    fits = [SimpleNamespace(deviance=deviance) for deviance in (900.0, 300.0)]
-    selection = SimpleNamespace(base=fits[0], fit=fits[1], selected=selected)
-    gap = SimpleNamespace(before=0.049, after=0.048, interval=(low, 1.0))
-    assert is_confirmed(selection, gap, 20) is stands
-
-
 @pytest.mark.slow
 def test_what_is_off_in_turns_is_unknown_and_no_heading_error():
     """Which on a lawnmower explains as much for its price; elsewhere it tells 21 less. It was known."""
@@ -215,7 +204,6 @@ def test_what_one_stretch_alone_tells_of_an_effect_is_not_held_against_it_where_
     noise = white_noise(rng.standard_normal((len(time), 1)), (slice(0, len(time)),), None, 0.5)
     known = NuisanceFit(np.ones((len(time), 1, 1)), np.ones(1), np.zeros(1))
     problem, raw = SimpleNamespace(time=time), column[:, None, None]
-    assert told_elsewhere(problem, noise, known, raw, residual) < 0.0
     left = noise.whiten(residual - 3.0 * column[:, None])
     explained = float(np.sum(noise.whiten(residual) ** 2) - np.sum(left**2))
     with_it = surprise_elsewhere(problem, noise, known.and_rest(raw, residual), residual)
