@@ -56,9 +56,10 @@ OFF_CENTRE, RECENTRED = 0.7, 4
 # A configured lever arm is a tape measurement with this σ, m, and wrong with probability WRONG_TAPE.
 TAPE_STD_M, WRONG_TAPE = 0.05, 0.1
 # A vehicle at the surface or at constant depth ends at the height at which it began, within LEVEL_M (tide, waves) and
-# its own excursions; with probability NOT_LEVEL it climbs, with σ CLIMB_MPS. Vertical reference error: with probability
-# OFFSET it has σ OFFSET_MPS (a receiver's antenna model) instead of `reference_offset_std`.
-LEVEL_M, NOT_LEVEL, CLIMB_MPS = 1.0, 0.1, 0.3
+# its own excursions. With probability SLOWLY it sinks or rises by its trim, with σ SLOW_MPS, and with probability CLIMBS
+# it dives, with σ CLIMB_MPS. Vertical reference error: with probability OFFSET it has σ OFFSET_MPS (a receiver's antenna
+# model) instead of `reference_offset_std`.
+LEVEL_M, SLOWLY, SLOW_MPS, CLIMBS, CLIMB_MPS = 1.0, 0.2, 0.03, 0.1, 0.3
 OFFSET, OFFSET_MPS = 0.1, 0.05
 # Smallest white noise of a velocity, m/s. Degrees of freedom needed to estimate the noise of bins.
 LEAST_NOISE_MPS, FEWEST = 1e-4, 6
@@ -491,18 +492,18 @@ class JointFit:
         """Return mean and covariance over points of the slow errors and over the hypotheses of the priors.
 
         These are a right and a wrong configured lever arm, a small and a large vertical error of the reference, and a
-        level and a climbing vehicle.
+        level, a slowly sinking and a diving vehicle.
         """
         arms = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
         offsets = {0.0: 1.0 - OFFSET, OFFSET_MPS: OFFSET} if climbs else {0.0: 1.0}
-        level = {True: 1.0 - NOT_LEVEL, False: NOT_LEVEL} if climbs else {True: 1.0}
-        cases = list(product(arms, offsets, level))
-        likely = np.array([arms[arm] * offsets[offset] * level[is_level] for arm, offset, is_level in cases])
+        paths = {0.0: 1.0 - SLOWLY - CLIMBS, SLOW_MPS: SLOWLY, CLIMB_MPS: CLIMBS} if climbs else {0.0: 1.0}
+        cases = list(product(arms, offsets, paths))
+        likely = np.array([arms[arm] * offsets[offset] * paths[climb_mps] for arm, offset, climb_mps in cases])
         priors = [self._by_prior(points, arm, offset) for arm, offset, _ in cases]
         information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
         square = np.zeros(information.shape[:2])
         for climb in climbs:
-            variance = np.array([climb.std if is_level else CLIMB_MPS for *_, is_level in cases])[:, None] ** 2
+            variance = np.array([max(climb.std, climb_mps) for *_, climb_mps in cases])[:, None] ** 2
             h, at = climb.row[:-1], climb.at
             information[:, :, at[:, None], at] += np.outer(h, h) / variance[:, :, None, None]
             vector[:, :, at] -= climb.row[-1] * h / variance[:, :, None]
