@@ -138,8 +138,6 @@ def _open_mcap(path: Path, shown: Path, notes: list[str]) -> Source | None:
     }
     counts = dict.fromkeys(channels.values(), 0)
     for number, count in statistics.channel_message_counts.items():
-        if number not in channels:
-            raise DamagedError(f"its index counts messages of channel {number}, which it does not name")
         counts[channels[number]] += count
 
     def batches(topics: Collection[str]) -> Iterator[Batch]:

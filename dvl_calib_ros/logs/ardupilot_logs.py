@@ -51,11 +51,24 @@ def read_ardupilot_log(path: Path, start: bytes) -> DvlLog:
         from pymavlink import DFReader, mavutil
     except ImportError as error:
         raise InputError(f"{path}: is read by pymavlink; pip install 'dvl_calib_ros[ardupilot]'") from error
+
+    class Dataflash(DFReader.DFReader_binary):  # type: ignore[misc]
+        """pymavlink's reader, which reads a message of no length, by a damaged table of formats, for ever."""
+
+        offset: int
+
+        def _parse_next(self) -> Any:
+            before, message = self.offset, super()._parse_next()
+            while message is not None and self.offset <= before:
+                self.offset = before = before + 1
+                message = super()._parse_next()
+            return message
+
     read = _VehicleMessages()
     wanted = list(_TAKERS)
     try:
         with _silenced():
-            log = (DFReader.DFReader_binary if is_dataflash(start) else mavutil.mavmmaplog)(str(path))
+            log = (Dataflash if is_dataflash(start) else mavutil.mavmmaplog)(str(path))
             with closing(log):
                 while (message := log.recv_match(type=wanted)) is not None:
                     read.take(message)

@@ -363,6 +363,8 @@ def _definition_seeds() -> Iterator[bytes]:
         yield b"\0" + JAZZY.generate_msgdef(msgtype, ros_version=2)[0].encode()
     yield b"\0int32 X=3\nfloat64[<=4] values\nstring<=5 name 'a'\nfloat64[9] covariance\n"
     yield b"\0a/B self\n"
+    halves = [f"{'=' * 80}\nMSG: a/{'CDEFGH'[i]}\na/{'DEFGHI'[i]} x\na/{'DEFGHI'[i]}[2] y\n" for i in range(6)]
+    yield f"\0a/C[60] x\n{''.join(halves)}{'=' * 80}\nMSG: a/I\nuint8[0] x\n".encode()
     yield b"\0a/B2[] x\n" + b"=" * 80 + b"\nMSG: a/B2\na/B y\n"
     yield b"\xff" + (
         b"================================================================================\nIDL: a/msg/B\n"

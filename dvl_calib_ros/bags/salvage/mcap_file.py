@@ -102,9 +102,11 @@ def _summary(file: BinaryIO) -> Summary | None:
     if holes := holes_in(file, start, size):
         lost = sum(last - first for first, last in holes)
         raise DamagedError(f"{lost} bytes of its index cannot be read from the disk")
-    counted = summary.statistics if summary else None
-    if counted is not None and counted.message_count != sum(counted.channel_message_counts.values()):
-        raise DamagedError("its count of messages is damaged")
+    if summary is not None and summary.statistics is not None:
+        counts = summary.statistics.channel_message_counts
+        is_named = not summary.channels or counts.keys() <= summary.channels.keys()
+        if not is_named or summary.statistics.message_count != sum(counts.values()):
+            raise DamagedError("its count of messages is damaged")
     return summary
 
 

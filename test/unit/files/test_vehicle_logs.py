@@ -17,6 +17,7 @@ from log_fixtures import START_S, dataflash, general_nmea, nortek, pd0, rmc, sen
 
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion
+from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.logs.dvl_logs import is_dvl_log, read_dvl_log
 from dvl_calib_ros.logs.nmea import read_rmc
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_files
@@ -77,6 +78,16 @@ def test_of_a_telemetry_log_one_vehicle_is_read(tmp_path):
     pytest.importorskip("pymavlink", reason="needs the extra ardupilot")
     log = read_dvl_log(telemetry(tmp_path / "two.tlog", other=True))
     assert len(log.samples) == 35 and log.left_out["of another vehicle"] == 100
+
+
+def test_a_message_of_no_length_is_not_read_for_ever(tmp_path):
+    pytest.importorskip("pymavlink", reason="needs the extra ardupilot")
+    path = dataflash(tmp_path / "dive.BIN")
+    content = path.read_bytes()
+    nothing = b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", 200, 0, b"ZERO", b"", b"") + b"\xa3\x95\xc8" * 3
+    path.write_bytes(content[: 4 * 89] + nothing + content[4 * 89 :])
+    with pytest.raises(InputError, match="no velocity that can be used"):
+        read_dvl_log(path)
 
 
 def test_a_cut_or_holed_log_gives_what_is_whole_without_a_word_of_each_byte(tmp_path, capfd):
