@@ -43,7 +43,7 @@ def plain(value: Any) -> str:
     """Format a parameter."""
     if isinstance(value, list):
         return " ".join(map(plain, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value) or "''"
+    return f"{round(value, 12) + 0.0:.6g}" if isinstance(value, float) else str(value) or "''"
 
 
 @cache
