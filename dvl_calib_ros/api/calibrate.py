@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -114,9 +115,8 @@ def compare(
     from ..files.mounting import load_extrinsics
 
     found = []
-    for given in results:
+    for given, name in zip(results, _names(results), strict=True):
         if isinstance(given, Calibration):
-            name = ", ".join(map(str, given.bags))
             extrinsics = extrinsics_of_replay(given.replayed, name)
             if extrinsics is None:
                 raise InputError(f"{name}: no sample of it could be used to calibrate; leave it out")
@@ -124,11 +124,21 @@ def compare(
         elif is_bag(Path(given)):
             topics = (dvl_topic, gnss_topic, imu_topic)
             recording, discovery = discovered_in([Path(given)], topics, params, parameters)
-            found.append(calibrated(recording, discovery.parameters, discovery.topics, str(given)).extrinsics)
+            found.append(calibrated(recording, discovery.parameters, discovery.topics, name).extrinsics)
         else:
-            found.append(load_extrinsics(Path(given), str(given)))
+            found.append(load_extrinsics(Path(given), name))
     check_distinct(found)
     return run(found)
+
+
+def _names(results: Sequence[StrPath | Calibration]) -> list[str]:
+    """Return the names of files and bags without folders if they are unique, else their paths. Raises InputError."""
+    for each in results:
+        if not isinstance(each, str | os.PathLike | Calibration):
+            raise InputError(f"compare: {each!r}; expected result files, bags or return values of replay")
+    paths = [list(each.bags) if isinstance(each, Calibration) else [Path(each)] for each in results]
+    short = [", ".join(path.name or str(path) for path in of_one) for of_one in paths]
+    return short if len(set(short)) == len(short) else [", ".join(map(str, of_one)) for of_one in paths]
 
 
 def fleet(

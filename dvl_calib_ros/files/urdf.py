@@ -120,8 +120,8 @@ class Urdf:
 
 
 def numbers(values: Sequence[float] | Array) -> str:
-    """Format numbers for a URDF attribute: nine digits, no minus zero."""
-    return " ".join(f"{float(value) + 0.0:.9g}" for value in values)
+    """Format numbers for a URDF attribute: nine digits, zero below 1e-12, no minus zero."""
+    return " ".join(f"{round(float(value), 12) + 0.0:.9g}" for value in values)
 
 
 def origin_tag(xyz: Sequence[float] | Array | None, rpy: Sequence[float] | Array) -> str:

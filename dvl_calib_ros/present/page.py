@@ -34,16 +34,16 @@ def breakable(text: str) -> Markup:
     return Markup(re.sub(r"([/_])(?=\w)", r"\1<wbr>", str(escape(text))))
 
 
-def whole(text: str) -> str:
-    """Return a number with its unit, unbroken and with minus signs."""
-    return text.replace("-", "−").replace(" ", "\u00a0")
+def whole(text: str) -> Markup:
+    """Return a number with its unit in HTML, unbroken and with minus signs."""
+    return Markup(str(escape(text)).replace("-", "−").replace(" ", "&nbsp;"))
 
 
 def plain(value: Any) -> str:
     """Format a parameter."""
     if isinstance(value, list):
         return " ".join(map(plain, value))
-    return f"{value:.6g}" if isinstance(value, float) else str(value) or "''"
+    return f"{round(value, 12) + 0.0:.6g}" if isinstance(value, float) else str(value) or "''"
 
 
 @cache

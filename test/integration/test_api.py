@@ -118,6 +118,7 @@ def test_values_that_no_data_support_are_marked_where_the_mounting_is_printed(ba
     ("call", "expected"),
     [
         (lambda run, to: dc.replay(3), "bags=3: expected the path"),
+        (lambda run, to: dc.compare(run, 5), "5; expected result files, bags or"),
         (lambda run, to: dc.simulate(to, duration=30.0), "'seconds'"),
         (lambda run, to: dc.simulate(to, waves=0.3), "Waves(height="),
         (lambda run, to: dc.simulate(to, trajectory="foo"), "box"),
@@ -160,7 +161,11 @@ def test_bags_are_compared_as_result_files_are(calibration, bag, tmp_path):
     saved = calibration.save(tmp_path / "before.yaml")
     later = dc.simulate(tmp_path / "later", seconds=90.0, seed=7)
     found = dc.compare(saved, later)
-    assert [each.name for each in found.calibrations] == [str(saved), str(later)]
+    assert [each.name for each in found.calibrations] == ["before.yaml", "later"]
+    (tmp_path / "again").mkdir()
+    other = dc.replay(later, history=False).save(tmp_path / "again" / "before.yaml")
+    again = dc.compare(saved, other)  # equal names: whole paths
+    assert [each.name for each in again.calibrations] == [str(saved), str(other)]
     assert found.word in ("same", "suspicious", "moved")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import re
 import sys
 import zlib
@@ -23,9 +24,10 @@ from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
+from dvl_calib_ros.files.urdf import numbers
 from dvl_calib_ros.present.figure_data import MapTrack, TimeAxis, explorable
 from dvl_calib_ros.present.figure_style import MODEL_STYLES, new_figure
-from dvl_calib_ros.present.page import write_replay_report, write_report
+from dvl_calib_ros.present.page import plain, write_replay_report, write_report
 from dvl_calib_ros.present.replay_figures import ModelLine, estimate_over_time, held_out_errors
 from dvl_calib_ros.verdict.kinds import Severity
 
@@ -92,6 +94,10 @@ def test_the_mounting_stands_large_on_top_as_a_user_mounts_it(made):
     for each in found:
         assert f"{each.in_unit(each.value)} ± {each.in_unit(each.std)} (1σ)" in summary
     assert "φ" not in summary and "from above" in summary and "from starboard" in summary
+
+
+def test_an_angle_of_zero_is_written_as_zero():
+    assert plain([math.pi, 6.16e-33, -1e-17]) == "3.14159 0 0" and numbers([6.16e-33, 0.5]) == "0 0.5"
 
 
 def test_after_a_reject_there_is_no_mounting_and_no_drift_that_it_would_be_worth(tmp_path, monkeypatch):
