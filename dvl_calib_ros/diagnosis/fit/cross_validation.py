@@ -95,6 +95,13 @@ def predictive_gain(problem: Problem, noise: Noise, simpler: Predictor, richer: 
     return worse - better
 
 
+def predictive_gain_of(problem: Problem, simpler: Fit, richer: Fit) -> float:
+    """Return the `predictive_gain` of a fit over a simpler one, without the instruments' noise that that smooths."""
+    own, other = ((NuisanceFit.of_fit(problem, each), each.residual) for each in (simpler, richer))
+    smoothed = float(simpler.own_noise @ simpler.own_noise - richer.own_noise @ richer.own_noise)
+    return predictive_gain(problem, richer.noise, own, other) + max(-smoothed, 0.0)
+
+
 def _coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> Noise:
     """Return the noise of what columns leave of a residual (M, A)."""
     for _ in range(2):

@@ -8,11 +8,10 @@ from functools import cache, partial
 import numpy as np
 
 from ...effects.base import Effect
-from ..fit.cross_validation import predictive_gain
+from ..fit.cross_validation import predictive_gain_of
 from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
 from ..fit.selection_criteria import (
     WINDOW_STEPS,
-    NuisanceFit,
     best_of,
     blocks_of,
     finer_steps,
@@ -122,13 +121,11 @@ def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """Return a fit without effects that do not predict held-out data beyond chance, slow noise being an alternative."""
     problem, n = fitter.problem, len(fit.seen)
     while fit.effects:
-        own, spare = (NuisanceFit.of_fit(problem, fit), fit.residual), []
+        spare = []
         for effect in fit.effects:
             rest = fit_without(fitter, fit, effect)
-            gain = predictive_gain(problem, fit.noise, (NuisanceFit.of_fit(problem, rest), rest.residual), own)
-            gain += float(fit.own_noise @ fit.own_noise - rest.own_noise @ rest.own_noise)
             chance = price(effect, n_effects, n, times_tried(effect)) - n_amplitudes(effect, n)
-            spare.append((gain - chance, rest))
+            spare.append((predictive_gain_of(problem, rest, fit) - chance, rest))
         worst, rest = min(spare, key=lambda each: each[0])
         if worst > 0.0:
             return fit

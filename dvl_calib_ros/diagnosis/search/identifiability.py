@@ -9,6 +9,7 @@ import numpy as np
 
 from ...calibration.registration.registration import IN_TIME_STD_S
 from ...effects.base import Effect
+from ..fit.cross_validation import predictive_gain_of
 from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
 from ..fit.selection_criteria import blocks_of, fit_without, log_p_in_place, log_p_value, robust_p, times_tried
 from ..model.hypothesis import Hypothesis
@@ -113,6 +114,8 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
             continue
         rival = fitter.fit_kept(combined(fitter, rest, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance
+        if behind < 0.5 * drop:  # what is much worse under one noise is under its own as well
+            behind = min(behind, predictive_gain_of(fitter.problem, rival, fit))
         fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
         chosen = float(np.log(times_tried(effect) / times_tried(effects[name])))
         if behind < SETTINGS.indistinguishable + max(0.0, 2.0 * (fewer + chosen)):
