@@ -72,8 +72,8 @@ SAID_FROM, WRONG_FROM, WITHIN = math.radians(0.2), math.radians(0.5), 2.0
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
-# Scale error of a beam from which it is reported, and from which a calibration is rejected: 10 m of drift per km.
-BEAM_SAID_FROM, BEAM_WRONG_FROM = 0.02, 0.03
+# Error of the velocity ahead (share of the speed) by a beam, from which it is reported, and rejected: 10 m per km.
+BEAM_SAID_FROM, BEAM_WRONG_FROM = 0.005, 0.01
 # Residual, relative to the median, beyond which it is an outlier; number of iterations.
 OUTLYING, ROUNDS = 4.0, 3
 # Smallest noise of the residual, m/s.
@@ -105,9 +105,9 @@ class ResidualTrend(NamedTuple):
     wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
     of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
     circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: memory, s, the most
-    significant of `FORGOTTEN_S`. beam, beam_std: share by which one beam reads low; beam_deg: its azimuth in the DVL.
-    over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every heading; 0 if the residual
-    holds less than half of it.
+    significant of `FORGOTTEN_S`. beam, beam_std: share by which one beam reads low; beam_deg: its azimuth in the DVL;
+    beam_off: error of the mean velocity by it, as a share of the speed. over_ground, over_ground_std: (2,) m/s,
+    reference minus DVL, east and north, on every heading; 0 if the residual holds less than half of it.
     """
 
     tilt: Array
@@ -126,6 +126,7 @@ class ResidualTrend(NamedTuple):
     beam: float
     beam_std: float
     beam_deg: float
+    beam_off: float
 
 
 class _Fit(NamedTuple):
@@ -244,15 +245,15 @@ def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> A
     return known
 
 
-def _beam(fit: _Fit, columns: Array, moving: Array, rotation_dvl_from_body: Array) -> tuple[float, float, float]:
-    """Return the most significant share by which one beam reads low, its σ, and its azimuth in the DVL, degrees.
+def _beam(fit: _Fit, columns: Array, moving: Array, rotation_dvl_from_body: Array) -> tuple[float, float, float, float]:
+    """Return the last four values of `ResidualTrend`, of the most significant beam that matters on a straight course.
 
     The velocity is the least-squares solution of four beams. A beam that reads high looks like the opposite one that
     reads low, but for scales. columns: (N, 3, n) of the fit. moving: (N, 3) m/s, body.
     """
     t, weight, found = rotation_dvl_from_body, fit.weight, []
     flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)
-    few = of_few(np.array([len(fit.starts) - 1.0]))[0]
+    few, mean = of_few(np.array([len(fit.starts) - 1.0]))[0], moving.mean(axis=0)
     # the noise of the DVL, which is in `moving` as well, looks like a beam in signals that are smaller
     noise = float(np.einsum("n,ni,ni->", weight, fit.rest, fit.rest))
     for degrees in AZIMUTHS_DEG:
@@ -268,8 +269,10 @@ def _beam(fit: _Fit, columns: Array, moving: Array, rotation_dvl_from_body: Arra
         rest = fit.rest - share * alone
         scores = np.add.reduceat(weight * (alone * rest).sum(axis=1), fit.starts) / square
         std = few * float(_std(scores[None], QUICK_STRETCHES)[0])
-        found.append((abs(share), std, (degrees + 180.0 * (share < 0.0)) % 360.0))
-    return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
+        off = abs(share) * float(np.linalg.norm(low.mean(axis=0))) / max(float(np.linalg.norm(mean)), 1e-6)
+        if off > BEAM_SAID_FROM:
+            found.append((abs(share), std, (degrees + 180.0 * (share < 0.0)) % 360.0, off))
+    return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0, 0.0))
 
 
 def _beside(time: Array, values: Array, starts: Index) -> Array:
@@ -370,8 +373,9 @@ def residual_warnings(
             said.append(found_tilt.weighed(word))
         elif std > TILT_SHOWN and abs(float(found.lean[axis])) > WRONG_FROM:
             said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
-    if found.beam > max(SURELY_BIASED * found.beam_std, BEAM_SAID_FROM):
-        word = Severity.REJECT if found.beam - found.beam_std > BEAM_WRONG_FROM else Severity.MARGINAL
+    if found.beam > SURELY_BIASED * found.beam_std and found.beam_off > BEAM_SAID_FROM:
+        is_sure = found.beam > SURELY_SMOOTHED * found.beam_std  # slow errors may look like one of the eight beams
+        word = Severity.REJECT if is_sure and found.beam_off > BEAM_WRONG_FROM else Severity.MARGINAL
         percent, std = 100.0 * found.beam, 100.0 * found.beam_std
         said.append(finding("BEAM_OFF", percent=percent, std=std, azimuth=found.beam_deg).weighed(word))
     size = np.abs(found.bias)

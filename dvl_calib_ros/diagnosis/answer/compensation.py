@@ -31,7 +31,7 @@ WHOLE_RUN_S = 5.0
 
 
 @dataclass(frozen=True)
-class Correction:
+class AppliedCorrection:
     """Parameters with a correction, verified on held-out data.
 
     changed: values by name, of the parameters that differ. errors: held-out rms without and with it, m/s.
@@ -50,7 +50,7 @@ class Correction:
 
 def verified_corrections(
     parameters: Parameters, diagnosis: Diagnosis, days: Sequence[int | None]
-) -> dict[int | None, Correction]:
+) -> dict[int | None, AppliedCorrection]:
     """Return the corrections that change a parameter, of the vehicle (None) or of a recording by index.
 
     Raises
@@ -66,7 +66,7 @@ def verified_corrections(
         changed = {name: value for name, value in corrected.as_dict().items() if value != before[name]}
         if not changed:
             continue
-        found[day] = Correction(corrected, changed, held_out_errors(diagnosis, day))
+        found[day] = AppliedCorrection(corrected, changed, held_out_errors(diagnosis, day))
         if not found[day].errors[1] < found[day].errors[0]:
             raise InputError(f"not written, since the error does not fall: {found[day].sentence}")
     if not found:
