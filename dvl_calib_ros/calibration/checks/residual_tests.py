@@ -374,8 +374,8 @@ def residual_warnings(
         elif std > TILT_SHOWN and abs(float(found.lean[axis])) > WRONG_FROM:
             said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
     if found.beam > SURELY_BIASED * found.beam_std and found.beam_off > BEAM_SAID_FROM:
-        is_sure = found.beam > SURELY_SMOOTHED * found.beam_std  # slow errors may look like one of the eight beams
-        word = Severity.REJECT if is_sure and found.beam_off > BEAM_WRONG_FROM else Severity.MARGINAL
+        is_clear = found.beam > SURELY_SMOOTHED * found.beam_std  # slow errors may look like one of the eight beams
+        word = Severity.REJECT if is_clear and found.beam_off > BEAM_WRONG_FROM else Severity.MARGINAL
         percent, std = 100.0 * found.beam, 100.0 * found.beam_std
         said.append(finding("BEAM_OFF", percent=percent, std=std, azimuth=found.beam_deg).weighed(word))
     size = np.abs(found.bias)

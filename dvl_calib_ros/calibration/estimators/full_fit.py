@@ -57,9 +57,9 @@ OFF_CENTRE, RECENTRED = 0.7, 4
 TAPE_STD_M, WRONG_TAPE = 0.05, 0.1
 # A vehicle at the surface or at constant depth ends at the height at which it began, within LEVEL_M (tide, waves) and
 # its own excursions. With probability SLOWLY it sinks or rises by its trim (σ SLOW_MPS), and with probability CLIMBS it
-# dives (σ CLIMB_MPS). Vertical reference error: with probability OFFSET it has σ OFFSET_MPS (a receiver's antenna model)
+# dives (σ CLIMB_MPS). Vertical reference error: with probability OFFSET it has σ OFFSET_MPS (an antenna's model)
 # instead of `reference_offset_std`.
-LEVEL_M, SLOWLY, SLOW_MPS, CLIMBS, CLIMB_MPS = 1.0, 0.2, 0.03, 0.1, 0.3
+LEVEL_M, SLOWLY, SLOW_MPS, CLIMBS, CLIMB_MPS = 1.0, 0.1, 0.02, 0.1, 0.3
 OFFSET, OFFSET_MPS = 0.1, 0.05
 # Smallest white noise of a velocity, m/s. Degrees of freedom needed to estimate the noise of bins.
 LEAST_NOISE_MPS, FEWEST = 1e-4, 6

@@ -47,7 +47,7 @@ def pitch_found(climb, error_up: float) -> tuple[float, float]:
 @pytest.mark.parametrize("error_up", [0.0, 0.06, -0.06])
 def test_a_vertical_error_of_the_reference_does_not_turn_a_level_vehicles_pitch(error_up):
     off, std = pitch_found(lambda time: 0.0 * time, error_up)
-    assert abs(off) < min(2.0 * std, 0.5) and std < 0.6  # of 0.06 m/s it would be 2.5 degrees
+    assert abs(off) < min(2.0 * std, 0.5) and std < 0.7  # of 0.06 m/s it would be 2.5 degrees
 
 
 @pytest.mark.parametrize(
