@@ -27,7 +27,7 @@ from ..model.settings import SETTINGS
 from .arm_clock_ambiguity import DVL_CLOCK, LAG, TWO_CLOCKS, lag_not_taken_back
 from .candidates import KEPT_VARIANTS
 from .clock_jumps import LEAP, gaps, is_in_stamps
-from .unexplained import Unexplained, matters, unexplained
+from .unexplained import Unexplained, unexplained
 
 # A clock that explains less than this share of what two leaps do, and makes them cancel, is not late before them
 LITTLE_OF_LEAPS = 0.02
@@ -96,11 +96,11 @@ def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> boo
 
 
 def _is_all_that_is_left(fitter: Fitter, rest: Fit, left: Callable[[], Unexplained]) -> bool:
-    """Whether a fit without one of its effects (rest) leaves what matters, and with it nothing. left: then.
+    """Return whether a fit without one of its effects (rest) has a significant residual, and with it none. left: with it.
 
     What an inexact strong effect leaves has the shape of no other: one takes in a part of it at most.
     """
-    return matters(fitter.problem, rest, unexplained(fitter, rest)) and not left().found
+    return unexplained(fitter, rest).found and not left().found
 
 
 def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:
