@@ -96,7 +96,7 @@ def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> boo
 
 
 def _is_all_that_is_left(fitter: Fitter, rest: Fit, left: Callable[[], Unexplained]) -> bool:
-    """Return whether a fit without one of its effects (rest) has a significant residual, and with it none. left: with it.
+    """Return whether a fit without an effect (rest) has a significant residual, and with it none. left: with it.
 
     What an inexact strong effect leaves has the shape of no other: one takes in a part of it at most.
     """
