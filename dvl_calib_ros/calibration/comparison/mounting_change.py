@@ -23,11 +23,24 @@ from ...verdict.answering import Answering
 from ...verdict.kinds import Severity
 from ..numerics.frames import Array, near_angles
 from ..numerics.tests import chi2_sf, holm, smallest_found
-from ..results.extrinsics import ANGLES, GROUPS, MOUNTING, N_AXES, N_COMPONENTS, ONLY_CLOCK, ONLY_SCALE, Extrinsics
+from ..results.extrinsics import (
+    ANGLES,
+    GROUPS,
+    LEVER_ARM,
+    MOUNTING,
+    N_AXES,
+    N_COMPONENTS,
+    ONLY_CLOCK,
+    ONLY_SCALE,
+    Extrinsics,
+)
 
 # False-alarm rates of one comparison, for any numbers of quantities and instants: a mounting has moved at the two-sided
 # 4 σ of a normal error and is suspicious at 2 σ; scale and delay have changed at 1 %.
 MOVED, SUSPICIOUS, CHANCE = chi2_sf(16.0, 1), chi2_sf(4.0, 1), 0.01
+# Standard deviation of a lever arm between recordings without a movement, m: the phase centre of a GNSS antenna wanders
+# by one to two centimetres with the satellites in view (IGS antenna calibrations)
+ARM_WANDERS_M = 0.015
 # Probability of finding a movement as large as `Comparison.smallest`
 POWER = 0.9
 
@@ -63,6 +76,7 @@ class Difference:
         if first.dvl and first.dvl == second.dvl:
             common = first.by_bias @ second.by_bias.T
             both = both - common - common.T
+        both = both + np.diag(np.where(np.isin(_ALL, _ALL[LEVER_ARM]), ARM_WANDERS_M**2, 0.0))
         value = _near(second.value, first.value) - first.value
         covariance = np.where(np.outer(compared, compared), both, 0.0)
         return Difference(first, second, np.where(compared, value, np.nan), covariance, compared)
