@@ -10,7 +10,7 @@ _KINDS = (
     Kind(
         "DOCTOR_STAMP_ZERO",
         "{topic}: {share:.0%} of the messages have no stamp",
-        "`header.stamp` is zero; the time of reception is late.",
+        "",
         "let the driver fill header.stamp with the time of measurement",
     ),
     Kind(
@@ -28,14 +28,14 @@ _KINDS = (
     Kind(
         "DOCTOR_STAMP_JUMP",
         "{topic}: stamps jump ahead by {seconds:.1f} s while recording went on",
-        "The driver's clock was set during the recording.",
+        "",
         "set clocks before the recording, or cut the recording there",
         Severity.ERROR,
     ),
     Kind(
         "DOCTOR_CLOCKS",
         "{topic}: stamps are {seconds:.2f} s {side} those of {other}",
-        "Two drivers stamp by different clocks.",
+        "",
         "synchronise clocks (PTP, NTP or GNSS); for this bag: {here}",
         Severity.ERROR,
     ),
@@ -62,7 +62,7 @@ _KINDS = (
     Kind(
         "DOCTOR_TOO_FEW",
         "{topic}: {count} messages are too few",
-        "Hardly a message of the topic was recorded.",
+        "",
         "record all topics for some minutes",
         Severity.ERROR,
     ),
@@ -75,7 +75,7 @@ _KINDS = (
     Kind(
         "DOCTOR_GAPS",
         "{topic}: silent for {seconds:.1f} s in all (gaps: {count}), the longest at {at_s:.0f} s",
-        "Sensor, cable, fix or driver dropped out.",
+        "",
         "check power, cable, bottom lock and fix at that time",
     ),
     Kind(
@@ -93,7 +93,7 @@ _KINDS = (
     Kind(
         "DOCTOR_FROZEN",
         "{topic}: {share:.0%} of the velocities repeat the one before exactly",
-        "The driver repeats its last value.",
+        "",
         "let the driver send new measurements only; -p max_repeats:=1 skips the repeats",
     ),
     Kind(
@@ -111,7 +111,7 @@ _KINDS = (
     Kind(
         "DOCTOR_NOT_FINITE",
         "{topic}: {share:.0%} of the velocities are not finite",
-        "The driver sends nan or infinity without a measurement.",
+        "",
         "check lock or fix at that time; these are not used",
     ),
     Kind(
@@ -124,20 +124,20 @@ _KINDS = (
     Kind(
         "DOCTOR_NO_IMU",
         "no IMU in the bag: {what}",
-        "Attitude and lever arm correction need an IMU.",
+        "",
         "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
     ),
     Kind(
         "DOCTOR_NO_IMU_EARTH",
         "no IMU in the bag: the reference is not in the body's frame, so it cannot be compared with the DVL",
-        "A reference in ENU or NED needs an attitude.",
+        "",
         "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
         Severity.ERROR,
     ),
     Kind(
         "DOCTOR_UNITS",
         "DVL and reference differ by a factor of {factor:.4g}{guess}",
-        "DVL or reference is not in m/s.",
+        "",
         "let its driver convert to m/s",
         Severity.ERROR,
     ),
@@ -151,7 +151,7 @@ _KINDS = (
     Kind(
         "DOCTOR_FRAMES",
         "{says}",
-        "The recording declares other frames than its data show.",
+        "",
         "check frames and transforms",
     ),
     Kind(
@@ -163,7 +163,7 @@ _KINDS = (
     Kind(
         "DOCTOR_NOT_MOVING",
         "{topic}: the vehicle does not move faster than min_speed ({min_speed:g} m/s)",
-        "A vehicle at rest gives no information.",
+        "",
         "record a run at 0.5 m/s or more",
         Severity.ERROR,
     ),

@@ -39,20 +39,20 @@ FINDINGS = (
     Kind(
         "DVL_NONE_USABLE",
         "none of {count} DVL messages can be used: {reasons}",
-        "Every message is refused, for the reasons listed.",
+        "",
         "look the reasons up in the table of drivers (docs/bags_and_drivers.md)",
     ),
     # clocks and stamps
     Kind(
         "CLOCKS_DIFFER",
         "{stream} stamps are {seconds:.0f} s {side} the {other}'s and cannot be paired",
-        "The two drivers stamp by different clocks.",
+        "",
         "set both clocks by the same source (PTP, NTP or GNSS)",
     ),
     Kind(
         "CLOCK_TAKEN_OFF",
         "{clock}: subtracted ({parameter}: {value:g}); the calibration restarted with it",
-        "Two estimates of the clock offset agreed, and it was corrected.",
+        "",
         "correct that clock, or set this value as a parameter, which is then kept",
     ),
     Kind(
@@ -76,7 +76,7 @@ FINDINGS = (
     Kind(
         "STAMPS_MISSING_IN_BAG",
         "{count} messages had no header stamp, the time at which they were recorded is used",
-        "As `STAMP_MISSING`, for a whole bag.",
+        "",
         "let the driver fill header.stamp",
     ),
     Kind(
@@ -94,7 +94,7 @@ FINDINGS = (
     Kind(
         "SAMPLES_BEFORE_RESTART",
         "{count} {stream} samples were from before the clock was set back or the bag looped; they are not used",
-        "These samples belong to the run before the restart.",
+        "",
         "nothing, unless clocks are set during a run",
     ),
     Kind(
@@ -143,7 +143,7 @@ FINDINGS = (
     Kind(
         "OUTPUT_QOS",
         "{topic}: {name} asks for an incompatible QoS and does not hear it ({reason})",
-        "The subscriber asks for more than the node offers.",
+        "",
         "change the QoS of the subscriber",
     ),
     Kind(
@@ -169,7 +169,7 @@ FINDINGS = (
     Kind(
         "TF_NOT_THERE",
         "publish_tf is set, but tf2_ros is not installed; ~/mounting is published, a transform is not",
-        "ROS from PyPI has no tf2_ros.",
+        "",
         "install ros-$ROS_DISTRO-tf2-ros-py, and source its setup.bash",
     ),
     # frames
@@ -189,7 +189,7 @@ FINDINGS = (
     Kind(
         "REFERENCE_FRAME",
         "reference: frame_id {frame_id!r} says neither body ({base}) nor earth ({earth}); its messages are not used",
-        "The `frame_id` is neither the body's nor an earth frame.",
+        "",
         "set parameter gnss_frame to body, enu or ned",
     ),
     Kind(
@@ -215,7 +215,7 @@ FINDINGS = (
         "SAMPLES_INVALID",
         "{count} {stream} samples are invalid (not finite, above max_speed, or with an impossible covariance); they "
         "are not used",
-        "No bottom lock or fix, or a driver that fills fields wrongly.",
+        "",
         "check the sensor, its bottom lock or fix, and its driver",
     ),
     Kind(
@@ -227,7 +227,7 @@ FINDINGS = (
     Kind(
         "DVL_DROPOUTS",
         "the DVL dropped out {count} times",
-        "Gaps: no bottom lock, power or cable.",
+        "",
         "check its power, cable and bottom lock (altitude, speed)",
     ),
     Kind(
@@ -239,7 +239,7 @@ FINDINGS = (
     Kind(
         "DVL_FROZEN",
         "{count} DVL samples repeat one velocity more than max_repeats times; they are not used",
-        "The driver hangs and repeats its last velocity.",
+        "",
         "restart the driver",
     ),
     Kind(
@@ -252,13 +252,13 @@ FINDINGS = (
     Kind(
         "GNSS_OUTAGE",
         "no GNSS for {seconds:.0f} s: {model} still corrects with its last estimate, but learns nothing more",
-        "References stopped, or all are refused; the selected model needs them.",
+        "",
         "surface, check the receiver and the topic {topic}, or select a model without GNSS (gnss_free_model)",
     ),
     Kind(
         "GNSS_OUTAGE_WITHOUT",
         "no GNSS for {seconds:.0f} s: {model} continues, but learns nothing that needs GNSS, such as the scale",
-        "References stopped, or all are refused; models that need them keep their estimate.",
+        "",
         "surface, or check the receiver and the topic {topic}",
     ),
     Kind(
@@ -276,7 +276,7 @@ FINDINGS = (
     Kind(
         "BAG_NO_GNSS",
         "no topic {topic!r} in the bag: only the models without GNSS can run",
-        "No reference velocity under this name.",
+        "",
         "if there is one under another name, set --gnss-topic",
     ),
     Kind(
@@ -290,19 +290,19 @@ FINDINGS = (
     Kind(
         "NO_TURN_RATE",
         "{count} samples have no angular velocity for max_turn_rate and are not used",
-        "`max_turn_rate` is set, and no IMU gives the turn rate.",
+        "",
         "check the IMU topic, or set max_turn_rate to 0",
     ),
     Kind(
         "LEVER_ARM_NOT_COMPENSATED",
         "lever_arm is not compensated in {count} samples: no angular velocity",
-        "`lever_arm` is set, and no IMU gives the turn rate.",
+        "",
         "check the IMU topic, or set max_turn_rate so that turns are left out",
     ),
     Kind(
         "ALL_SLOW",
         "every sample is slower than min_speed, nothing is learnt",
-        "The vehicle stands or drifts; angles need motion.",
+        "",
         "drive, at 1 m/s or more",
     ),
     Kind(
@@ -314,7 +314,7 @@ FINDINGS = (
     Kind(
         "CONFIGURATION_WRONG",
         "the data contradict the configuration: {says}",
-        "Another frame or mounting fits the samples much better.",
+        "",
         "correct the configuration and start again",
         Severity.ERROR,
     ),
@@ -343,14 +343,14 @@ FINDINGS = (
         "TILT_NOT_SHOWN",
         "the vehicle hardly tilts, so nothing shows whether the DVL's driver levels its velocity: if it does, the "
         "vehicle's mean {axis} is in the mounting ({lean:.1f}° of {axis})",
-        "Without tilt nothing shows whether the driver levels the velocity.",
+        "",
         "look into the driver's settings, or record in waves or with dives",
     ),
     Kind(
         "ONE_SPEED",
         "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes what dvl_bias_std says of it",
-        "A velocity bias looks like a mounting unless the speed changes.",
+        "",
         "drive at two speeds, one twice the other; set dvl_bias_std, if you know the DVL's",
     ),
     Kind(
@@ -390,7 +390,7 @@ FINDINGS = (
         "FILTER_FINDS_NOTHING",
         "the reference lags by {late:.1f} s, is smoothed over as long, and shows no error of the DVL: a filter may "
         "have made it from this DVL",
-        "A reference without any DVL error may be a filter that uses this DVL.",
+        "",
         "use a reference that does not use the DVL: velocity or positions of GNSS alone",
     ),
     Kind(
@@ -404,14 +404,14 @@ FINDINGS = (
         "CLOCK_OR_ARM",
         "at one speed a delayed reference looks like a lever arm, and in a steady turn like a yaw: {metres:.1f} m, "
         "{degrees:.1f}° and {seconds:.1f} s of delay cannot be distinguished; σ includes them",
-        "At one speed a reference delay looks like a lever arm.",
+        "",
         "drive turns to both sides at two speeds",
     ),
     Kind(
         "CLOCK_ON_TURN",
         "in a steady turn a delayed reference or IMU looks like a yaw: {degrees:.1f}° cannot be distinguished; σ "
         "includes it",
-        "In a steady turn a delay looks like a yaw.",
+        "",
         "drive turns to both sides, or a straight leg",
     ),
     Kind(
@@ -424,7 +424,7 @@ FINDINGS = (
         "ONE_HEADING",
         "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes that of the reference",
-        "On one heading an error of the reference looks like a mounting.",
+        "",
         "drive the opposite heading as well, at two speeds; or set reference_offset_std to the reference's accuracy "
         "(σ includes four times that)",
     ),
@@ -438,13 +438,13 @@ FINDINGS = (
         "PRIOR_HOLDS_ERROR",
         "prior_source initial_window: the mean of the DVL's own first seconds already holds the misalignment, so M5 "
         "and M6 gain nothing over no calibration",
-        "The prior comes from the sensor to be calibrated.",
+        "",
         "prefer prior_source fixed",
     ),
     Kind(
         "INITIAL_CONTRADICTED",
         "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so it is left out",
-        "The mounting has moved since that calibration, so it is not used.",
+        "",
         "inspect the mounting; if it is right, save this result and start from that",
     ),
     Kind(
