@@ -49,14 +49,14 @@ _COMPARISONS = (
     Kind(
         "SCALE_CHANGED",
         "the scale has changed by {percent:+.2f} % ± {std:.2f} % {between}",
-        "The mounting does not change the scale.",
+        "",
         "the speed of sound, or the DVL's settings",
         Severity.MARGINAL,
     ),
     Kind(
         "DELAY_CHANGED",
         "the DVL's stamps come {seconds:.2f} s ± {std:.2f} s {way} {between}",
-        "The mounting does not change the delay.",
+        "",
         "a clock, not the mounting",
         Severity.MARGINAL,
     ),
@@ -70,7 +70,7 @@ _COMPARISONS = (
     Kind(
         "SCATTER",
         "the calibrations scatter by {by:.1f} times their σ, and no single date explains it: σ is too small",
-        "σ does not include all that differs between recordings.",
+        "",
         "",
         Severity.MARGINAL,
     ),
@@ -78,13 +78,13 @@ _COMPARISONS = (
     Kind(
         "CALIBRATION_DOUBTED",
         "{name}: {remark}",
-        "Its result file holds a warning.",
+        "",
         "calibrate again, or leave it out of the comparison",
     ),
     Kind(
         "MODELS_DIFFER",
         "the models differ ({models}): so may their errors",
-        "Errors of one model cancel in a difference; those of two do not.",
+        "",
         "calibrate all with one model (-p model:=full)",
     ),
     Kind(
@@ -152,14 +152,14 @@ _DIAGNOSES = (
     Kind(
         "GAP_REFERENCE_CONSTANT",
         "this recording cannot show a gap: the reference velocity is constant to the last digit",
-        "The receiver has stopped.",
+        "",
         "check the receiver",
         Severity.MARGINAL,
     ),
     Kind(
         "GAP_REFERENCE_VERTICAL",
         "this recording cannot show a gap: the reference does not measure the horizontal velocity",
-        "Most effects need horizontal velocity.",
+        "",
         "record a horizontal reference velocity",
         Severity.MARGINAL,
     ),

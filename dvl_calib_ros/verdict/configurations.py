@@ -18,7 +18,7 @@ CONFIGURATIONS = (
     _Said(
         "DVL_ROUNDED",
         "the DVL's velocity is rounded to {step:.2g} m/s, too coarse to find a mounting",
-        "The step between two values exceeds the noise.",
+        "",
         "let the driver send all digits",
     ),
     _Said(
@@ -36,13 +36,13 @@ CONFIGURATIONS = (
     _Said(
         "DVL_AXES_TURNED",
         "the DVL's axes look turned over: y and z point the other way",
-        "Data fit with y and z negated: forward-right-down for forward-left-up, or the reverse.",
+        "Forward-right-down for forward-left-up, or the reverse.",
         "set dvl_axes to {axes}",
     ),
     _Said(
         "DVL_LEFT_HANDED",
         "the DVL's axes look left-handed: {axis} points the other way",
-        "Data fit with one axis negated.",
+        "",
         "negate this axis in the DVL's driver; of z, check the sign of the reference's vertical velocity as well",
     ),
     _Said(
@@ -54,7 +54,7 @@ CONFIGURATIONS = (
     _Said(
         "MOUNTING_FITS",
         "the data fit mounting_rpy {roll:.3g} {pitch:.3g} {yaw:.3g}",
-        "The DVL is rotated by far more than a misalignment.",
+        "",
         "set mounting_rpy to [{roll:.4g}, {pitch:.4g}, {yaw:.4g}]",
     ),
     # the reference
@@ -68,7 +68,7 @@ CONFIGURATIONS = (
         "REFERENCE_OR_IMU_NED",
         "the reference looks like {name} (gnss_frame: {frame}), or the IMU's orientation looks like NED (imu_frame: "
         "ned); only sway distinguishes them",
-        "Both explain motion ahead; sway decides.",
+        "",
         "check both drivers",
     ),
     _Said(
@@ -87,13 +87,13 @@ CONFIGURATIONS = (
     _Said(
         "IMU_NO_RATES",
         "the IMU sends no angular velocity (exactly 0 in every message) while its orientation turns",
-        "A lever arm needs the angular velocity.",
+        "",
         "let the IMU's driver fill angular_velocity",
     ),
     _Said(
         "IMU_CONTRADICTS",
         "the IMU's orientation and its angular velocity contradict each other; the data fit {found}",
-        "The differentiated orientation differs from the angular velocity.",
+        "",
         "correct the IMU's driver",
     ),
     _Said(
@@ -151,7 +151,7 @@ CONFIGURATIONS = (
     _Said(
         "GRAVITY_SIGN",
         "{topic}: the IMU's acceleration at rest points down, as gravity with the other sign",
-        "The specific force points up at rest.",
+        "",
         "correct the IMU's driver",
     ),
     _Said(
@@ -170,13 +170,13 @@ CONFIGURATIONS = (
     _Said(
         "GRAVITY_LEANS",
         "{topic}: gravity is {degrees:.0f}° from up by the IMU's own orientation",
-        "Roll and pitch, or the acceleration, are wrong by that angle.",
+        "",
         "check the IMU's mounting in its driver",
     ),
     _Said(
         "GRAVITY_IN_G",
         "{topic}: the IMU's acceleration at rest is 1 g and not 9.81 m/s²",
-        "The driver does not send SI units; check the angular velocity too.",
+        "Check the angular velocity too.",
         "let the driver send SI units",
     ),
     _Said(
@@ -195,19 +195,19 @@ CONFIGURATIONS = (
     _Said(
         "CLOCK_LATE",
         "{whose} stamps are {seconds:.2f} s {way}",
-        "Estimated from velocities and turns; the other clocks agree.",
+        "The other clocks agree.",
         "set {parameter} to {offset:g}",
     ),
     _Said(
         "CLOCKS_LATE",
         "the reference's stamps are {seconds:.2f} s {way}, and the DVL's {dvl_seconds:.2f} s {dvl_way}",
-        "Both differ from the IMU's clock. A calibration estimates the DVL's delay.",
+        "A calibration estimates the DVL's delay.",
         "set {parameter} to {offset:g}",
     ),
     _Said(
         "CLOCKS_NOT_TOLD_APART",
         "the stamps of DVL and reference differ by {seconds:.2f} ± {std:.2f} s; it is unknown whose clock is wrong",
-        "Legs at one speed fit more than one clock.",
+        "",
         "set the clocks by one source, or drive turns at two speeds",
     ),
     _Said(
@@ -232,7 +232,7 @@ CONFIGURATIONS = (
         "CLOCK_FAR",
         "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be estimated and "
         "subtracted",
-        "Speeds agree only with that clock offset.",
+        "",
         "set that clock right; this recording: --restamp log takes the times at which messages were recorded",
     ),
     # declarations of a recording
@@ -269,7 +269,7 @@ CONFIGURATIONS = (
     _Said(
         "FRAMES_AMBIGUOUS",
         "the data fit {taken} and, as well, {other}; the first is taken",
-        "Both fit and give different mountings. Which side is port, and which axes has the reference?",
+        "Which side is port, and which axes has the reference?",
         "set the one that is right",
         severity=Severity.MARGINAL,
     ),

@@ -16,7 +16,7 @@ _KINDS = (
     Kind(
         "DOCTOR_STAMP_RECEPTION",
         "{topic}: stamps jitter with the reception ({jitter_ms:.0f} ms about {period_ms:.0f} ms), not with the sensor",
-        "The driver stamps on arrival, so stamps are late.",
+        "",
         "let the driver take the sensor's own time; then dvl-calib diagnose BAG estimates the remaining delay",
     ),
     Kind(
@@ -42,7 +42,7 @@ _KINDS = (
     Kind(
         "DOCTOR_APART",
         "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
-        "The topics were recorded at different times, or a clock is wrong.",
+        "",
         "record both together; if they were, check the clocks, and for import the times of both files",
         Severity.ERROR,
     ),
@@ -55,7 +55,7 @@ _KINDS = (
     Kind(
         "DOCTOR_STANDING_STAMP",
         "{topic}: {share:.0%} of the stamps repeat the one before, so hardly a message can be used",
-        "The driver fills `header.stamp` once, or its clock stands still.",
+        "",
         "let the driver stamp every message with its time of measurement",
         Severity.ERROR,
     ),
@@ -69,7 +69,7 @@ _KINDS = (
     Kind(
         "DOCTOR_UNDECODABLE",
         "{topic}: {count} of {total} messages cannot be decoded: {reason}",
-        "Another version than the recording declares, or damaged.",
+        "",
         "rebuild the driver's messages, or record with ros2 bag record",
     ),
     Kind(
@@ -81,7 +81,7 @@ _KINDS = (
     Kind(
         "DOCTOR_ZEROS",
         "{topic}: {share:.0%} of the velocities are exactly zero",
-        "The driver sends zeros without bottom lock.",
+        "",
         "let the driver send nothing, or mark it invalid; these are not used",
     ),
     Kind(
@@ -105,7 +105,7 @@ _KINDS = (
     Kind(
         "DOCTOR_AXIS",
         "{topic}: {axes} is exactly zero in every message: not measured",
-        "Course and speed have no vertical; that axis is not measured.",
+        "Course and speed have no vertical.",
         "use a receiver's own velocity (three axes) if pitch matters",
     ),
     Kind(
@@ -117,7 +117,7 @@ _KINDS = (
     Kind(
         "DOCTOR_NO_ORIENTATION",
         "{topic}: no orientation ({why})",
-        "A reference in ENU or NED needs an attitude.",
+        "",
         "record the IMU's or INS's filtered topic, or a reference in the body frame",
         Severity.ERROR,
     ),
@@ -157,7 +157,7 @@ _KINDS = (
     Kind(
         "DOCTOR_SLOW_REFERENCE",
         "{topic}: {rate_hz:.2g} Hz is too slow for turns",
-        "Between two reference samples the velocity is interpolated.",
+        "",
         "set the receiver to 1 Hz or more, better 5 Hz",
     ),
     Kind(

@@ -20,13 +20,13 @@ FINDINGS = (
     Kind(
         "TOPICS_FOUND",
         "{own} had no publisher; found and used instead: {found}",
-        "The node chose topics by type and content (`discover`); they may be another vehicle's.",
+        "They may be another vehicle's.",
         "remap the topics to these names if they are right, else to the right ones, or set discover to false",
     ),
     Kind(
         "DVL_SILENT",
         "no usable DVL message for {seconds:.0f} s",
-        "Messages stopped, or all are refused (other findings say why).",
+        "Other findings can say why.",
         "check the sensor, its driver and the topic {topic}",
         Severity.ERROR,
     ),
@@ -58,7 +58,7 @@ FINDINGS = (
     Kind(
         "DVL_NO_REFERENCE",
         "no DVL sample has a reference velocity at its time, though both come",
-        "Stamps of DVL and reference are never within `gnss_timeout`; usually the DVL has its own clock.",
+        "Usually the DVL has its own clock.",
         "compare the header stamps of both; a DVL with its own clock must be synchronised (NTP)",
     ),
     Kind(
@@ -82,7 +82,7 @@ FINDINGS = (
     Kind(
         "STAMPS_FAR",
         "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, absurdly far from the others",
-        "A computer without a clock battery, or broken stamps.",
+        "A computer without a clock battery.",
         "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording",
     ),
     Kind(
@@ -100,7 +100,7 @@ FINDINGS = (
     Kind(
         "SAMPLES_LATE",
         "{count} {stream} samples came after the DVL sample that they belong to had been used; they are not used",
-        "The topic lags the DVL's by more than `max_latency`.",
+        "",
         "raise max_latency, in proportion when a bag is played faster than recorded",
     ),
     Kind(
@@ -131,7 +131,7 @@ FINDINGS = (
     Kind(
         "TOPIC_OTHER_TYPE",
         "{topic}: {name} publishes {type}, where {expected} is expected, and is not heard",
-        "ROS 2 connects only publishers and subscribers of the same type. The warning names the parameter.",
+        "The warning names the parameter.",
         "{remedy}",
     ),
     Kind(
@@ -156,14 +156,14 @@ FINDINGS = (
     Kind(
         "TF_TWICE",
         "another node publishes a transform to {frame!r}, in addition to publish_tf",
-        "Usually robot_state_publisher with the nominal mounting; listeners get either.",
+        "Usually robot_state_publisher with the nominal mounting.",
         "turn publish_tf off, and write the calibration into the URDF instead (dvl-calib apply --urdf)",
     ),
     Kind(
         "POSITION_UNKNOWN",
         "publish_tf is set, but the position of the reference point in {base} is unknown, and so is the DVL's; no "
         "transform is published",
-        "The lever arm starts at the reference point, not at `base_frame`.",
+        "",
         "set reference_position, and dvl_position to from_reference; or publish the transform of the reference's frame",
     ),
     Kind(
@@ -176,14 +176,14 @@ FINDINGS = (
     Kind(
         "DVL_FRAME",
         "dvl: a message has frame_id {frame_id!r} where {expected!r} is expected; it is not used",
-        "The velocity is in another frame than configured, or already in the body's.",
+        "Another frame than configured, or the body's.",
         "let the driver publish in the DVL's own frame, or set parameter dvl_frame to {frame_id!r} if that is its name",
     ),
     Kind(
         "DVL_TURNED_TWICE",
         "dvl: data in frame {frame_id!r} are turned from forward-right-down to forward-left-up, and mounting_rpy "
         "turns the DVL upside down as well",
-        "Right only for a DVL that looks up; else the roll of 180° is counted twice.",
+        "Right only for a DVL that looks up.",
         "if mounting_rpy describes a frame whose z points down, set dvl_axes to flu, which uses the data unchanged",
     ),
     Kind(
@@ -195,13 +195,13 @@ FINDINGS = (
     Kind(
         "REFERENCE_NO_ATTITUDE",
         "{count} DVL samples have an earth-frame reference but no attitude; the models with GNSS cannot use them",
-        "A velocity in ENU or NED needs the IMU's orientation.",
+        "",
         "check that the IMU topic has messages with an orientation; or publish the reference in the body frame",
     ),
     Kind(
         "IMU_FRAME",
         "imu: data is in frame {frame_id!r}; it is taken as the orientation and angular velocity of {base}",
-        "A rotated IMU without `imu_rpy` gives a wrong attitude and wrong turn rates.",
+        "",
         "if the IMU is mounted rotated, give its orientation in parameter imu_rpy",
     ),
     # messages that cannot be used
@@ -270,7 +270,7 @@ FINDINGS = (
     Kind(
         "BAG_NO_IMU",
         "no IMU in the bag: {what}",
-        "Attitude and lever arm correction need an IMU.",
+        "",
         "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
     ),
     Kind(
@@ -283,7 +283,7 @@ FINDINGS = (
         "BAG_NO_DEFINITION",
         "the bag does not say how {type} is laid out (recorded before ROS 2 Iron?); it is read by the definitions "
         "known here",
-        "SQLite bags of older ROS 2 hold no message definitions.",
+        "",
         "if it cannot be decoded, run ros2 bag convert to MCAP where the package is installed",
     ),
     # motion and configuration
@@ -308,7 +308,7 @@ FINDINGS = (
     Kind(
         "SAMPLES_GATED",
         "{model}: {gated} of {given} samples are gated",
-        "So many outliers mean a wrong configuration rather than bad data.",
+        "",
         "check mounting_rpy and the frames before believing it: does the vehicle drive ahead in the DVL's x?",
     ),
     Kind(
@@ -322,14 +322,14 @@ FINDINGS = (
         "HEADING_DEVIATION",
         "the heading error changes with the heading: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
         "{least:+.1f}° at {least_at:.0f}°; it costs {cost:.0f} m per km",
-        "A compass deviates with the heading, a gyro drifts; the yaw holds the mean deviation.",
+        "A compass deviates with the heading, a gyro drifts.",
         "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
     ),
     Kind(
         "IMU_LEVEL",
         "the IMU's orientation is a heading alone (roll and pitch are 0 in every message), so the DVL's roll and pitch "
         "are not known",
-        "The IMU sends a heading alone, so trim looks like a mounting.",
+        "",
         "record an IMU that gives roll and pitch",
     ),
     Kind(
@@ -371,7 +371,7 @@ FINDINGS = (
         "BED_MOVES",
         "moving bed: over ground the reference is {millimetres:.0f} mm/s faster than the DVL towards {course:.0f}°, "
         "on every heading",
-        "Bottom track follows moving sediment or the water's layer; dead reckoning drifts with it.",
+        "Bottom track follows moving sediment or the water's layer.",
         "calibrate where the bed is still; to estimate that velocity as well: -p reference_offset_std:={std:g}",
     ),
     Kind(
@@ -383,7 +383,7 @@ FINDINGS = (
     Kind(
         "CIRCULAR_REFERENCE",
         "the reference follows the DVL's own noise for {seconds:.1f} s: a filter made it from this DVL",
-        "The reference and the DVL share noise, so it cannot show the DVL's error.",
+        "",
         "use a reference that does not use the DVL: velocity or positions of GNSS alone",
     ),
     Kind(
@@ -431,7 +431,7 @@ FINDINGS = (
     Kind(
         "INNOVATIONS_LARGE",
         "{model}: innovations are larger than R and P allow (mean NIS {nis:.1f}, at most {limit:.1f}), σ is too small",
-        "More noise than configured, or an effect that the model lacks.",
+        "",
         "raise gnss_aided_std or gnss_free_std, or find the effect with dvl-calib diagnose",
     ),
     Kind(
@@ -450,13 +450,13 @@ FINDINGS = (
     Kind(
         "RESULT_WORSE",
         "{path} is kept, which is better ({before}); the newer result ({now}) is {beside}",
-        "A worse verdict or a larger σ replaces nothing unasked.",
+        "",
         "to use the newer all the same, rename it, or call ~/save_anyway",
     ),
     Kind(
         "RESULT_NOT_SAVED",
         "the result was not saved: {reason}",
-        "Full disk, missing folder or no permission. The previous file is untouched.",
+        "The previous file is untouched.",
         "free space, or set result_file elsewhere and call ~/save",
     ),
 )

@@ -30,7 +30,7 @@ _KINDS = (
     Kind(
         "NOTHING_COMPARED",
         "there is no IMU, so no DVL sample can be compared with the reference",
-        "A velocity in an earth frame needs an attitude.",
+        "",
         "record the IMU's topic, with orientation",
         Severity.REJECT,
     ),
@@ -44,7 +44,7 @@ _KINDS = (
     Kind(
         "DRIFT_OPEN",
         "the calibration leaves {open:.0f} m of drift per km open (1σ), more than {limit:.0f}",
-        "The data determine the calibration badly; five times `target_drift` is accepted.",
+        "Up to five times `target_drift` is accepted.",
         "drive on: other headings, other speeds, turns to both sides",
         Severity.MARGINAL,
     ),
@@ -52,7 +52,7 @@ _KINDS = (
     Kind(
         "MISALIGNMENT_LARGE",
         "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
-        "More often a wrong `mounting_rpy` or frame than a bracket (`reject_misalignment`).",
+        "Seldom the bracket.",
         "is mounting_rpy right, and are the frames?",
         Severity.REJECT,
     ),
@@ -73,14 +73,14 @@ _KINDS = (
     Kind(
         "LEVER_ARM_NOT_SHOWN",
         "the lever arm is poorly observable, and {turns}",
-        "On this track a lever arm error looks like an angle; σ includes it.",
+        "σ includes it.",
         "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways",
         Severity.MARGINAL,
     ),
     Kind(
         "LEVER_ARM_TURNS_ANGLE",
         "the lever arm is known to ±{std:.2g} m, and {turns}",
-        "On this track a lever arm error looks like an angle, and this model assumes the arm.",
+        "This model assumes the arm.",
         "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways",
         Severity.REJECT,
     ),
@@ -123,7 +123,7 @@ _KINDS = (
     Kind(
         "HELD_OUT_SEVERAL_TIMES",
         _HELD_OUT + ": the error is several times the predicted one",
-        "The error is more than three times the predicted one.",
+        "More than three times.",
         "the configuration is wrong, or an effect is missing from the model (dvl-calib diagnose looks for it)",
         Severity.REJECT,
     ),
@@ -137,7 +137,7 @@ _KINDS = (
     Kind(
         "HELD_OUT_NOISIER",
         _HELD_OUT + ": the reference is noisier than it says, or an effect is missing from the model",
-        "Larger than predicted (`max_error_ratio`): a noisy reference, or an effect that the model lacks.",
+        "Limit: `max_error_ratio`.",
         "",
         Severity.MARGINAL,
     ),
@@ -152,7 +152,7 @@ _KINDS = (
     Kind(
         "DRIFT_WORSE",
         "on data held out dead reckoning drifts by {after:.1f} m per km with it, by {before:.1f} as mounted",
-        "The drift grows by more than half, beyond noise.",
+        "",
         "an effect is missing from the model (dvl-calib diagnose looks for it)",
         Severity.REJECT,
     ),
@@ -160,7 +160,7 @@ _KINDS = (
     Kind(
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
-        "Two drivers stamp by clocks that differ too much for any model.",
+        "",
         "set the clocks by one source; this recording: --restamp log takes the times at which messages were recorded",
         Severity.REJECT,
     ),
@@ -183,7 +183,7 @@ _KINDS = (
         "BAGS_DELAY_CHANGED",
         "the delay of the DVL's stamps differs between recordings, but one delay is used for recordings that follow "
         "each other so closely",
-        "A model with one delay averages two.",
+        "",
         "calibrate each by itself",
         Severity.REJECT,
     ),
