@@ -233,7 +233,7 @@ CONFIGURATIONS = (
         "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be estimated and "
         "subtracted",
         "",
-        "set that clock right; this recording: --restamp log takes the times at which messages were recorded",
+        "set that clock right; this recording: --restamp log (recording times)",
     ),
     # declarations of a recording
     _Said(

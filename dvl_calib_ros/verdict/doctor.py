@@ -125,13 +125,13 @@ _KINDS = (
         "DOCTOR_NO_IMU",
         "no IMU in the bag: {what}",
         "",
-        "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
+        "record sensor_msgs/Imu with an orientation, or name its topic: --imu-topic",
     ),
     Kind(
         "DOCTOR_NO_IMU_EARTH",
         "no IMU in the bag: the reference is not in the body's frame, so it cannot be compared with the DVL",
         "",
-        "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
+        "record sensor_msgs/Imu with an orientation, or name its topic: --imu-topic",
         Severity.ERROR,
     ),
     Kind(

@@ -21,7 +21,7 @@ FINDINGS = (
         "TOPICS_FOUND",
         "{own} had no publisher; found and used instead: {found}",
         "They may be another vehicle's.",
-        "remap the topics to these names if they are right, else to the right ones, or set discover to false",
+        "remap the topics to these names or the right ones, or set discover to false",
     ),
     Kind(
         "DVL_SILENT",
@@ -150,8 +150,7 @@ FINDINGS = (
         "SECOND_NODE",
         "{topic}: {count} publishers ({names})",
         "Two calibration nodes, or a bag with recorded estimates.",
-        "stop the second node or the bag with recorded estimates, or give one of them a namespace "
-        "(--ros-args -r __ns:=/port) and its own result_file",
+        "stop the second node, or give one a namespace (--ros-args -r __ns:=/port) and its own result_file",
     ),
     Kind(
         "TF_TWICE",
@@ -184,7 +183,7 @@ FINDINGS = (
         "dvl: data in frame {frame_id!r} are turned from forward-right-down to forward-left-up, and mounting_rpy "
         "turns the DVL upside down as well",
         "Right only for a DVL that looks up.",
-        "if mounting_rpy describes a frame whose z points down, set dvl_axes to flu, which uses the data unchanged",
+        "if mounting_rpy describes a frame whose z points down, set dvl_axes to flu",
     ),
     Kind(
         "REFERENCE_FRAME",
@@ -271,7 +270,7 @@ FINDINGS = (
         "BAG_NO_IMU",
         "no IMU in the bag: {what}",
         "",
-        "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
+        "record sensor_msgs/Imu with an orientation, or name its topic: --imu-topic",
     ),
     Kind(
         "BAG_NO_GNSS",
@@ -384,14 +383,14 @@ FINDINGS = (
         "CIRCULAR_REFERENCE",
         "the reference follows the DVL's own noise for {seconds:.1f} s: a filter made it from this DVL",
         "",
-        "use a reference that does not use the DVL: velocity or positions of GNSS alone",
+        "use the velocity or positions of GNSS alone",
     ),
     Kind(
         "FILTER_FINDS_NOTHING",
         "the reference lags by {late:.1f} s, is smoothed over as long, and shows no error of the DVL: a filter may "
         "have made it from this DVL",
         "",
-        "use a reference that does not use the DVL: velocity or positions of GNSS alone",
+        "use the velocity or positions of GNSS alone",
     ),
     Kind(
         "LEVER_ARM_CONTRADICTED",

@@ -74,14 +74,14 @@ _KINDS = (
         "LEVER_ARM_NOT_SHOWN",
         "the lever arm is poorly observable, and {turns}",
         "σ includes it.",
-        "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways",
+        "give lever_arm and initial_std_lever_arm, or go straight and turn both ways",
         Severity.MARGINAL,
     ),
     Kind(
         "LEVER_ARM_TURNS_ANGLE",
         "the lever arm is known to ±{std:.2g} m, and {turns}",
         "This model assumes the arm.",
-        "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways",
+        "give lever_arm and initial_std_lever_arm, or go straight and turn both ways",
         Severity.REJECT,
     ),
     # errors on held-out data
@@ -161,7 +161,7 @@ _KINDS = (
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
         "",
-        "set the clocks by one source; this recording: --restamp log takes the times at which messages were recorded",
+        "set the clocks by one source; this recording: --restamp log (recording times)",
         Severity.REJECT,
     ),
     # several recordings
