@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument("--effects", action="store_true", help="what can be simulated and diagnosed, with its parameters")
     for name, help_text in _TABLES.items():
         what.add_argument(f"--{name}", action="store_true", help=help_text)
-    what.add_argument("--commands", action="store_true", help="every command with an example")
+    what.add_argument("--commands", action="store_true", help="every command")
     what.add_argument("--urdf", type=Path, metavar="FILE", help="a parameter file that begins with a URDF's mounting")
     parser.add_argument("--joint", metavar="NAME", help="the DVL's joint in the URDF; default: the one above dvl_link")
     parser.add_argument(
@@ -78,9 +78,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def command_table() -> str:
-    """Return a table of all commands with examples, in Markdown."""
+    """Return a table of all commands, in Markdown."""
     from .commands import COMMANDS
 
-    lines = ["| command | does | example |", "|---|---|---|"]
-    lines += [f"| `{command.name}` | {command.help} | `{command.example}` |" for command in COMMANDS]
+    lines = ["| command | does |", "|---|---|"]
+    lines += [f"| `{command.name}` | {command.help} |" for command in COMMANDS]
     return "\n".join(lines) + "\n"

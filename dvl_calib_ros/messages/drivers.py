@@ -539,10 +539,13 @@ def driver_table() -> str:
     """Return the documentation's table of message types, in Markdown."""
     lines = ["| type | sent by | frame, axes | covariance | not used, and counted as |", "|---|---|---|---|---|"]
     for each in _WRITTEN:
-        axes = "forward-right-down" if each.points_down else "forward-left-up" if each.is_dvl else "of the reference"
-        rules = "; ".join(f"`{rule.counter}`: {rule.says}" for rule in each.rules)
+        axes = ", forward-right-down" if each.points_down else ", forward-left-up" if each.is_dvl else ""
+        # most types have zero_velocity, which the page explains once
+        rules = "; ".join(
+            f"`{rule.counter}`" + (f": {rule.says}" if rule.counter != "zero_velocity" else "") for rule in each.rules
+        )
         lines.append(
-            f"| {each.name.replace('/msg/', '/')} | {each.sent_by} | {each.frame_says}, {axes} | "
+            f"| {each.name.replace('/msg/', '/')} | {each.sent_by} | {each.frame_says}{axes} | "
             f"{each.covariance_says} | {rules} |"
         )
     return "\n".join(lines) + "\n"

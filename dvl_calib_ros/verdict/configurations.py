@@ -12,19 +12,19 @@ CONFIGURATIONS = (
     _Said(
         "DVL_TWO_ON_TOPIC",
         "two DVLs publish on one topic: the velocity alternates between two values",
-        "Velocity differences change sign with almost every message.",
+        "",
         "record one DVL per topic",
     ),
     _Said(
         "DVL_ROUNDED",
         "the DVL's velocity is rounded to {step:.2g} m/s, too coarse to find a mounting",
-        "The step between two values exceeds the noise.",
+        "",
         "let the driver send all digits",
     ),
     _Said(
         "DVL_AXIS_DEAD",
         "the DVL measures nothing along {axes} (exactly 0 in every message)",
-        "One axis is exactly 0, and the others are noisy.",
+        "",
         "check the driver's fields",
     ),
     _Said(
@@ -36,13 +36,13 @@ CONFIGURATIONS = (
     _Said(
         "DVL_AXES_TURNED",
         "the DVL's axes look turned over: y and z point the other way",
-        "Data fit with y and z negated: forward-right-down for forward-left-up, or the reverse.",
+        "Forward-right-down for forward-left-up, or the reverse.",
         "set dvl_axes to {axes}",
     ),
     _Said(
         "DVL_LEFT_HANDED",
         "the DVL's axes look left-handed: {axis} points the other way",
-        "Data fit with one axis negated.",
+        "",
         "negate this axis in the DVL's driver; of z, check the sign of the reference's vertical velocity as well",
     ),
     _Said(
@@ -54,52 +54,52 @@ CONFIGURATIONS = (
     _Said(
         "MOUNTING_FITS",
         "the data fit mounting_rpy {roll:.3g} {pitch:.3g} {yaw:.3g}",
-        "The DVL is rotated by far more than a misalignment.",
+        "",
         "set mounting_rpy to [{roll:.4g}, {pitch:.4g}, {yaw:.4g}]",
     ),
     # the reference
     _Said(
         "REFERENCE_LOOKS",
         "the reference looks like {name}",
-        "Data fit with the reference in that frame.",
+        "",
         "set gnss_frame to {frame}",
     ),
     _Said(
         "REFERENCE_OR_IMU_NED",
         "the reference looks like {name} (gnss_frame: {frame}), or the IMU's orientation looks like NED (imu_frame: "
         "ned); only sway distinguishes them",
-        "Both explain motion ahead; sway decides.",
+        "",
         "check both drivers",
     ),
     _Said(
         "REFERENCE_HOLDS_DVL",
         "a filter made the reference from this DVL: the reference holds {percent:.0f} % of the DVL's own noise",
-        "A filter made the reference from this DVL.",
+        "",
         "use the velocity of GNSS alone",
     ),
     # the IMU
     _Said(
         "IMU_LOOKS_NED",
         "the IMU's orientation looks like NED, forward-right-down",
-        "Data fit with the orientation as NED.",
+        "",
         "set imu_frame to ned and imu_rpy to [3.1416, 0, 0]",
     ),
     _Said(
         "IMU_NO_RATES",
         "the IMU sends no angular velocity (exactly 0 in every message) while its orientation turns",
-        "A lever arm needs the angular velocity.",
+        "",
         "let the IMU's driver fill angular_velocity",
     ),
     _Said(
         "IMU_CONTRADICTS",
         "the IMU's orientation and its angular velocity contradict each other; the data fit {found}",
-        "The differentiated orientation differs from the angular velocity.",
+        "",
         "correct the IMU's driver",
     ),
     _Said(
         "IMU_CONTRADICTS_EITHER",
         "the IMU's orientation and its angular velocity contradict each other; the data fit {found}, or {other}",
-        "As `IMU_CONTRADICTS`, with two conventions that fit.",
+        "",
         "correct the IMU's driver",
     ),
     # which conventions
@@ -109,20 +109,20 @@ CONFIGURATIONS = (
         "An ENU yaw is 0 at east and grows to the left.",
         "",
     ),
-    _Said("RATES_NEGATED", "an angular velocity of the other sign", "All three axes are negated.", ""),
+    _Said("RATES_NEGATED", "an angular velocity of the other sign", "", ""),
     _Said(
         "IMU_AXES_MIXED",
         "an attitude and an angular velocity in different axes: one forward-left-up, the other forward-right-down",
-        "Attitude and angular velocity differ in y and z.",
+        "",
         "",
     ),
     _Said(
         "RATES_EXCHANGED",
         "exchanged axes: where the attitude turns about x, y, z, the angular velocity is about {axes}",
-        "Axes are exchanged or negated.",
+        "",
         "",
     ),
-    _Said("RATES_DEGREES", "an angular velocity in degrees per second", "The angular velocity has to be in rad/s.", ""),
+    _Said("RATES_DEGREES", "an angular velocity in degrees per second", "", ""),
     _Said(
         "RATES_SCALED",
         "an angular velocity that is {times:.2g} times as large",
@@ -132,7 +132,7 @@ CONFIGURATIONS = (
     _Said(
         "RATES_IN_EARTH",
         "an angular velocity about the axes of the earth ({frame}), not of the body",
-        "The angular velocity has to be about the IMU's own axes.",
+        "",
         "",
     ),
     _Said(
@@ -151,7 +151,7 @@ CONFIGURATIONS = (
     _Said(
         "GRAVITY_SIGN",
         "{topic}: the IMU's acceleration at rest points down, as gravity with the other sign",
-        "The specific force points up at rest.",
+        "",
         "correct the IMU's driver",
     ),
     _Said(
@@ -164,19 +164,19 @@ CONFIGURATIONS = (
         "GRAVITY_FITS_INVERTED",
         "{topic}: the IMU's orientation looks inverted: gravity is {given:.1f}° from up, and {inverted:.1f}° with the "
         "quaternion inverted",
-        "The quaternion has to rotate the body into the earth.",
+        "",
         "correct the IMU's driver",
     ),
     _Said(
         "GRAVITY_LEANS",
         "{topic}: gravity is {degrees:.0f}° from up by the IMU's own orientation",
-        "Roll and pitch, or the acceleration, are wrong by that angle.",
+        "",
         "check the IMU's mounting in its driver",
     ),
     _Said(
         "GRAVITY_IN_G",
         "{topic}: the IMU's acceleration at rest is 1 g and not 9.81 m/s²",
-        "The driver does not send SI units; check the angular velocity too.",
+        "Check the angular velocity too.",
         "let the driver send SI units",
     ),
     _Said(
@@ -195,45 +195,45 @@ CONFIGURATIONS = (
     _Said(
         "CLOCK_LATE",
         "{whose} stamps are {seconds:.2f} s {way}",
-        "Estimated from velocities and turns; the other clocks agree.",
+        "The other clocks agree.",
         "set {parameter} to {offset:g}",
     ),
     _Said(
         "CLOCKS_LATE",
         "the reference's stamps are {seconds:.2f} s {way}, and the DVL's {dvl_seconds:.2f} s {dvl_way}",
-        "Both differ from the IMU's clock. A calibration estimates the DVL's delay.",
+        "A calibration estimates the DVL's delay.",
         "set {parameter} to {offset:g}",
     ),
     _Said(
         "CLOCKS_NOT_TOLD_APART",
         "the stamps of DVL and reference differ by {seconds:.2f} ± {std:.2f} s; it is unknown whose clock is wrong",
-        "Legs at one speed fit more than one clock.",
+        "",
         "set the clocks by one source, or drive turns at two speeds",
     ),
     _Said(
         "CLOCK_DRIFTS",
         "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
-        "The clock gains or loses time at a steady rate.",
+        "",
         "set the clocks by one source",
     ),
     _Said(
         "CLOCK_DRIFTS_DVL",
         "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
-        "The clock gains or loses time at a steady rate.",
+        "",
         "set the clocks by one source, or dvl_clock_drift to {drift:.2g}",
     ),
     _Said(
         "CLOCK_LEAPS",
         "{whose} clock steps {way} by {seconds:.2f} ± {std:.2f} s after {at:.0f} s",
-        "A clock was set during the recording.",
+        "",
         "cut the recording there, and calibrate with either part",
     ),
     _Said(
         "CLOCK_FAR",
         "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be estimated and "
         "subtracted",
-        "Speeds agree only with that clock offset.",
-        "set that clock right; this recording: --restamp log takes the times at which messages were recorded",
+        "",
+        "set that clock right; this recording: --restamp log (recording times)",
     ),
     # declarations of a recording
     _Said(
@@ -251,13 +251,13 @@ CONFIGURATIONS = (
     _Said(
         "REFERENCE_FRAME_OTHER",
         "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}, which is used",
-        "The frame's name and the data contradict each other.",
+        "",
         "-p gnss_frame:={declared} overrides this",
     ),
     _Said(
         "MOUNTING_CONTRADICTED",
         "DVL and reference do not agree with the mounting {given}; they do with {found}",
-        "A transform or parameter contradicts the data.",
+        "",
         "try -p mounting_rpy:={option}",
     ),
     _Said(
@@ -269,11 +269,11 @@ CONFIGURATIONS = (
     _Said(
         "FRAMES_AMBIGUOUS",
         "the data fit {taken} and, as well, {other}; the first is taken",
-        "Both fit and give different mountings. Which side is port, and which axes has the reference?",
+        "Which side is port, and which axes has the reference?",
         "set the one that is right",
         severity=Severity.MARGINAL,
     ),
-    _Said("TWO_CONTRADICTIONS", "{one}; {other}", "Two reasons of this list.", ""),
+    _Said("TWO_CONTRADICTIONS", "{one}; {other}", "", ""),
 )
 
 
@@ -283,13 +283,13 @@ DISCOVERIES = (
         "SECOND_DVL",
         "two DVLs: {topic} ({frame}) is calibrated here, not {other} ({other_frame}); calibrate that with --dvl-topic "
         "{other}",
-        "Each DVL has its own mounting.",
+        "",
         "",
     ),
     _Discovered(
         "TOPIC_DOES_NOT_MOVE",
         "{topic} does not move; not taken as a reference",
-        "The velocity is 0 throughout.",
+        "",
         "",
     ),
     _Discovered(
@@ -314,13 +314,13 @@ DISCOVERIES = (
     _Discovered(
         "FRAME_NOT_IN_TREE",
         "no transform for the DVL's frame {frame!r}; using frame {other!r} instead",
-        "The frame used instead has a DVL's name.",
+        "",
         "",
     ),
     _Discovered(
         "REFERENCE_FRAME_NOT_TOLD",
         "{topic}: its frame is unknown, and without an IMU the data do not show it",
-        "Finding the frame needs an attitude.",
+        "",
         "",
     ),
     _Discovered(
@@ -335,5 +335,5 @@ DISCOVERIES = (
         "The quaternion does not have length 1.",
         "",
     ),
-    _Discovered("URDF_NOT_READ", "{reason}; not used", "`/robot_description` is no URDF.", ""),
+    _Discovered("URDF_NOT_READ", "{reason}; not used", "", ""),
 )

@@ -20,13 +20,13 @@ FINDINGS = (
     Kind(
         "TOPICS_FOUND",
         "{own} had no publisher; found and used instead: {found}",
-        "The node chose topics by type and content (`discover`); they may be another vehicle's.",
-        "remap the topics to these names if they are right, else to the right ones, or set discover to false",
+        "They may be another vehicle's.",
+        "remap the topics to these names or the right ones, or set discover to false",
     ),
     Kind(
         "DVL_SILENT",
         "no usable DVL message for {seconds:.0f} s",
-        "Messages stopped, or all are refused (other findings say why).",
+        "Other findings can say why.",
         "check the sensor, its driver and the topic {topic}",
         Severity.ERROR,
     ),
@@ -39,26 +39,26 @@ FINDINGS = (
     Kind(
         "DVL_NONE_USABLE",
         "none of {count} DVL messages can be used: {reasons}",
-        "Every message is refused, for the reasons listed.",
+        "",
         "look the reasons up in the table of drivers (docs/bags_and_drivers.md)",
     ),
     # clocks and stamps
     Kind(
         "CLOCKS_DIFFER",
         "{stream} stamps are {seconds:.0f} s {side} the {other}'s and cannot be paired",
-        "The two drivers stamp by different clocks.",
+        "",
         "set both clocks by the same source (PTP, NTP or GNSS)",
     ),
     Kind(
         "CLOCK_TAKEN_OFF",
         "{clock}: subtracted ({parameter}: {value:g}); the calibration restarted with it",
-        "Two estimates of the clock offset agreed, and it was corrected.",
+        "",
         "correct that clock, or set this value as a parameter, which is then kept",
     ),
     Kind(
         "DVL_NO_REFERENCE",
         "no DVL sample has a reference velocity at its time, though both come",
-        "Stamps of DVL and reference are never within `gnss_timeout`; usually the DVL has its own clock.",
+        "Usually the DVL has its own clock.",
         "compare the header stamps of both; a DVL with its own clock must be synchronised (NTP)",
     ),
     Kind(
@@ -76,13 +76,13 @@ FINDINGS = (
     Kind(
         "STAMPS_MISSING_IN_BAG",
         "{count} messages had no header stamp, the time at which they were recorded is used",
-        "As `STAMP_MISSING`, for a whole bag.",
+        "",
         "let the driver fill header.stamp",
     ),
     Kind(
         "STAMPS_FAR",
         "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, absurdly far from the others",
-        "A computer without a clock battery, or broken stamps.",
+        "A computer without a clock battery.",
         "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording",
     ),
     Kind(
@@ -94,13 +94,13 @@ FINDINGS = (
     Kind(
         "SAMPLES_BEFORE_RESTART",
         "{count} {stream} samples were from before the clock was set back or the bag looped; they are not used",
-        "These samples belong to the run before the restart.",
+        "",
         "nothing, unless clocks are set during a run",
     ),
     Kind(
         "SAMPLES_LATE",
         "{count} {stream} samples came after the DVL sample that they belong to had been used; they are not used",
-        "The topic lags the DVL's by more than `max_latency`.",
+        "",
         "raise max_latency, in proportion when a bag is played faster than recorded",
     ),
     Kind(
@@ -131,7 +131,7 @@ FINDINGS = (
     Kind(
         "TOPIC_OTHER_TYPE",
         "{topic}: {name} publishes {type}, where {expected} is expected, and is not heard",
-        "ROS 2 connects only publishers and subscribers of the same type. The warning names the parameter.",
+        "The warning names the parameter.",
         "{remedy}",
     ),
     Kind(
@@ -143,65 +143,64 @@ FINDINGS = (
     Kind(
         "OUTPUT_QOS",
         "{topic}: {name} asks for an incompatible QoS and does not hear it ({reason})",
-        "The subscriber asks for more than the node offers.",
+        "",
         "change the QoS of the subscriber",
     ),
     Kind(
         "SECOND_NODE",
         "{topic}: {count} publishers ({names})",
         "Two calibration nodes, or a bag with recorded estimates.",
-        "stop the second node or the bag with recorded estimates, or give one of them a namespace "
-        "(--ros-args -r __ns:=/port) and its own result_file",
+        "stop the second node, or give one a namespace (--ros-args -r __ns:=/port) and its own result_file",
     ),
     Kind(
         "TF_TWICE",
         "another node publishes a transform to {frame!r}, in addition to publish_tf",
-        "Usually robot_state_publisher with the nominal mounting; listeners get either.",
+        "Usually robot_state_publisher with the nominal mounting.",
         "turn publish_tf off, and write the calibration into the URDF instead (dvl-calib apply --urdf)",
     ),
     Kind(
         "POSITION_UNKNOWN",
         "publish_tf is set, but the position of the reference point in {base} is unknown, and so is the DVL's; no "
         "transform is published",
-        "The lever arm starts at the reference point, not at `base_frame`.",
+        "",
         "set reference_position, and dvl_position to from_reference; or publish the transform of the reference's frame",
     ),
     Kind(
         "TF_NOT_THERE",
         "publish_tf is set, but tf2_ros is not installed; ~/mounting is published, a transform is not",
-        "ROS from PyPI has no tf2_ros.",
+        "",
         "install ros-$ROS_DISTRO-tf2-ros-py, and source its setup.bash",
     ),
     # frames
     Kind(
         "DVL_FRAME",
         "dvl: a message has frame_id {frame_id!r} where {expected!r} is expected; it is not used",
-        "The velocity is in another frame than configured, or already in the body's.",
+        "Another frame than configured, or the body's.",
         "let the driver publish in the DVL's own frame, or set parameter dvl_frame to {frame_id!r} if that is its name",
     ),
     Kind(
         "DVL_TURNED_TWICE",
         "dvl: data in frame {frame_id!r} are turned from forward-right-down to forward-left-up, and mounting_rpy "
         "turns the DVL upside down as well",
-        "Right only for a DVL that looks up; else the roll of 180° is counted twice.",
-        "if mounting_rpy describes a frame whose z points down, set dvl_axes to flu, which uses the data unchanged",
+        "Right only for a DVL that looks up.",
+        "if mounting_rpy describes a frame whose z points down, set dvl_axes to flu",
     ),
     Kind(
         "REFERENCE_FRAME",
         "reference: frame_id {frame_id!r} says neither body ({base}) nor earth ({earth}); its messages are not used",
-        "The `frame_id` is neither the body's nor an earth frame.",
+        "",
         "set parameter gnss_frame to body, enu or ned",
     ),
     Kind(
         "REFERENCE_NO_ATTITUDE",
         "{count} DVL samples have an earth-frame reference but no attitude; the models with GNSS cannot use them",
-        "A velocity in ENU or NED needs the IMU's orientation.",
+        "",
         "check that the IMU topic has messages with an orientation; or publish the reference in the body frame",
     ),
     Kind(
         "IMU_FRAME",
         "imu: data is in frame {frame_id!r}; it is taken as the orientation and angular velocity of {base}",
-        "A rotated IMU without `imu_rpy` gives a wrong attitude and wrong turn rates.",
+        "",
         "if the IMU is mounted rotated, give its orientation in parameter imu_rpy",
     ),
     # messages that cannot be used
@@ -215,7 +214,7 @@ FINDINGS = (
         "SAMPLES_INVALID",
         "{count} {stream} samples are invalid (not finite, above max_speed, or with an impossible covariance); they "
         "are not used",
-        "No bottom lock or fix, or a driver that fills fields wrongly.",
+        "",
         "check the sensor, its bottom lock or fix, and its driver",
     ),
     Kind(
@@ -227,7 +226,7 @@ FINDINGS = (
     Kind(
         "DVL_DROPOUTS",
         "the DVL dropped out {count} times",
-        "Gaps: no bottom lock, power or cable.",
+        "",
         "check its power, cable and bottom lock (altitude, speed)",
     ),
     Kind(
@@ -239,7 +238,7 @@ FINDINGS = (
     Kind(
         "DVL_FROZEN",
         "{count} DVL samples repeat one velocity more than max_repeats times; they are not used",
-        "The driver hangs and repeats its last velocity.",
+        "",
         "restart the driver",
     ),
     Kind(
@@ -252,13 +251,13 @@ FINDINGS = (
     Kind(
         "GNSS_OUTAGE",
         "no GNSS for {seconds:.0f} s: {model} still corrects with its last estimate, but learns nothing more",
-        "References stopped, or all are refused; the selected model needs them.",
+        "",
         "surface, check the receiver and the topic {topic}, or select a model without GNSS (gnss_free_model)",
     ),
     Kind(
         "GNSS_OUTAGE_WITHOUT",
         "no GNSS for {seconds:.0f} s: {model} continues, but learns nothing that needs GNSS, such as the scale",
-        "References stopped, or all are refused; models that need them keep their estimate.",
+        "",
         "surface, or check the receiver and the topic {topic}",
     ),
     Kind(
@@ -270,51 +269,51 @@ FINDINGS = (
     Kind(
         "BAG_NO_IMU",
         "no IMU in the bag: {what}",
-        "Attitude and lever arm correction need an IMU.",
-        "record the IMU's topic (sensor_msgs/Imu, with orientation) together with the DVL, or name it: --imu-topic",
+        "",
+        "record sensor_msgs/Imu with an orientation, or name its topic: --imu-topic",
     ),
     Kind(
         "BAG_NO_GNSS",
         "no topic {topic!r} in the bag: only the models without GNSS can run",
-        "No reference velocity under this name.",
+        "",
         "if there is one under another name, set --gnss-topic",
     ),
     Kind(
         "BAG_NO_DEFINITION",
         "the bag does not say how {type} is laid out (recorded before ROS 2 Iron?); it is read by the definitions "
         "known here",
-        "SQLite bags of older ROS 2 hold no message definitions.",
+        "",
         "if it cannot be decoded, run ros2 bag convert to MCAP where the package is installed",
     ),
     # motion and configuration
     Kind(
         "NO_TURN_RATE",
         "{count} samples have no angular velocity for max_turn_rate and are not used",
-        "`max_turn_rate` is set, and no IMU gives the turn rate.",
+        "",
         "check the IMU topic, or set max_turn_rate to 0",
     ),
     Kind(
         "LEVER_ARM_NOT_COMPENSATED",
         "lever_arm is not compensated in {count} samples: no angular velocity",
-        "`lever_arm` is set, and no IMU gives the turn rate.",
+        "",
         "check the IMU topic, or set max_turn_rate so that turns are left out",
     ),
     Kind(
         "ALL_SLOW",
         "every sample is slower than min_speed, nothing is learnt",
-        "The vehicle stands or drifts; angles need motion.",
+        "",
         "drive, at 1 m/s or more",
     ),
     Kind(
         "SAMPLES_GATED",
         "{model}: {gated} of {given} samples are gated",
-        "So many outliers mean a wrong configuration rather than bad data.",
+        "",
         "check mounting_rpy and the frames before believing it: does the vehicle drive ahead in the DVL's x?",
     ),
     Kind(
         "CONFIGURATION_WRONG",
         "the data contradict the configuration: {says}",
-        "Another frame or mounting fits the samples much better.",
+        "",
         "correct the configuration and start again",
         Severity.ERROR,
     ),
@@ -322,14 +321,14 @@ FINDINGS = (
         "HEADING_DEVIATION",
         "the heading error changes with the heading: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
         "{least:+.1f}° at {least_at:.0f}°; it costs {cost:.0f} m per km",
-        "A compass deviates with the heading, a gyro drifts; the yaw holds the mean deviation.",
+        "A compass deviates with the heading, a gyro drifts.",
         "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
     ),
     Kind(
         "IMU_LEVEL",
         "the IMU's orientation is a heading alone (roll and pitch are 0 in every message), so the DVL's roll and pitch "
         "are not known",
-        "The IMU sends a heading alone, so trim looks like a mounting.",
+        "",
         "record an IMU that gives roll and pitch",
     ),
     Kind(
@@ -343,14 +342,14 @@ FINDINGS = (
         "TILT_NOT_SHOWN",
         "the vehicle hardly tilts, so nothing shows whether the DVL's driver levels its velocity: if it does, the "
         "vehicle's mean {axis} is in the mounting ({lean:.1f}° of {axis})",
-        "Without tilt nothing shows whether the driver levels the velocity.",
+        "",
         "look into the driver's settings, or record in waves or with dives",
     ),
     Kind(
         "ONE_SPEED",
         "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes what dvl_bias_std says of it",
-        "A velocity bias looks like a mounting unless the speed changes.",
+        "",
         "drive at two speeds, one twice the other; set dvl_bias_std, if you know the DVL's",
     ),
     Kind(
@@ -371,7 +370,7 @@ FINDINGS = (
         "BED_MOVES",
         "moving bed: over ground the reference is {millimetres:.0f} mm/s faster than the DVL towards {course:.0f}°, "
         "on every heading",
-        "Bottom track follows moving sediment or the water's layer; dead reckoning drifts with it.",
+        "Bottom track follows moving sediment or the water's layer.",
         "calibrate where the bed is still; to estimate that velocity as well: -p reference_offset_std:={std:g}",
     ),
     Kind(
@@ -383,15 +382,15 @@ FINDINGS = (
     Kind(
         "CIRCULAR_REFERENCE",
         "the reference follows the DVL's own noise for {seconds:.1f} s: a filter made it from this DVL",
-        "The reference and the DVL share noise, so it cannot show the DVL's error.",
-        "use a reference that does not use the DVL: velocity or positions of GNSS alone",
+        "",
+        "use the velocity or positions of GNSS alone",
     ),
     Kind(
         "FILTER_FINDS_NOTHING",
         "the reference lags by {late:.1f} s, is smoothed over as long, and shows no error of the DVL: a filter may "
         "have made it from this DVL",
-        "A reference without any DVL error may be a filter that uses this DVL.",
-        "use a reference that does not use the DVL: velocity or positions of GNSS alone",
+        "",
+        "use the velocity or positions of GNSS alone",
     ),
     Kind(
         "LEVER_ARM_CONTRADICTED",
@@ -404,14 +403,14 @@ FINDINGS = (
         "CLOCK_OR_ARM",
         "at one speed a delayed reference looks like a lever arm, and in a steady turn like a yaw: {metres:.1f} m, "
         "{degrees:.1f}° and {seconds:.1f} s of delay cannot be distinguished; σ includes them",
-        "At one speed a reference delay looks like a lever arm.",
+        "",
         "drive turns to both sides at two speeds",
     ),
     Kind(
         "CLOCK_ON_TURN",
         "in a steady turn a delayed reference or IMU looks like a yaw: {degrees:.1f}° cannot be distinguished; σ "
         "includes it",
-        "In a steady turn a delay looks like a yaw.",
+        "",
         "drive turns to both sides, or a straight leg",
     ),
     Kind(
@@ -424,39 +423,39 @@ FINDINGS = (
         "ONE_HEADING",
         "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes that of the reference",
-        "On one heading an error of the reference looks like a mounting.",
+        "",
         "drive the opposite heading as well, at two speeds; or set reference_offset_std to the reference's accuracy "
         "(σ includes four times that)",
     ),
     Kind(
         "INNOVATIONS_LARGE",
         "{model}: innovations are larger than R and P allow (mean NIS {nis:.1f}, at most {limit:.1f}), σ is too small",
-        "More noise than configured, or an effect that the model lacks.",
+        "",
         "raise gnss_aided_std or gnss_free_std, or find the effect with dvl-calib diagnose",
     ),
     Kind(
         "PRIOR_HOLDS_ERROR",
         "prior_source initial_window: the mean of the DVL's own first seconds already holds the misalignment, so M5 "
         "and M6 gain nothing over no calibration",
-        "The prior comes from the sensor to be calibrated.",
+        "",
         "prefer prior_source fixed",
     ),
     Kind(
         "INITIAL_CONTRADICTED",
         "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so it is left out",
-        "The mounting has moved since that calibration, so it is not used.",
+        "",
         "inspect the mounting; if it is right, save this result and start from that",
     ),
     Kind(
         "RESULT_WORSE",
         "{path} is kept, which is better ({before}); the newer result ({now}) is {beside}",
-        "A worse verdict or a larger σ replaces nothing unasked.",
+        "",
         "to use the newer all the same, rename it, or call ~/save_anyway",
     ),
     Kind(
         "RESULT_NOT_SAVED",
         "the result was not saved: {reason}",
-        "Full disk, missing folder or no permission. The previous file is untouched.",
+        "The previous file is untouched.",
         "free space, or set result_file elsewhere and call ~/save",
     ),
 )

@@ -39,7 +39,7 @@ class Kind:
     says
         The fact, as a sentence with fields in braces for the values found.
     means
-        Explanation for the documentation.
+        Cause, for the documentation; '' if the sentence gives it.
     remedy
         What to do, also with fields; '' if there is nothing to do.
     severity
@@ -50,7 +50,7 @@ class Kind:
     Raises
     ------
     ValueError
-        For a code that is not one word in capitals, or a finding without an explanation or remedy.
+        For a code that is not one word in capitals, or a finding without a remedy.
     """
 
     code: str
@@ -63,8 +63,8 @@ class Kind:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Z][A-Z_]*[A-Z]", self.code):
             raise ValueError(f"code {self.code!r}: capitals and underscores only")
-        if not (self.says and self.means and (self.remedy or not self.is_finding)):
-            raise ValueError(f"{self.code}: says, means and a finding's remedy must not be empty")
+        if not (self.says and (self.remedy or not self.is_finding)):
+            raise ValueError(f"{self.code}: says and a finding's remedy must not be empty")
 
     @property
     def is_finding(self) -> bool:

@@ -153,12 +153,13 @@ def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
 
 def lookup(kinds: Iterable[Kind]) -> str:
     """Return a part of docs/troubleshooting.md: cause and remedy under each code, with … for fields."""
-    return "\n".join(f"### {kind.code}\n\n{_cause_and_remedy(kind)}\n" for kind in kinds)
+    texts = ((kind.code, _cause_and_remedy(kind)) for kind in kinds)
+    return "\n".join(f"### {code}\n\n{text}\n" for code, text in texts if text)
 
 
 def _cause_and_remedy(kind: Kind) -> str:
     remedy = _FIELD.sub("…", re.sub(r"^{\w+}", "", kind.remedy))
-    return f"{kind.means} {full(remedy)}".replace("….", "…") if remedy else kind.means
+    return f"{kind.means} {full(remedy) if remedy else ''}".strip().replace("….", "…")
 
 
 def _causes(value: object) -> tuple[Reason, ...]:

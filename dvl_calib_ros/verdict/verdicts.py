@@ -30,7 +30,7 @@ _KINDS = (
     Kind(
         "NOTHING_COMPARED",
         "there is no IMU, so no DVL sample can be compared with the reference",
-        "A velocity in an earth frame needs an attitude.",
+        "",
         "record the IMU's topic, with orientation",
         Severity.REJECT,
     ),
@@ -44,7 +44,7 @@ _KINDS = (
     Kind(
         "DRIFT_OPEN",
         "the calibration leaves {open:.0f} m of drift per km open (1σ), more than {limit:.0f}",
-        "The data determine the calibration badly; five times `target_drift` is accepted.",
+        "Up to five times `target_drift` is accepted.",
         "drive on: other headings, other speeds, turns to both sides",
         Severity.MARGINAL,
     ),
@@ -52,7 +52,7 @@ _KINDS = (
     Kind(
         "MISALIGNMENT_LARGE",
         "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
-        "More often a wrong `mounting_rpy` or frame than a bracket (`reject_misalignment`).",
+        "Seldom the bracket.",
         "is mounting_rpy right, and are the frames?",
         Severity.REJECT,
     ),
@@ -73,22 +73,22 @@ _KINDS = (
     Kind(
         "LEVER_ARM_NOT_SHOWN",
         "the lever arm is poorly observable, and {turns}",
-        "On this track a lever arm error looks like an angle; σ includes it.",
-        "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways",
+        "σ includes it.",
+        "give lever_arm and initial_std_lever_arm, or go straight and turn both ways",
         Severity.MARGINAL,
     ),
     Kind(
         "LEVER_ARM_TURNS_ANGLE",
         "the lever arm is known to ±{std:.2g} m, and {turns}",
-        "On this track a lever arm error looks like an angle, and this model assumes the arm.",
-        "give lever_arm and how well it is measured (initial_std_lever_arm), or go straight and turn both ways",
+        "This model assumes the arm.",
+        "give lever_arm and initial_std_lever_arm, or go straight and turn both ways",
         Severity.REJECT,
     ),
     # errors on held-out data
     Kind(
         "HELD_OUT",
         _HELD_OUT,
-        "The held-out error is as predicted.",
+        "",
         "",
         Severity.ACCEPT,
     ),
@@ -102,42 +102,42 @@ _KINDS = (
     Kind(
         "HELD_OUT_OUTLIERS",
         _HELD_OUT + ", {typical:.3f} without outliers: there are many of them",
-        "Outliers alone make the error large.",
+        "",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "HELD_OUT_WORSE",
         _HELD_OUT + ": the calibration makes it worse",
-        "The correction makes the held-out error larger than chance allows.",
+        "",
         "",
         Severity.REJECT,
     ),
     Kind(
         "HELD_OUT_NO_BETTER",
         _HELD_OUT + ": the calibration makes no difference, perhaps for lack of data",
-        "The correction makes no significant difference.",
+        "",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "HELD_OUT_SEVERAL_TIMES",
         _HELD_OUT + ": the error is several times the predicted one",
-        "The error is more than three times the predicted one.",
+        "More than three times.",
         "the configuration is wrong, or an effect is missing from the model (dvl-calib diagnose looks for it)",
         Severity.REJECT,
     ),
     Kind(
         "HELD_OUT_IMPLAUSIBLE",
         _HELD_OUT + ": implausibly small, as if the DVL were fused into the reference, which then cannot judge it",
-        "DVL and reference share noise.",
+        "",
         "take GNSS alone",
         Severity.REJECT,
     ),
     Kind(
         "HELD_OUT_NOISIER",
         _HELD_OUT + ": the reference is noisier than it says, or an effect is missing from the model",
-        "Larger than predicted (`max_error_ratio`): a noisy reference, or an effect that the model lacks.",
+        "Limit: `max_error_ratio`.",
         "",
         Severity.MARGINAL,
     ),
@@ -152,7 +152,7 @@ _KINDS = (
     Kind(
         "DRIFT_WORSE",
         "on data held out dead reckoning drifts by {after:.1f} m per km with it, by {before:.1f} as mounted",
-        "The drift grows by more than half, beyond noise.",
+        "",
         "an effect is missing from the model (dvl-calib diagnose looks for it)",
         Severity.REJECT,
     ),
@@ -160,8 +160,8 @@ _KINDS = (
     Kind(
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
-        "Two drivers stamp by clocks that differ too much for any model.",
-        "set the clocks by one source; this recording: --restamp log takes the times at which messages were recorded",
+        "",
+        "set the clocks by one source; this recording: --restamp log (recording times)",
         Severity.REJECT,
     ),
     # several recordings
@@ -175,7 +175,7 @@ _KINDS = (
     Kind(
         "BAGS_MOUNTING_DIFFERS",
         "the mounting differs {moved} {between}: the average of all is the mounting of none",
-        "Each bag was calibrated alone, and two contradict each other.",
+        "",
         "",
         Severity.REJECT,
     ),
@@ -183,7 +183,7 @@ _KINDS = (
         "BAGS_DELAY_CHANGED",
         "the delay of the DVL's stamps differs between recordings, but one delay is used for recordings that follow "
         "each other so closely",
-        "A model with one delay averages two.",
+        "",
         "calibrate each by itself",
         Severity.REJECT,
     ),
@@ -202,33 +202,33 @@ MANOEUVRES = (
     _Said("NEXT_CIRCLE", "circle to {side}", "Turns show the lever arm and average earth-fixed errors."),
     _Said("NEXT_EIGHT", "drive a figure eight", "Turns to both sides separate lever arm and yaw."),
     _Said("NEXT_DIVE", "dive and rise by 10° of pitch", "Pitching shows the vertical axis."),
-    _Said("NEXT_WAIT", "keep on: nothing is learnt yet", "No sample used yet, or the vehicle stands."),
+    _Said("NEXT_WAIT", "keep on: nothing is learnt yet", ""),
     _Said(
         "NEXT_REJECTED",
         "nothing: the findings say why this calibration is not to be used",
-        "More data of the same kind do not help.",
+        "",
     ),
     _Said(
         "NEXT_STANDS",
         "keep on: the goal is reached, if it stays so",
-        "The goal has to be kept for half a minute.",
+        "",
     ),
-    _Said("NEXT_IS_GOOD", "good enough: save", "The predicted drift is within `target_drift`."),
+    _Said("NEXT_IS_GOOD", "good enough: save", ""),
     _Said(
         "NEXT_IS_GOOD_BUT_SCALE",
         "as good as it gets without a reference: save; the scale stays unknown",
-        "The drift by yaw is within `target_drift`; scale needs a reference.",
+        "",
     ),
     _Said(
         "LONGER_AS_DRIFT_GREW",
         "it takes longer than promised: the predicted drift has grown from {before:.1f} to {now:.1f} m per km",
-        "New data differ from the old by more than σ.",
+        "",
     ),
     _Said(
         "LONGER_AS_LITTLE_SHOWN",
         "it takes longer than promised: the motion since then was less informative than the suggested one "
         "({before:.1f} m per km then, {now:.1f} now)",
-        "The motion has shown less than planned.",
+        "",
     ),
     _Said(
         "WORTH_OF_ANOTHER_MODEL",
@@ -239,7 +239,7 @@ MANOEUVRES = (
     _Said(
         "WORTH_HAS_FALLEN",
         "no longer good enough: the predicted drift has grown to {worth:.1f} m per km",
-        "New data differ from the old by more than σ.",
+        "",
         remedy="Drive on. If it happens again, look for the cause with `dvl-calib doctor`.",
     ),
 )
@@ -247,27 +247,27 @@ MANOEUVRES = (
 
 _Selected = partial(Kind, page="troubleshooting.md#why-a-model-is-selected", severity=Severity.ACCEPT)
 SELECTIONS = (
-    _Selected("MODEL_NAMED", "set by parameter model", "The parameter names one model.", ""),
-    _Selected("MODEL_CHOSEN", "{by}: {gnss}", "`auto` or `iac` selects by GNSS.", ""),
-    _Selected("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}", "As `MODEL_CHOSEN`, and by the data.", ""),
-    _Selected("GNSS_AVAILABLE", "GNSS is available", "References keep coming (`gnss_timeout`).", ""),
+    _Selected("MODEL_NAMED", "set by parameter model", "", ""),
+    _Selected("MODEL_CHOSEN", "{by}: {gnss}", "", ""),
+    _Selected("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}", "", ""),
+    _Selected("GNSS_AVAILABLE", "GNSS is available", "", ""),
     _Selected("GNSS_NOT_AVAILABLE", "GNSS is not available", "No reference for `gnss_timeout`.", ""),
     _Selected(
         "GNSS_GOING",
         "GNSS has stopped; the model changes if it stays away for gnss_hysteresis",
-        "No reference, for less than `gnss_hysteresis`.",
+        "",
         "",
     ),
     _Selected(
         "GNSS_COMING",
         "GNSS is back; the model changes if it stays for gnss_hysteresis",
-        "References for less than `gnss_hysteresis`.",
+        "",
         "",
     ),
     _Selected(
         "HEADINGS_TELL_CURRENT",
         "headings distinguish a current from the mounting",
-        "Several headings separate a current from the mounting.",
+        "",
         "",
     ),
     _Selected(
@@ -286,7 +286,7 @@ SELECTIONS = (
     _Selected(
         "POSITIONS_NOISY",
         "velocities from the positions would have {noise:.1f} m/s of noise, so positions are compared over legs",
-        "Positions with metres of noise (USBL, plain GPS) are compared over legs.",
+        "",
         "",
     ),
     _Selected(

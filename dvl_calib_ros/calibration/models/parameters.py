@@ -41,7 +41,7 @@ class Parameters:
 
     model: str = _parameter(
         AUTO,
-        "Published model: auto (recommended), iac (the paper's: M3 or M4 with GNSS, M5 to M7 without), or a name.",
+        "Published model: auto (recommended), iac (the paper's selection), or a name.",
         choices=(AUTO, IAC, *MODELS),
         replaced=REPLACED,
         read_only=False,
@@ -62,8 +62,7 @@ class Parameters:
     )
     gnss_timeout: float = _parameter(
         2.0,
-        "GNSS counts as lost at this age of the last paired reference sample; also the longest gap that is "
-        "interpolated.",
+        "Age of the last paired reference sample from which GNSS counts as lost; longest interpolated gap.",
         unit="s",
         low=0.05,
         high=60.0,
@@ -78,8 +77,9 @@ class Parameters:
     )
     gnss_frame: str = _parameter(
         FROM_FRAME_ID,
-        "Frame of the reference velocity; body: base_axes, frd: forward-right-down body. from_frame_id: base_frame is "
-        "body; enu, map, odom, world: ENU; ned, nwu; or a name ending in _enu, _ned, _nwu, _flu, _frd.",
+        "Frame of the reference velocity; body: base_axes, frd: forward-right-down body. from_frame_id: "
+        "base_frame is body; enu, map, odom, world: ENU; ned, nwu; or by ending: _enu, _ned, _nwu, _flu, "
+        "_frd.",
         choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame), FRD, NWU),
     )
     gnss_axes: str = _parameter(
@@ -94,16 +94,16 @@ class Parameters:
     )
     base_axes: str = _parameter(
         FLU,
-        "Axes of base_frame, mounting, lever arm and all results: forward-left-up (REP-103) or forward-right-down.",
+        "Axes of base_frame and all results: forward-left-up (REP-103) or forward-right-down.",
         choices=(FLU, FRD),
     )
     use_transforms: bool = _parameter(
         True,
-        "Take mounting_rpy, lever_arm and imu_rpy at their defaults from /tf_static or robot_description.",
+        "Take default mounting_rpy, lever_arm and imu_rpy from /tf_static or robot_description.",
     )
     publish_tf: bool = _parameter(
         False,
-        "Broadcast ~/mounting as a static transform (live, needs tf2_ros). Not next to another publisher of it.",
+        "Broadcast ~/mounting as a static transform (needs tf2_ros). Not next to another publisher of it.",
     )
     dvl_frame: str = _parameter(
         "",
@@ -111,8 +111,7 @@ class Parameters:
     )
     dvl_axes: str = _parameter(
         FROM_MESSAGE,
-        "Axes of the DVL's data, converted to base_axes. from_message: by a frame_id ending in _frd or _flu, else by "
-        "message type.",
+        "Axes of the DVL's data. from_message: by a frame_id ending in _frd or _flu, else by message type.",
         choices=(FROM_MESSAGE, FLU, FRD),
     )
     dvl_type: str = _parameter(
@@ -130,7 +129,7 @@ class Parameters:
     )
     position_window: float = _parameter(
         1.0,
-        "Time between two positions that are differenced to a velocity. Longer: less noise, less true in turns.",
+        "Time between two positions that are differenced to a velocity. Longer: less noise, wrong in turns.",
         unit="s",
         low=0.1,
         high=30.0,
@@ -144,7 +143,7 @@ class Parameters:
     )
     lever_arm: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
-        "Position of the DVL from the reference point, body frame; compensated while the angular velocity is known.",
+        "Position of the DVL from the reference point, body frame; compensated with the angular velocity.",
         unit="m",
         low=-100.0,
         high=100.0,
@@ -158,8 +157,8 @@ class Parameters:
     )
     dvl_position: str = _parameter(
         UNKNOWN,
-        "The DVL's position in base_frame. from_reference: reference_position plus the estimated lever arm; told: "
-        "plus the configured one; unknown: no position is written.",
+        "The DVL's position in base_frame: reference_position plus the estimated (from_reference) or "
+        "configured (told) lever arm; unknown: none is written.",
         choices=(UNKNOWN, TOLD, FROM_REFERENCE),
     )
     imu_rpy: tuple[float, ...] = _parameter(
@@ -177,18 +176,18 @@ class Parameters:
     )
     restamp: str = _parameter(
         "",
-        "Use recording times as stamps: log for all topics, or topic names with commas between.",
+        "Topics whose stamps are replaced by recording times, with commas between; log: all.",
     )
     dvl_time_offset: float = _parameter(
         0.0,
-        "Delay of DVL stamps (positive: late). Corrected before pairing.",
+        "Delay of DVL stamps (positive: late), corrected before pairing.",
         unit="s",
         low=-60.0,
         high=60.0,
     )
     reference_time_offset: float = _parameter(
         0.0,
-        "Delay of reference stamps (positive: late). Corrected before pairing.",
+        "As dvl_time_offset, for the reference.",
         unit="s",
         low=-60.0,
         high=60.0,
@@ -202,7 +201,7 @@ class Parameters:
     )
     imu_time_offset: float = _parameter(
         0.0,
-        "Delay of IMU stamps (positive: late). Corrected before pairing.",
+        "As dvl_time_offset, for the IMU.",
         unit="s",
         low=-60.0,
         high=60.0,
@@ -230,27 +229,27 @@ class Parameters:
     )
     initial_std_misalignment: float = _parameter(
         0.05,
-        "Prior standard deviation of each misalignment angle.",
+        "Prior σ of each misalignment angle.",
         unit="rad",
         low=1e-6,
         high=1.0,
     )
     initial_std_scale: float = _parameter(
         0.006,
-        "Prior standard deviation of the scale error.",
+        "Prior σ of the scale error.",
         low=1e-7,
         high=0.5,
     )
     initial_std_lever_arm: float = _parameter(
         2.0,
-        "Prior standard deviation of the lever arm (full). A configured arm has 0.05 m, or with probability 0.1 this.",
+        "Prior σ of the lever arm (full). A configured arm has 0.05 m, or with probability 0.1 this.",
         unit="m",
         low=1e-4,
         high=100.0,
     )
     initial_std_time_offset: float = _parameter(
         1.0,
-        "Prior standard deviation of the DVL's delay (full, within 3.2 s).",
+        "Prior σ of the DVL's delay (full, within 3.2 s).",
         unit="s",
         low=1e-4,
         high=10.0,
@@ -271,26 +270,25 @@ class Parameters:
     )
     use_message_covariance: bool = _parameter(
         True,
-        "R of the GNSS models from message covariances. Without, samples with variances of 1000 (m/s)² and more are "
-        "used too.",
+        "R of the GNSS models from message covariances.",
     )
     gnss_aided_std: float = _parameter(
         0.2,
-        "Standard deviation per axis of R of the GNSS models, if the reference has no covariance.",
+        "σ per axis of R of the GNSS models, if the reference has no covariance.",
         unit="m/s",
         low=1e-4,
         high=10.0,
     )
     gnss_free_std: float = _parameter(
         0.025,
-        "Standard deviation per axis of R of the GNSS-free models, and of a DVL without covariance.",
+        "σ per axis of R of the GNSS-free models, and of a DVL without covariance.",
         unit="m/s",
         low=1e-4,
         high=10.0,
     )
     motion_std: float = _parameter(
         ASSUMPTIONS.motion_std,
-        "Standard deviation of sway and heave about the model, straight ahead (A1, F1).",
+        "σ of sway and heave about the model, straight ahead (A1, F1).",
         unit="m/s",
         low=1e-4,
         high=10.0,
@@ -304,29 +302,28 @@ class Parameters:
     )
     heave_offset_std: float = _parameter(
         ASSUMPTIONS.heave_offset_std,
-        "Prior standard deviation of a constant heave, such as trim (A1, F1).",
+        "Prior σ of a constant heave, such as trim (A1, F1).",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     reference_offset_std: float = _parameter(
         0.005,
-        "Prior standard deviation, east, north and up, of a constant error of an earth-frame reference (full).",
+        "Prior σ per axis of a constant error of an earth-frame reference (full).",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     heading_deviation_std: float = _parameter(
         math.radians(0.5),
-        "Prior standard deviation of the heading error, one and two cycles (compass). On one heading σ of yaw includes "
-        "it. 0: exact.",
+        "Prior σ of the heading error, one and two cycles (compass). 0: exact.",
         unit="rad",
         low=0.0,
         high=0.5,
     )
     dvl_bias_std: float = _parameter(
         0.008,
-        "Prior standard deviation of the DVL's velocity bias per axis (full). At one speed σ includes it. 0: no bias.",
+        "Prior σ of the DVL's velocity bias per axis (full). 0: no bias.",
         unit="m/s",
         low=0.0,
         high=1.0,
@@ -346,16 +343,16 @@ class Parameters:
     )
     current_std: float = _parameter(
         ASSUMPTIONS.current_std,
-        "Prior standard deviation of the current per axis (A1, F1). On one heading it sets the share of sway that "
-        "counts as misalignment.",
+        "Prior σ of the current per axis (A1, F1). On one heading it sets the share of sway that counts as "
+        "misalignment.",
         unit="m/s",
         low=1e-6,
         high=10.0,
     )
     prior_source: str = _parameter(
         "fixed",
-        "Prior sway and heave of M5 and M6: prior_sway_heave, or the mean of prior_window of the DVL itself (gains "
-        "nothing), or of the reference (replay only).",
+        "Prior sway and heave of M5 and M6: prior_sway_heave, or the mean of prior_window of the DVL "
+        "(gains nothing) or the reference (replay only).",
         choices=("fixed", "initial_window", "reference"),
     )
     prior_window: float = _parameter(
@@ -422,8 +419,7 @@ class Parameters:
     )
     max_latency: float = _parameter(
         1.0,
-        "Stamp difference by which a topic may lag before a DVL sample continues without it. Raise for bags played "
-        "faster.",
+        "Stamp difference by which a topic may lag before a DVL sample continues without it.",
         unit="s",
         low=0.0,
         high=600.0,
@@ -483,14 +479,13 @@ class Parameters:
     )
     max_error_ratio: float = _parameter(
         1.0,
-        "A held-out error that exceeds this multiple of the predicted one significantly is marginal.",
+        "Significantly above this ratio of held-out to predicted error a calibration is marginal.",
         low=0.1,
         high=100.0,
     )
     result_file: str = _parameter(
         "",
-        "Result file (YAML) of ~/save and the end of the node. Empty: none. At run time only another .yaml in the "
-        "same folder.",
+        "Result file (YAML) of ~/save and the end of the node. At run time only another .yaml in the same folder.",
         read_only=False,
     )
     result_backups: float = _parameter(
@@ -501,7 +496,7 @@ class Parameters:
         read_only=False,
     )
     initial_calibration: str = _parameter(
-        "", "Result file whose states and covariances are the prior. Empty: none.",
+        "", "Result file whose states and covariances are the prior.",
     )  # fmt: skip
 
     def __post_init__(self) -> None:

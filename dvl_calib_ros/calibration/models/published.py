@@ -46,7 +46,7 @@ def _m7(seen: Observations) -> Linearised:
 
 _ONE_SCALE = (("delta_k", (0, 1, 2)),)
 _SCALE_X = (("delta_k_x", (0,)),)
-_NOISY_REGRESSOR = "slow, or with a noisy receiver: the scale is too small by"
+_NOISY_REGRESSOR = "slow, or a noisy receiver: scale too small by"
 
 
 def _aided(
