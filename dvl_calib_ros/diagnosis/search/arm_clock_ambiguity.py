@@ -48,7 +48,7 @@ class Combination:
 
 @dataclass(frozen=True)
 class OpenArm:
-    """Ambiguity of arm and reference clock: change (m) of each arm parameter per s of delay. late: σ of the delay, s."""
+    """Ambiguity of arm and reference clock: change (m) of arm parameters per second of delay. late: σ of that, s."""
 
     by: Mapping[str, float]
     late: float
