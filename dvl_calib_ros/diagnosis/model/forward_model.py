@@ -249,7 +249,7 @@ class Problem:
             as_it_is=partial(self._close_as_it_is, hypothesis, recording, time),
         )
         if any(each.effect.acts_on is ActsOn.REFERENCE for each in injections):
-            error -= found.on_reference(injections)  # in place: `closely` does not share it
+            error -= found.on_reference(injections)  # in place: `found` keeps its cached `close`
         for lag, values in hypothesis.lags(recording):
             error -= lag.of_before(found.motion, error, values)
         return found
@@ -513,8 +513,8 @@ def make_problem(
     return problem if problem.measured[2] else replace(problem, shown_turns=_shown_turns(problem))
 
 
-# A turn of the mounting that, as large as its prior, does less than this (m/s rms), is not fitted: it would take in
-# what is left of the waves, by tens of degrees
+# Mounting rotations that act by less than this (m/s RMS) at their prior size are not fitted: they would absorb the
+# residual of waves with tens of degrees
 TURN_SHOWN_MPS = 0.002
 
 

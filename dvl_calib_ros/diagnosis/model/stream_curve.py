@@ -28,8 +28,8 @@ NOISE_ALONE, SOME_MOTION = 1.4, 2.5
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Streams slower than this, s, barely resolve turns and waves, so no frequency is removed; samples per smoothing cubic
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
-# Standard deviations beyond which a sample is an outlier that pulls no more; and by how many of itself the size of the
-# tails has to be above that of normal noise: a median of neighbours' differences is known to 1.6 / √n
+# Clipping of outliers, in standard deviations; relative excess of tails that is significant (3 σ): the median of
+# neighbours' differences has a relative σ of 1.6 / √n
 SPIKY, SURELY_HEAVY = 6.0, 3.0 * 1.6
 # Largest product of the intervals to both neighbours, in usual intervals; at the middle of two samples it is 0.25
 TOLD = 0.4
