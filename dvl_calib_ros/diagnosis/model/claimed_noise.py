@@ -52,7 +52,7 @@ def differ(log_claims: Array) -> bool:
 
 
 def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: NDArray[np.intp]) -> Claims:
-    """Regress log squares of values (M, A) on reported values (M, A, c), each axis about its own mean.
+    """Fit log squares of values (M, A) to reported values (M, A, c), each axis about its own mean.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ def covariates(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
 
 
 def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Level | None:
-    """Regress log squared innovations (M, A) on the covariates, robustly. Return None without covariates."""
+    """Fit log squared innovations (M, A) to the covariates, robustly. Return None without covariates."""
     found = covariates(problem, seen)
     if not found:
         return None
@@ -101,7 +101,7 @@ def estimated(
 
 
 def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotation: Array | None) -> Claims | None:
-    """Regress innovations (M, A) of constant level on informative reported values. Return None without."""
+    """Fit innovations (M, A) of constant level to informative reported values. Return None without."""
     names, log_claims = claims_of(problem, seen, rotation)
     return exponents(names, log_claims, innovations, stretches_of(problem)) if names else None
 

@@ -32,8 +32,7 @@ DELAYS = np.arange(-4.0, 4.01, 0.25)
 PARTS, FEWEST_PARTS = 60, 3
 # Drop in whitened squares from which a jump is fitted; delay below which a clock is synchronised, s
 WORTH_FITTING, NO_DELAY = 40.0, 0.13
-# Number of largest gaps in the stamps, each longer than this, s, at which the clock may have jumped ahead by as much,
-# within this tolerance, s
+# Largest gaps that may be jumps ahead: their number, least length, s, and tolerance of the jump's size, s
 GAPS, GAP_FROM_S, AS_LARGE_S = 6, 0.15, 0.3
 # Gaps without lost samples that are tried as clock jumps
 LEAPS = 3
