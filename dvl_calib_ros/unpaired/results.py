@@ -119,10 +119,9 @@ class Rung:
 class UnpairedComparison(Answering):
     """Result of a comparison of a simulator with a vehicle.
 
-    reasons: the verdict first. effects: claims first, the largest first. noise: claims first, the most significant
-    first. levels: by regime, m/s RMS over the axes: vehicle and simulator. floor_mps: noise in `rungs` that no
-    simulator can remove. not_shown: for each side the effects not observable at relevant sizes, with their smallest
-    detectable size.
+    reasons: the verdict first. effects: claims first, the largest first. noise: likewise, the most significant first.
+    levels: by regime, m/s RMS over the axes of vehicle and simulator. floor_mps: noise in `rungs` that no simulator can
+    remove. not_shown: per side, effects not observable at relevant sizes, with their smallest detectable size.
     """
 
     verdict: SimulatorVerdict

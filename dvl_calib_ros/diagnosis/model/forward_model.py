@@ -215,7 +215,7 @@ class Problem:
 
     @property
     def rougher_than_claimed(self) -> float:
-        """Return the ratio of the DVL's roughness to its simulated noise, the upper bound of its noise."""
+        """Return the ratio of the DVL's roughness, the upper bound of its noise, to its simulated noise."""
         each = [(one.dvl.roughness, one.dvl.noise) for one in self.recordings]
         return max(float((rough / np.maximum(noise, 1e-12)).max()) for rough, noise in each)
 

@@ -26,7 +26,7 @@ MIN_SPECTRUM, BANDS = 60, 40
 NOISE_ALONE, SOME_MOTION = 1.4, 2.5
 # Weights of fourth differences
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
-# Streams slower than this, s, barely resolve turns and waves, so no frequency is removed; samples per smoothing cubic
+# Longest interval, s, of a stream that resolves turns and waves: only its noise is removed; samples per smoothing cubic
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
 # Clipping of outliers, in standard deviations; relative excess of tails that is significant (3 σ): the median of
 # neighbours' differences has a relative σ of 1.6 / √n

@@ -89,7 +89,7 @@ def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect, drops: Ma
 
 
 def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:
-    """Return whether an effect adds a negligible share to all effects; for a bent arm, also to the noise."""
+    """Return whether an effect explains a negligible share of the whole; if it bends the arm, also of the noise."""
     if drop > SETTINGS.ghost_share * explained:
         return False
     return not effect.bends_arm or drop < SETTINGS.ghost_of_noise * left
@@ -187,7 +187,7 @@ def repeated_effects(
 
 
 def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> list[Hypothesis]:
-    """Return the best starts, in order of time, with a second occurrence that promises less deviance than `limit`."""
+    """Return the best starts below a deviance `limit` with a second occurrence, both in order of time."""
     others = [effect for effect in fit.effects if effect.name != whole.name]
     (again,) = (spec.name for spec in whole.parameters if spec.name in whole.again and is_time_of_run(spec))
     seconds = max(recording.seconds for recording in fitter.problem.recordings)

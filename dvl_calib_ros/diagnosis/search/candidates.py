@@ -48,7 +48,7 @@ class Variant:
 
     @property
     def p(self) -> int:
-        """Number of columns."""
+        """Return the number of columns."""
         return self.columns.shape[2]
 
     @property
@@ -264,7 +264,7 @@ def _is_told_by_two_clocks(table: StraightLines, chosen: Sequence[int]) -> bool:
 
 
 def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
-    """Return a fit's clock offsets as offsets of other clocks; large offsets exceed the linear range.
+    """Return hypotheses with a fit's clock offsets assigned to other clocks; large offsets exceed the linear range.
 
     A clock jump at the beginning is a constant DVL delay.
     """

@@ -26,8 +26,8 @@ LEAP = "time_offset_jump"
 MOVING_CLOCK = ("clock_drift", LEAP)
 OF_TIME = (*CLOCKS, LAG, *MOVING_CLOCK)
 STANDS_IN = (DVL_CLOCK, *MOVING_CLOCK)
-# Delays, s, relative to the fit; parts of a run with constant delay, and fewest parts between jumps: shorter delays are
-# not identifiable from the ends of a run.
+# DVL delays to try, s; parts of a run with constant delay, and fewest parts between jumps: shorter ones are not
+# identifiable from the ends of a run
 DELAYS = np.arange(-4.0, 4.01, 0.25)
 PARTS, FEWEST_PARTS = 60, 3
 # Drop in whitened squares from which a jump is fitted; delay below which a clock is synchronised, s
@@ -73,8 +73,8 @@ def leaping(fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping
 def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     """Return true times (s) and excess (s) of the largest gaps in the DVL's stamps of one recording.
 
-    Backward clock steps have a negative excess, their upper bound. A forward clock jump leaves a gap of its own size;
-    lost samples leave gaps as well.
+    Backward clock steps have a negative excess, an upper bound of their size. A forward clock jump leaves a gap of its
+    own size; lost samples leave gaps as well.
     """
     if len(fit.seen) > 1:
         return []

@@ -290,7 +290,7 @@ def _with_what_is_shown_of_the_arm(
 ) -> tuple[Fitter, Fit, Mapping[str, Effect]]:
     """Return a fit and effects with only the observable parts of the lever arm.
 
-    every: effects with all parameters; effects: with those that columns alone show observable.
+    every: effects with all parameters; effects: with those observable by their columns alone.
     """
     arm = without_insignificant(fitter.problem, fit)
     if arm is not None:
@@ -338,8 +338,8 @@ PROMISING = 20.0
 def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hypothesis]:
     """Propose a heading error of two cycles in place of effects that rotate DVL against reference.
 
-    One hypothesis for all recordings and one per recording; without such effects only if promising. heading: with all
-    its parameters; None if untestable. A single recording has no proposals.
+    Its parameters are shared or per recording. A fit without such effects gets only promising proposals, a single
+    recording none. heading: with all its parameters; None if untestable.
     """
     if heading is None or len(fit.seen) < 2:
         return []

@@ -52,7 +52,7 @@ def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effec
 
 
 def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
-    """Return the lever arm without insignificant parts (2 σ of the model error). Return None if none is."""
+    """Return the lever arm without parts below 2 σ of the model error. Return None if all are significant."""
     known = _known_to(problem, fit)
     faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < FAINT * std}
     (arm,) = (effect for effect in fit.effects if effect.name == ARM) if faint else (None,)

@@ -166,7 +166,7 @@ def _first(each: tuple[float, str | float, Array]) -> float:
 
 @dataclass(frozen=True)
 class FollowTest:
-    """One score test of a group: at: its columns under test; energy: chi-square of dof; is_whole: of all columns."""
+    """Score test. name: of the group; at: columns under test; energy: chi-square of dof; is_whole: all columns."""
 
     name: str
     at: NDArray[np.intp]
@@ -275,7 +275,7 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
 
 
 def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
-    """Return whether the regressor of the residual predicts held-out data better than slow noise under the null."""
+    """Return whether the regressor of the residual predicts held-out data better than slow noise and chance do."""
     return rest.found and holds_out(problem, fit, rest) > rest.price - rest.clearest.shape[2]
 
 
