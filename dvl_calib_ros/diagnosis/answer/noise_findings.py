@@ -25,9 +25,9 @@ OUTLIER_SIGMA = 6.0
 CHANCE_OF_REPEAT = 1e-3
 # Least ratio of actual to reported noise that is reported
 INFLATION = 1.2
-# Simulated recordings with white noise, for the colour from resampling
-MADE_UP = 5
 # Simulated recordings with white noise, for the colour from interpolation
+MADE_UP = 5
+# Exponent below which reported covariances are invalid; the other stream's noise lowers it even if they are valid
 HALF = 0.5
 
 

@@ -460,8 +460,8 @@ class Problem:
         return np.concatenate(parts, axis=2), np.concatenate(sizes)
 
     def _of_unshown_turns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect) -> list[Array]:
-        """Return d e / d unobservable rotations of the mounting, (M, A, t), and / d half their square, (M, A, r), by
-        recording. The cosine of a 4° rotation scales all velocities of a recording by -0.25 per cent."""
+        """Return d e / d unobservable mounting rotations, (M, A, t), and d e / d half their square by recording, (M, A,
+        r). The cosine of a 4° rotation scales all velocities of a recording by -0.25 per cent."""
         turned = self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen))
         slower = self.binned([-each.motion.velocity_body for each in seen], seen)[:, :, None]
         return [turned, self._of_the_day(effect, slower)]

@@ -25,7 +25,7 @@ TAKEN_ROUNDS = 2
 
 @dataclass(frozen=True)
 class Level:
-    """log standard deviation = const + Σ slope · (covariate - mean). p: of all slopes jointly, p_of: of each."""
+    """Log-linear noise level: log σ = const + Σ slope · (covariate - mean). p: of all slopes jointly, p_of: of each."""
 
     names: tuple[str, ...]
     slopes: Array

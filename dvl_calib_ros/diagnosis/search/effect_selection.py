@@ -397,7 +397,7 @@ def _instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
 
 # Robust standard deviations from neighbours and from the other stream; an outlier exceeds both
 FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0
-# Ratio of the two deviations, projected: around a turn between samples they differ more than this
+# Bounds of the ratio of both deviations, projected: around a turn between samples they differ more
 ALIKE = (0.6, 1.7)
 # Fewest samples for a scatter
 FEWEST = 30

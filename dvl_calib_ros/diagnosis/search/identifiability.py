@@ -79,7 +79,7 @@ def identify_effects(
         selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
     if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
         opened = replace(opened, late=IN_TIME_STD_S)  # only their combination is observable
-    if opened is not None:  # lag and delay differ by less than a sample interval
+    if opened is not None:  # a lag differs from a delay by less than interpolation errors
         selected = [
             _or_else(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
@@ -113,7 +113,7 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
             continue
         rival = fitter.fit_kept(combined(fitter, rest, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance
-        if behind < 0.5 * drop:  # what is much worse under one noise is under its own as well
+        if behind < 0.5 * drop:  # a fit much worse under one noise is so under its own
             behind = min(behind, predictive_gain_of(fitter.problem, rival, fit))
         fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
         chosen = float(np.log(times_tried(effect) / times_tried(effects[name])))
