@@ -1,1 +1,1 @@
-"""Where a recorded DVL differs from the simulated one, which effect causes it, and how much it explains."""
+"""Diagnosis of the gap between a recorded and a simulated DVL: its causes and their shares."""

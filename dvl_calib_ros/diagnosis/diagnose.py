@@ -1,4 +1,4 @@
-"""The diagnosis: from bags to an answer."""
+"""Diagnosis of bags."""
 
 from __future__ import annotations
 
@@ -49,16 +49,16 @@ from .search.unexplained import Unexplained, matters, moved_by
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 
-# An effect could have been seen if one of its parameters could at so many times its typical size ...
+# An effect is observable if one of its parameters is detectable at this multiple of its typical size
 VISIBLE_TIMES_TYPICAL = 3.0
-# ... and a recording can only be cleared if that share of the effects could have been seen
+# Least share of observable effects for the verdict NO_GAP
 MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
-# Share of the gap's energy that effects have to close on held-out data to be what explains it
+# Least share of the gap's energy, on held-out data, that effects must close to explain it
 MATERIAL = 0.2
-# Slow noise of instruments, as a multiple of their noise at high frequencies; more is an unknown cause
+# Largest ratio of slow to high-frequency instrument noise; more is an unknown cause
 MOST_SLOW = 1.5
-# What is left beyond the noise is told in the sentence from this share of the noise on
+# Least ratio of the unexplained error to the noise for a mention in the sentence
 WORTH_TELLING = 0.3
 
 
@@ -72,9 +72,9 @@ def diagnose(
     *,
     forget: bool = False,
 ) -> Diagnosis:
-    """Diagnose bags of one vehicle. Raises InputError for what cannot be compared at all.
+    """Diagnose bags of one vehicle. Raises InputError for data that cannot be compared.
 
-    forget: as of `load_recordings`.
+    forget: as in `load_recordings`.
     """
     loaded = load_recordings(source, parameters, topics or Topics(), forget=forget)
     on_progress(0.5)
@@ -90,7 +90,7 @@ def diagnose_recordings(
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> Diagnosis:
-    """`diagnose`, of recordings that are read already. Raises InputError for clocks too far apart to be compared."""
+    """Diagnose recordings in memory. Raises InputError for clock offsets too large to compare."""
     says_nothing = _says_nothing(recordings)
     if says_nothing:
         return _nothing_to_say(says_nothing, notes)
@@ -121,7 +121,7 @@ def diagnose_recordings(
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
     verdict = _verdict(selection, rest, gap, len(visible) / len(testable))
     covariance, times = covariance_of(selection)
-    if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # whose part in the sizes nobody knows
+    if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # the unknown cause may contribute
         moved = moved_by(selection.fitter.problem, selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
     covariance = with_observable(selection.fitter.problem, selection.fit, covariance)
@@ -158,7 +158,7 @@ def diagnose_recordings(
 
 
 def _check_bounds(selection: EffectSelection) -> None:
-    """Raise InputError for a clock that is as far off as can be: it is further, and nothing beside it is right."""
+    """Raise InputError for a clock offset at its bound: it is larger, and biases all other parameters."""
     hypothesis = selection.fit.hypothesis
     for each in hypothesis.parameters():
         value, spec = hypothesis.value(each), each.spec
@@ -171,7 +171,7 @@ def _check_bounds(selection: EffectSelection) -> None:
 
 
 def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequence[RecordedStreams]) -> str:
-    """What recordings lack for an effect to be testable, '' if nothing."""
+    """Return the inputs that an effect needs and recordings lack, '' if none."""
     lacking = [need.value for need in effect.needs - available]
     if effect.relative_to_first and len(recordings) < 2:
         lacking.append("a second recording")
@@ -188,7 +188,7 @@ def _compared_axes(selection: EffectSelection) -> str:
 
 
 def _says_nothing(recordings: Sequence[RecordedStreams]) -> Reason | None:
-    """Why recordings cannot say anything; None if they can."""
+    """Return the reason against diagnosing recordings. Return None if there is none."""
     seconds = sum(recording.seconds for recording in recordings)
     samples = sum(min(len(recording.dvl.time), len(recording.reference.time)) for recording in recordings)
     if samples < SETTINGS.min_bins or seconds < SETTINGS.min_seconds:
@@ -220,7 +220,7 @@ def _nothing_to_say(why: Reason, notes: Sequence[str]) -> Diagnosis:
     )
 
 
-# How each verdict is said.
+# Reason code of each verdict
 CODES = {
     DiagnosisVerdict.KNOWN: "GAP_EXPLAINED",
     DiagnosisVerdict.AMBIGUOUS: "GAP_AMBIGUOUS",
@@ -233,7 +233,7 @@ CODES = {
 def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
     if matters(selection.fitter.problem, selection.fit, rest):
         return DiagnosisVerdict.UNKNOWN
-    # effects that leave more on held-out data than there is noise explain it no better than what they stand in for
+    # effects that leave more than the noise on held-out data explain it no better than their equivalents
     if gap.not_expected > (1.0 if selection.selected else MOST_SLOW) * gap.noise_floor:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected and gap.shown < MATERIAL:
@@ -245,7 +245,7 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
 
 
 def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: int) -> dict[str, float]:
-    """Size of each parameter that is found with a power of 80 per cent at the level of the tests."""
+    """Return the size of each parameter that is detected with a power of 80 per cent at the level of the tests."""
     fit, problem = selection.fit, selection.fitter.problem
     columns = [fit.columns]
     std = [prior_std(fit.hypothesis)]
@@ -307,9 +307,9 @@ def _found(
 
 
 def _known_together(selection: EffectSelection, covariance: Array, selected: Selected) -> Combination | None:
-    """What is known of a lever arm and a clock that are one to the data; of several clocks by that which tells most."""
+    """Return the observable combination of an ambiguous lever arm and clock, the most precise of several."""
     fit, name, others = selection.fit, selected.effect.name, selected.equivalent
-    if LAG in fit.values:  # which takes in a part of the delay
+    if LAG in fit.values:  # a lag absorbs part of the delay
         return None
     if name == ARM and others and not {*TWO_CLOCKS} & fit.values.keys():
         return opened_combination(fit, covariance, selection.opened)
@@ -319,7 +319,7 @@ def _known_together(selection: EffectSelection, covariance: Array, selected: Sel
 
 
 def _weighted_mean(each: Sequence[Mapping[str, Triple]]) -> dict[str, Triple]:
-    """Of values with 95 per cent intervals; infinite ones as in the first."""
+    """Return the weighted mean of values with 95 per cent intervals; infinite ones as in the first."""
     mean: dict[str, Triple] = {}
     for name, first in each[0].items():
         values = np.array([one[name] for one in each])
@@ -338,7 +338,7 @@ def _next_steps(
     untestable: Mapping[str, str],
     detectable: Mapping[str, Mapping[str, float]],
 ) -> tuple[Reason, ...]:
-    """What to drive: to separate what was confounded, else to see what this data sees worst."""
+    """Return manoeuvres that separate equivalent effects, or that make the least observable effects observable."""
     confounded = [(each.effect, [testable[name] for name in each.equivalent]) for each in selected if each.equivalent]
     if confounded:
         return tuple(
@@ -372,7 +372,7 @@ def _reasons(
     visible: Sequence[str],
     n_tested: int,
 ) -> tuple[Reason, ...]:
-    """The verdict, and what is left."""
+    """Return the verdict and the unexplained error as reasons."""
     numbers = {
         "names": " and ".join(" or ".join((effect.name, *effect.equivalent_to)) for effect in found),
         "before": 1e3 * gap.before,

@@ -43,31 +43,31 @@ class EffectInput:
 
     @property
     def attitude(self) -> Array:
-        """rotation_enu_from_body for an effect that needs it. Raises ValueError if missing."""
+        """Return rotation_enu_from_body for an effect that needs it. Raises ValueError if missing."""
         if self.rotation_enu_from_body is None:
             raise ValueError("this effect needs the attitude (rotation_enu_from_body)")
         return self.rotation_enu_from_body
 
     @property
     def turn_rate(self) -> Array:
-        """angular_velocity for an effect that needs it. Raises ValueError if missing."""
+        """Return angular_velocity for an effect that needs it. Raises ValueError if missing."""
         if self.angular_velocity is None:
             raise ValueError("this effect needs the angular velocity")
         return self.angular_velocity
 
     @property
     def velocity_dvl(self) -> Array:
-        """Velocity (N, 3) m/s in the nominal frame of the DVL."""
+        """Return the velocity (N, 3) m/s in the nominal frame of the DVL."""
         return self.velocity_body @ self.rotation_dvl_from_body.T
 
     @property
     def speed(self) -> Array:
-        """Speed (N,) m/s."""
+        """Return the speed (N,) m/s."""
         return np.linalg.norm(self.velocity_body, axis=1)
 
     @property
     def elapsed(self) -> Array:
-        """Time since the start (N,) s."""
+        """Return the time since the start (N,) s."""
         return self.time - (self.time[0] if self.start is None else self.start)
 
 
@@ -123,7 +123,7 @@ class EffectParameter:
 
     @property
     def spoken(self) -> str:
-        """Displayed name before value and unit."""
+        """Return the displayed name before value and unit."""
         return self.name if self.said is None else self.said
 
 
@@ -160,7 +160,7 @@ class AnyEffect:
 
     @property
     def defaults(self) -> dict[str, float]:
-        """Values with which the effect does nothing."""
+        """Return the values with which the effect does nothing."""
         return {parameter.name: parameter.default for parameter in self.parameters}
 
 
@@ -186,17 +186,17 @@ class Effect(AnyEffect, ABC):
 
     @property
     def usual(self) -> Effect:
-        """The effect without its rarer parameters."""
+        """Return the effect without its rarer parameters."""
         return self.without(self.rarer)
 
     @property
     def once(self) -> Effect:
-        """The effect without a second occurrence."""
+        """Return the effect without a second occurrence."""
         return self.without(self.again)
 
     @property
     def of_the_vehicle(self) -> Effect:
-        """The effect with one size in all recordings."""
+        """Return the effect with one size in all recordings."""
         found = copy(self)
         vars(found)["of_the_day"] = False
         return found
@@ -214,7 +214,7 @@ class Effect(AnyEffect, ABC):
 
     @property
     def linear(self) -> bool:
-        """Whether the trace is linear in all parameters jointly."""
+        """Return whether the trace is linear in all parameters jointly."""
         return all(parameter.linear for parameter in self.parameters)
 
     @abstractmethod

@@ -55,7 +55,7 @@ class Log:
 
     @property
     def selection(self) -> EffectSelection | None:
-        """The fits behind the diagnosis; None without any."""
+        """Return the fits behind the diagnosis; None without any."""
         return self.diagnosis.selection
 
 

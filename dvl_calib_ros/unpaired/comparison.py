@@ -115,7 +115,7 @@ def _series(shrunk: Shrunk, vehicle: Log, simulator: Log) -> dict[str, object]:
 
 
 class _Compared:
-    """The union of effects, fitted to both sides."""
+    """Union of the effects, fitted to both sides."""
 
     def __init__(
         self,

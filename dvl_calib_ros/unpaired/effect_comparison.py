@@ -57,7 +57,7 @@ class Size:
 
     @property
     def names(self) -> list[str]:
-        """Names of the parameters."""
+        """Return the names of the parameters."""
         return [spec.name for spec in amplitudes(self.effect)]
 
     def taking(self, names: Sequence[str]) -> Array:
@@ -66,7 +66,7 @@ class Size:
 
     @property
     def mean(self) -> tuple[Array, Array]:
-        """Weighted mean (p,) over recordings and its covariance (p, p)."""
+        """Return the weighted mean (p,) over recordings and its covariance (p, p)."""
         r, p = self.stacked.shape
         design = np.tile(np.eye(p), (r, 1))
         weight = np.linalg.inv(self.covariance)

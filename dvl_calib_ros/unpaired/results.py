@@ -26,12 +26,12 @@ class ComparisonStatus(str, Enum):
 
     @property
     def is_claim(self) -> bool:
-        """Whether it is a difference."""
+        """Return whether it is a difference."""
         return self in (ComparisonStatus.MISSING, ComparisonStatus.OTHER_SIZE, ComparisonStatus.ONLY_SIMULATOR)
 
     @property
     def words(self) -> str:
-        """Displayed text."""
+        """Return the displayed text."""
         return {
             ComparisonStatus.MISSING: "the simulator lacks it",
             ComparisonStatus.OTHER_SIZE: "another size",
@@ -42,7 +42,7 @@ class ComparisonStatus(str, Enum):
 
 
 class SimulatorVerdict(str, Enum):
-    """The answer as a word."""
+    """Verdict of a comparison."""
 
     DIFFERENT = "different"
     ONLY_NOISE = "only_noise"
@@ -52,7 +52,7 @@ class SimulatorVerdict(str, Enum):
 
 @dataclass(frozen=True)
 class Lies:
-    """Location of most of an effect: axis, regime of motion, frequency band; each with its share of the energy."""
+    """Location of most of an effect: axis, motion regime, frequency band; each with its share of the energy."""
 
     axis: str
     axis_share: float
@@ -117,11 +117,11 @@ class Rung:
 
 @dataclass(frozen=True, repr=False)
 class UnpairedComparison(Answering):
-    """The whole answer.
+    """Result of a comparison of a simulator with a vehicle.
 
-    reasons: the verdict first. effects and noise: claims first, the most significant first. levels: by regime, m/s rms
-    over the axes: vehicle and simulator. floor_mps: noise in `rungs` that no simulator can remove. not_shown: for each
-    side the effects not observable from its motions at relevant sizes, with their smallest detectable size.
+    reasons: the verdict first. effects: claims first, the largest first. noise: likewise, the most significant first.
+    levels: by regime, m/s RMS over the axes of vehicle and simulator. floor_mps: noise in `rungs` that no simulator can
+    remove. not_shown: per side, effects not observable at relevant sizes, with their smallest detectable size.
     """
 
     verdict: SimulatorVerdict
@@ -139,12 +139,12 @@ class UnpairedComparison(Answering):
 
     @property
     def sentence(self) -> str:
-        """The verdict as a sentence."""
+        """Return the verdict as a sentence."""
         return " ".join(reason.full_sentence for reason in self.reasons)
 
     @property
     def missing(self) -> tuple[ComparedEffect, ...]:
-        """Effects of the vehicle that the simulator lacks, the most significant first."""
+        """Return the vehicle's effects that the simulator lacks, the largest first."""
         return tuple(each for each in self.effects if each.status is ComparisonStatus.MISSING)
 
 

@@ -50,18 +50,18 @@ class Round:
 
     @property
     def error_mps(self) -> float:
-        """Rms, m/s, of recorded minus simulated on the vehicle's own motion, held out; nan without a comparison."""
+        """Return the held-out RMS error, m/s, on the vehicle's own motion; nan without a comparison."""
         rungs = self.comparison.rungs
         return rungs[0].error_mps if rungs else float("nan")
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """Effects of the simulated DVL."""
+        """Return the effects of the simulated DVL."""
         return () if self.dvl is None else tuple(each["name"] for each in self.dvl["effects"])
 
     @property
     def claims(self) -> tuple[str, ...]:
-        """Effects and properties of the noise that differ from the vehicle's."""
+        """Return the effects and noise properties that differ from the vehicle's."""
         effects = [each.name for each in self.comparison.effects if each.status.is_claim]
         return (*effects, *(each.name for each in self.comparison.noise if each.status.is_claim))
 
@@ -74,7 +74,7 @@ class ClosedGap(Answering):
 
     @property
     def best(self) -> int:
-        """Index of the round with the fewest differences in effects and, among these, the smallest error."""
+        """Return the index of the round with the fewest differences in effects and, among these, the smallest error."""
 
         def worth(index: int) -> tuple[int, float]:
             each = self.rounds[index]
@@ -84,12 +84,12 @@ class ClosedGap(Answering):
 
     @property
     def verdict(self) -> SimulatorVerdict:
-        """Verdict of the best round."""
+        """Return the verdict of the best round."""
         return self.rounds[self.best].comparison.verdict
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """The answer: reduction of the gap, and remaining differences of the best round."""
+        """Return the reduction of the gap, and remaining differences of the best round."""
         first, best = self.rounds[0], self.rounds[self.best]
         if len(self.rounds) == 1:
             return (*first.comparison.reasons, finding("SIMULATOR_NO_ROUNDS"))

@@ -43,7 +43,7 @@ class StreamFacts:
 
     @property
     def interval(self) -> float:
-        """Typical time between stamps, s."""
+        """Return the typical time between stamps, s."""
         return float(np.median(self.steps)) if len(self.steps) else np.nan
 
 

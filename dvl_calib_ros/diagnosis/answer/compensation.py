@@ -1,4 +1,4 @@
-"""What was found, as parameters that the node and replay compensate."""
+"""Corrections for the node and replay from a diagnosis."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ OFFSETS = {
     "reference_time_offset": "reference_time_offset",
     "attitude_time_offset": "imu_time_offset",
 }
-# Effects that a parameter corrects
+# Effects that a parameter can correct
 CORRECTED = (ARM, *OFFSETS, "water_lock", "clock_drift", "time_offset_jump")
-# A velocity that begins no later is there all the time
+# A water velocity that begins before this, s, acts throughout
 WHOLE_RUN_S = 5.0
 
 
@@ -43,7 +43,7 @@ class AppliedCorrection:
 
     @property
     def sentence(self) -> str:
-        """The changed values, and the held-out error without and with them."""
+        """Return the changed values, and the held-out error without and with them."""
         values = ", ".join(f"{name} {_rounded(value)}" for name, value in self.changed.items())
         return f"{values}; held-out error {1e3 * self.errors[0]:.1f} to {1e3 * self.errors[1]:.1f} mm/s"
 
@@ -76,9 +76,9 @@ def verified_corrections(
 
 
 def held_out_errors(diagnosis: Diagnosis, recording: int | None) -> tuple[float, float]:
-    """Return the held-out rms error (m/s) without a correction and with exactly its values; only φ and δk are fitted.
+    """Return the held-out RMS error (m/s) without a correction and with exactly its values; only φ and δk are fitted.
 
-    recording: index, whose error and correction is wanted; None: of all, with what belongs to the vehicle.
+    recording: index, for its error and correction; None: all, with the vehicle's correction.
     """
     assert diagnosis.selection is not None
     selection = diagnosis.selection
@@ -103,9 +103,9 @@ def held_out_errors(diagnosis: Diagnosis, recording: int | None) -> tuple[float,
 def corrections(diagnosis: Diagnosis, recording: int | None = None) -> dict[str, dict[str, float]]:
     """Return the values, by effect, that parameters of the calibration correct.
 
-    recording: of several, whose own (of the day) are wanted; None: only what belongs to the vehicle, and the day's
-    where there is but one recording. A size whose interval holds zero is left out, and an effect that others
-    explain as well, as these need another correction; but for a lever arm, whose interval allows for that.
+    recording: index, with its own parameters; None: only parameters of the vehicle, and the recording's if there is
+    one. Sizes whose interval includes zero are omitted, and effects with equivalents, which need another correction. A
+    lever arm is kept: its interval includes the ambiguity.
     """
     found: dict[str, dict[str, float]] = {}
     for effect in diagnosis.effects:
@@ -123,13 +123,13 @@ def corrections(diagnosis: Diagnosis, recording: int | None = None) -> dict[str,
             if begin_end["from_s"] >= WHOLE_RUN_S or np.isfinite(begin_end["to_s"]):
                 continue
             begin_end["from_s"] = 0.0
-        if sizes and "again_seconds" not in parameters:  # of two jumps, one would leave the other
+        if sizes and "again_seconds" not in parameters:  # one jump cannot correct two
             found[effect.name] = sizes | begin_end
     return found
 
 
 def _is_one_correction(diagnosis: Diagnosis, effect: FoundEffect) -> bool:
-    """Return whether an effect and those that explain the data as well set the same clocks against each other.
+    """Return whether an effect and its equivalents imply the same clock correction.
 
     A shift of all three clocks changes nothing, nor does the attitude's clock where the reference is in the body frame.
     """
@@ -147,7 +147,7 @@ def _is_one_correction(diagnosis: Diagnosis, effect: FoundEffect) -> bool:
 
 
 def _beside_attitude(hypothesis: Hypothesis) -> Array:
-    """Return how late the clocks of DVL and reference are beside that of the attitude, s, (2, recordings)."""
+    """Return the delays of DVL and reference relative to the attitude, s, (2, recordings)."""
     none = ({"seconds": 0.0},)
     dvl, reference, attitude = (
         np.array([each["seconds"] for each in hypothesis.values.get(name, none)]) for name in CLOCKS
@@ -161,7 +161,7 @@ def compensated(parameters: Parameters, diagnosis: Diagnosis, recording: int | N
     found = corrections(diagnosis, recording)
     for name, each in sorted(found.items(), key=lambda item: item[0] == "time_offset_jump"):
         if name == ARM:
-            axes = zip(parameters.lever_arm, ARM_PARAMETERS, strict=True)  # a height is not always shown
+            axes = zip(parameters.lever_arm, ARM_PARAMETERS, strict=True)  # a height may be unobservable
             values["lever_arm"] = tuple(known + each.get(axis, 0.0) for known, axis in axes)
         elif name in OFFSETS:
             values[OFFSETS[name]] = getattr(parameters, OFFSETS[name]) + each["seconds"]
@@ -186,7 +186,7 @@ def _rounded(value: Any) -> str:
 
 
 def parameter_file(parameters: Parameters) -> str:
-    """A ROS 2 parameter file with all values that are not the defaults."""
+    """Return a ROS 2 parameter file with all values that differ from the defaults."""
     values = {
         name: value
         for name, value in parameters.as_dict().items()

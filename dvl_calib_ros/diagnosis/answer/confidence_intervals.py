@@ -1,6 +1,6 @@
-"""How well the sizes of effects are known: by noise, by the times at which effects begin, by what fits do with samples.
+"""Confidence intervals of effects: noise, uncertain start times, and interpolation between samples.
 
-A fit's own covariance takes its times of the run and its curves between samples for true. Both are guesses.
+A fit's own covariance takes its start times and its interpolation as exact.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from ..search.effect_selection import EffectSelection
 Triple = tuple[float, float, float]
 Times = dict[tuple[str, int, str], Triple]
 
-# Made-up recordings that show what a fit does with samples, and from how many σ on that is not by chance: of the mean
-# of what it is off by, three of its own; of the scatter, what one of thirty sets of as many is beyond
+# Number of simulated recordings. Thresholds of significance: of the mean error, in σ; of the relative scatter, exceeded
+# by chance in one of thirty such sets
 MADE_UP, OFF_BY, SCATTER = 12, 1.0, 1.35
-# Motion between samples goes some way between the two that are fitted and made up, so half of what these differ by
+# True motion between samples lies between fitted and simulated interpolation: half of their difference counts
 HALF_WAY = 0.5
 
 
 def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
-    """(6 + p, 6 + p) of calibration and effects of a selection; and the times at which its effects begin or end, by
-    effect, recording and name, with their intervals of 95 per cent."""
+    """Return the covariance (6 + p, 6 + p) of a selection, and effects' times with 95 per cent intervals. Times are by
+    effect, recording and name."""
     fitter, fit = selection.fitter, selection.fit
     covariance = fit.covariance(blocks_of(fitter.problem))
     if not selection.selected:
@@ -47,7 +47,7 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
 
 
 def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
-    """A covariance (n, n) with what fits to made-up recordings are off by, and scatter beyond it."""
+    """Add bias and excess scatter of fits to simulated recordings to a covariance (n, n)."""
     steps = np.array(
         [
             fitter.step_of(other, seen, left, fit)
@@ -62,9 +62,9 @@ def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
 
 
 def with_unshown_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:
-    """A covariance (n, n) with what the turns that are not shown of a mounting that turns, beside the fit, make of it.
+    """Add the uncertainty from unobservable rotations of a moving mounting to a covariance (n, n).
 
-    A mounting that turned by 4 degrees in pitch takes yaw and arm along by a few tenths of a degree and centimetres.
+    A mounting rotated by 4 degrees in pitch shifts yaw by a few tenths of a degree and the arm by centimetres.
     """
     if not any(isinstance(effect, MountingEffect) for effect in fit.effects):
         return covariance

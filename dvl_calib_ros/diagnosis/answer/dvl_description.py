@@ -1,7 +1,7 @@
-"""The DVL as the diagnosis knows it, for another simulator to be told: mounting, rate, noise, and what each error is.
+"""Description of the DVL for another simulator: mounting, rate, noise and size of each error.
 
-Sizes are in m/s, so that what a simulator cannot be given can be weighed: an error is taken out of the composed model,
-all others left in, and what the DVL's velocity changes by is its size.
+Sizes are in m/s, so that errors that a simulator lacks can be weighed. The size of an error is the change of the DVL's
+velocity when that error alone is removed from the composed model.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from ..search.effect_selection import EffectSelection
 from .simulated_twin import simulated, with_quiet_reference
 
 Three = tuple[float, float, float]
-# Values of an effect: what was known of it before, to which is added what was found
+# Parameters of effects that the calibration may already correct; the estimate is added
 _KNOWN_BEFORE = {
     "lever_arm": ("x_m", "y_m", "z_m"),
     "dvl_time_offset": ("seconds",),
@@ -34,11 +34,10 @@ _KNOWN_BEFORE = {
 class DvlSeen:
     """A DVL on its vehicle, over all recordings.
 
-    mounting_rpy: (3,) rad, nominal, and lever_arm: (3,) m, both as given, without what was found. time_offset: s, and
-    clock_drift: s per s, that were taken off its stamps before. rate_hz: samples per second. noise_std: (3,) m/s, of
-    its axes, from sample to sample: what the motion does not explain, at most. speed: (3,) m/s, RMS along its axes.
-    sizes: RMS, m/s, of the vector by which each error changes what it measures: `misalignment`, `scale`, effects, and
-    what repeated samples miss.
+    mounting_rpy: (3,) rad, nominal, and lever_arm: (3,) m, both as configured, without the estimate. time_offset: s,
+    and clock_drift: s per s, configured corrections of its stamps. rate_hz: samples per second. noise_std: (3,) m/s,
+    per axis, from sample to sample, upper bound. speed: (3,) m/s, RMS along its axes. sizes: RMS, m/s, of the velocity
+    change by each error: `misalignment`, `scale`, effects, and repeated samples.
     """
 
     mounting_rpy: Three
@@ -51,12 +50,12 @@ class DvlSeen:
     sizes: Mapping[str, float]
 
 
-# Of finding stale_samples: how much the velocity has changed since the sample that is repeated
+# Size of the finding stale_samples: change of the velocity since the repeated sample
 STALE = "stale_samples"
 
 
 def dvl_seen(selection: EffectSelection, parameters: Parameters) -> DvlSeen:
-    """The DVL of what was selected; parameters: those with which the recordings were read."""
+    """Describe the DVL of a selection; parameters: those with which the recordings were read."""
     problem = replace(selection.fitter.problem, lever_arm=np.zeros(3))
     hypothesis = _whole(selection, parameters)
     measured = _measured(problem, hypothesis)
@@ -86,7 +85,7 @@ def dvl_seen(selection: EffectSelection, parameters: Parameters) -> DvlSeen:
 
 
 def _whole(selection: EffectSelection, parameters: Parameters) -> Hypothesis:
-    """The hypothesis with what the parameters compensated before it was fitted."""
+    """Return the hypothesis plus the corrections that the parameters had made before the fit."""
     hypothesis = selection.fit.hypothesis
     n = len(selection.fitter.problem.recordings)
     before = {
@@ -106,7 +105,7 @@ def _whole(selection: EffectSelection, parameters: Parameters) -> Hypothesis:
 
 
 def _measured(problem: Problem, hypothesis: Hypothesis) -> Array:
-    """(N, 3) m/s, DVL frame, without noise, of all recordings."""
+    """Simulate the DVL velocity (N, 3) m/s, DVL frame, without noise, of all recordings."""
     return np.concatenate([simulated(problem, hypothesis, index) for index in range(len(problem.recordings))])
 
 
@@ -115,10 +114,10 @@ def _rms(difference: Array) -> float:
 
 
 def _noise(recordings: Sequence[RecordedStreams], selection: EffectSelection) -> Array:
-    """(3,) m/s: the lesser of what neighbours do not tell of the DVL's own samples, and of their residual.
+    """Return the noise (3,) m/s: the lesser roughness of the DVL's samples and of their residual.
 
-    The first holds motion that is too quick for the DVL's rate (of a slow one no more is believed than it claims), the
-    second what is left of the reference's noise.
+    The former includes motion too fast for the DVL's rate, bounded by the reported noise if slow. The latter includes
+    noise of the reference.
     """
     problem = with_quiet_reference(selection.fitter.problem)
     variances = []

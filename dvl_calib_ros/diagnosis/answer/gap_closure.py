@@ -1,4 +1,4 @@
-"""How large the error is and how much of it goes away, on data that the parameters have not seen."""
+"""Gap and closure: size of the error and share that the effects explain, on held-out data."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
 
 RESAMPLES = 1000
-# Noise at high frequencies that is larger than what the messages claim by more than this is not taken for noise
+# High-frequency variation above this multiple of the reported noise is error, not noise
 WORSE_THAN_CLAIMED = 3.0
 Integers = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Vector RMS, m/s, per sample, on held-out data. before, after: errors as they are, noise included.
+    """Vector RMS, m/s, per sample, on held-out data. before, after: errors without and with effects, noise included.
 
-    noise_floor: what the instruments and the high frequencies show. closure: of what is beyond that, nan where there
-    is none; interval: its 95 per cent. not_explained: what of `after` is not noise. reported: noise that the messages
-    claim, None where they do not. by_recording: before and after of each of several. left_open: what of
-    `not_explained` is in stretches that alone tell a part of the effects, and no more than was to be expected there.
-    shown_from: the lower end of `interval` but for that.
+    noise_floor: from the residual and high frequencies. closure: explained share of the energy above it, nan without a
+    gap; interval: its 95 per cent. not_explained: part of `after` above the noise. reported: noise reported by the
+    messages, None if missing. by_recording: before and after per recording, if several. left_open: predicted part of
+    `not_explained`, in stretches that alone determine parts of the effects. shown_from: lower end of `interval` without
+    left_open.
     """
 
     before: float
@@ -46,26 +46,25 @@ class Gap:
 
     @property
     def shown(self) -> float:
-        """Closure, but for what is left open."""
+        """Return the closure with the part left open counted as closed."""
         return float(self.closure + (self.not_explained**2 - self.not_expected**2) / max(self.beyond_noise**2, 1e-300))
 
     @property
     def not_expected(self) -> float:
-        """m/s, of what is not explained, beyond what is left open."""
+        """Return the unexplained error beyond the part left open, m/s."""
         return float(np.sqrt(max(0.0, self.not_explained**2 - self.left_open**2)))
 
     @property
     def beyond_noise(self) -> float:
-        """m/s, of before."""
+        """Return the gap: `before` above the noise, m/s."""
         return float(np.sqrt(max(0.0, self.before**2 - self.noise_floor**2)))
 
 
 @dataclass(frozen=True)
 class HeldOutResiduals:
-    """before, after: errors (F, 3) m/s of calibrations without and with the effects that have not seen them.
-    floor: (F, 3) (m/s)², the square of the noise in both. block: (F,) index, for resampling. left_open: (F,)
-    (m/s)², square of what calibrations with the effects are to be off by there, as far as what they have seen tells.
-    """
+    """Held-out errors (F, 3) m/s without (`before`) and with effects (`after`). block: (F,) index, for resampling.
+    floor: (F, 3) (m/s)², noise variance of both. left_open: (F,) (m/s)², error variance with effects, predicted from
+    the parameters' covariance."""
 
     before: Array
     after: Array
@@ -74,11 +73,11 @@ class HeldOutResiduals:
     left_open: Array | float = 0.0
 
     def squares(self) -> tuple[Array, Array, Array]:
-        """Squares of before, after and floor summed over each block (B,), (m/s)²."""
+        """Return the squares of before, after and floor, summed per block (B,), (m/s)²."""
         return self._summed(self.before**2), self._summed(self.after**2), self._summed(self.floor)
 
     def open_of_blocks(self) -> Array:
-        """(B,) (m/s)², sums of what is left open, of each block no more than it has beyond the noise."""
+        """Return sums of left_open per block (B,), (m/s)², bounded by the block's excess over the noise."""
         _, after, floor = self.squares()
         left_open = np.bincount(self.block, np.broadcast_to(self.left_open, len(self.block)))
         return np.asarray(np.minimum(left_open, np.maximum(after - floor, 0.0)))
@@ -88,10 +87,10 @@ class HeldOutResiduals:
 
 
 def held_out(selection: EffectSelection) -> HeldOutResiduals:
-    """What is left before and after the effects of a selection, on held-out data.
+    """Return the errors before and after the effects of a selection on held-out data.
 
-    Of one recording stretches of time in turn are held out; of several whole ones, with what belongs to the day
-    (`Effect.of_the_day`) fitted to them. Everything is fitted anew in the composed model.
+    One recording is split into alternating stretches. Of several, each is held out, and parameters per recording
+    (`Effect.of_the_day`) are fitted to it. All parameters are re-estimated in the composed model.
     """
     fitter, fit = selection.fitter, selection.fit
     problem = fitter.problem
@@ -118,8 +117,8 @@ def held_out(selection: EffectSelection) -> HeldOutResiduals:
 
 
 def _left_open(fit: Fit) -> Array:
-    """(M,) (m/s)², square of what a fit is to be off by in each bin; of several recordings but for what is the day's,
-    which is fitted to what is held out."""
+    """Return the predicted error variance (M,), (m/s)², of a fit per bin. Parameters per recording do not contribute:
+    they are fitted to the held-out recording."""
     of_day = [each.effect.of_the_day and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
     own = np.flatnonzero(~np.array([False] * 6 + of_day))
     columns, covariance = fit.columns[:, :, own], fit.system.covariance()[np.ix_(own, own)]
@@ -127,7 +126,7 @@ def _left_open(fit: Fit) -> Array:
 
 
 def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
-    """Fit to one recording with the vehicle as others tell it and the day as it tells itself."""
+    """Fit one recording's own parameters, with the vehicle's parameters from the others."""
     problem, noise = selection.fitter.problem, selection.fit.noise
     alone = only(problem, recording)
     of_it = problem.rows_of[recording]
@@ -138,13 +137,13 @@ def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, record
 
 
 def only(problem: Problem, recording: int) -> Problem:
-    """The problem of one of its recordings."""
+    """Return the problem of one recording."""
     made = Problem((problem.recordings[recording],), problem.rotation_dvl_from_body, problem.lever_arm, ())
     return replace(made, grids=(problem.grids[recording],), of_axes=problem.measured)
 
 
 def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
-    """Held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
+    """Return held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
     before, after, floor = residuals.squares()
     left_open, n = residuals.open_of_blocks(), len(residuals.before)
 
@@ -185,7 +184,7 @@ def _by_recording(problem: Problem, residuals: HeldOutResiduals) -> dict[str, tu
 
 
 def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
-    """Share of the gap that one effect closes without the others, as fitted to all data."""
+    """Return the share of the gap that one effect closes without the others, fitted to all data."""
     fitter, fit = selection.fitter, selection.fit
     chosen = [effect for effect in fit.effects if effect.name == name]
     if len(fit.effects) == 1 or not np.isfinite(gap.closure):
@@ -201,11 +200,11 @@ def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
 
 
 def noise_floor(selection: EffectSelection) -> Array:
-    """(F, 3) (m/s)²: the noise of each sample.
+    """Return the noise variance (F, 3), (m/s)², of each sample.
 
-    Where what the fit leaves is as small as the high frequencies say that the noise is, it is what is left, sample by
-    sample: so it shares the noise of before and after, and their differences are exact to the size of the gap rather
-    than of the noise. Where more is left, that is slow, and no noise: then the level of the high frequencies is.
+    If the residual is as small as the high-frequency noise, it is the noise, per sample: before and after share it, and
+    their difference has the precision of the gap rather than of the noise. A larger residual is slow and no noise; then
+    the high-frequency variance is used.
     """
     problem, fit = selection.fitter.problem, selection.fit
     left = problem.errors(fit.seen)
@@ -227,8 +226,8 @@ def noise_floor(selection: EffectSelection) -> Array:
 
 
 def _made_slow(problem: Problem, fit: Fit) -> list[Array]:
-    """(3,) (m/s)² per recording: variance of the velocities' own noise, as made-up noise shows it, that a lag of the
-    fit has made slow, and high frequencies so do not show."""
+    """Return velocity noise variance (3,), (m/s)², per recording that a lag makes slow, from simulated noise. High
+    frequencies do not contain it."""
     slow: list[Array] = [np.zeros(3)] * len(problem.recordings)
     if not fit.hypothesis.lags(0):
         return slow
@@ -244,10 +243,9 @@ def _made_slow(problem: Problem, fit: Fit) -> list[Array]:
 
 
 def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:
-    """Variance (3,) that values (F, 3) show from sample to sample, and its relative standard error.
+    """Return the variance (3,) of values (F, 3) from sample to sample, and its relative standard error.
 
-    Of second differences: of white noise 6 times its variance, of what is slow next to nothing. Those that are far out
-    (outliers) are left out, like as many of white noise.
+    From second differences: 6 times the variance of white noise, almost zero for slow variation.
     """
     interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
@@ -259,7 +257,7 @@ def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:
 
 
 def claimed_std(problem: Problem) -> list[Array] | None:
-    """(3,) m/s per recording, that the messages claim of the difference per axis, None where one does not."""
+    """Return the reported standard deviation (3,) m/s of the difference per recording, None if any is missing."""
     found = []
     for recording in problem.recordings:
         if recording.dvl_std is None or recording.reference_std is None:

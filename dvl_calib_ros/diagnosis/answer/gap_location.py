@@ -1,4 +1,4 @@
-"""Where the gap lies: axis, regime of motion, stretch of time, band of frequency."""
+"""Location of the gap: axis, motion regime, stretch of time and frequency band."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class GapPlace:
-    """share: of the gap's energy in m²/s² that lies here. p: adjusted (Holm) over all places looked at."""
+    """Place of the gap. share: of its energy in m²/s². p: adjusted (Holm) over all places tested."""
 
     axis: str
     regime: str
@@ -41,9 +41,7 @@ class GapPlace:
 
 
 def regimes(problem: Problem, seen: Sequence[Seen], per_sample: bool = False) -> dict[str, Mask]:
-    """(M,) bool each, or of every sample (F,): where the vehicle goes straight, turns, changes speed, is slow or fast
-    (terciles).
-    """
+    """Return (M,) bool each, or (F,) per sample: straight, turning, accelerating, slow or fast (terciles)."""
 
     def of(function: Callable[[EffectInput], Array]) -> Array:
         if per_sample:
@@ -63,9 +61,9 @@ def regimes(problem: Problem, seen: Sequence[Seen], per_sample: bool = False) ->
 
 
 def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[GapPlace]:
-    """Places where the residual of the calibration alone is more than noise, those with most of the gap first.
+    """Return places where the calibrated residual exceeds the noise, by decreasing share of the gap.
 
-    columns: (M, A, p) that make up the gap: traces of the effects, or the dictionary where no effect explains it.
+    columns: (M, A, p) that explain the gap: traces of the effects, or the dictionary if no effect does.
     """
     problem, noise = fitter.problem, fit.noise
     gap = _signal(base, fit, columns)
@@ -106,7 +104,7 @@ def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[GapPlace
 
 
 def _signal(base: Fit, fit: Fit, columns: Array) -> Array:
-    """(M, A): the gap, as far as it is known: what the columns say beyond the calibration."""
+    """Return the estimated gap (M, A): the contribution of the columns beyond the calibration."""
     noise = fit.noise
     size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
     raw = np.concatenate([base.columns, columns / size], axis=2)
@@ -116,7 +114,7 @@ def _signal(base: Fit, fit: Fit, columns: Array) -> Array:
 
 
 def _simplest(problem: Problem, seen: Sequence[Seen]) -> Array:
-    """(M, c): one, speed, and turn rate where it is known."""
+    """Return (M, c): one, speed, and turn rate if available."""
     speed = problem.sampled(seen, lambda motion: motion.speed)
     functions = [np.ones_like(speed), speed]
     if EffectNeeds.ANGULAR_VELOCITY in problem.available:
@@ -125,7 +123,7 @@ def _simplest(problem: Problem, seen: Sequence[Seen]) -> Array:
 
 
 def _log_p(noise: Noise, functions: Array, q: Array, white: Array, axis: int, mask: Mask) -> float:
-    """log p of what functions of motion (M, c), within a place, explain of the whitened residual."""
+    """Return log p of functions of motion (M, c), restricted to a place, for the whitened residual."""
     columns = np.zeros((*noise.level.shape, functions.shape[1]))
     columns[mask, axis] = functions[mask]
     return explained(q, noise.whiten(columns), white, 1.0)[0]

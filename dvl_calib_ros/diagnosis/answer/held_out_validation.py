@@ -1,4 +1,4 @@
-"""Whether what was found stands: on data it was not fitted to, and against an unknown cause in its place."""
+"""Validation of selected effects, on held-out data and against an unknown cause."""
 
 from __future__ import annotations
 
@@ -20,21 +20,20 @@ from ..search.unexplained import (
 )
 from .gap_closure import Gap
 
-# Of what effects explain, the shares that an unknown cause must explain to be asked whether it predicts better: at
-# first sight, beyond its price, and beyond what made-up recordings show to be chance; and what curves between samples
-# leave
+# Shares of the effects' deviance from which an unknown cause is tested for better prediction: unadjusted, and adjusted
+# by simulated recordings; share that inexact interpolation leaves
 TOLD_FROM, AS_MUCH, OF_INEXACT = 0.5, 0.8, 0.02
-# Deviance by which a bound on another may be off as numbers are rounded
+# Tolerance for rounding in a bound on deviance
 ROUNDING = 1e-3
 
 
 def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection, Unexplained]:
-    """A selection without what an unknown cause explains better or may be a part of, and what it then leaves.
+    """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
 
-    Of effects that nobody would see without a test: a step in a bias looks like a drift, but for what that leaves.
-    Better is what explains more for its price, or predicts stretches of the run that neither was fitted to: several
-    effects together have shapes enough for a stall in turns, where they are fitted. A group of functions of which the
-    effects are some is their cause and more: it is better by what more explains alone.
+    Only effects below `SETTINGS.instead_of` are tested: a step in a bias resembles a drift except for its residual.
+    Better means more deviance for its price, or better prediction of held-out stretches: several effects jointly can
+    fit a stall in turns. A group of functions that contains the effects includes their cause, so only the former
+    criterion counts.
     """
     fitter, fit = selection.fitter, selection.fit
     rest = unexplained(fitter, fit)
@@ -61,9 +60,9 @@ def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection,
 
 
 def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectSelection, Unexplained]:
-    """A selection without effects that are not sure with what the rest follows fitted beside them, and what it leaves.
+    """Reject effects that are insignificant with the residual's regressor as nuisance.
 
-    Which part of them is the unknown cause's nobody knows: a current and two drifts in the place of a step in a bias.
+    The unknown cause's part in them is undetermined: a current and two drifts may replace a step in a bias.
     """
     fitter, block = selection.fitter, blocks_of(selection.fitter.problem)
     while selection.selected and matters(fitter.problem, selection.fit, rest):
@@ -82,8 +81,7 @@ def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectS
 
 
 def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
-    """By how much better, in deviance, an unknown cause beside a reduced fit predicts stretches that it was not fitted
-    to than the fit does."""
+    """Return the held-out deviance gain of an unmodelled regressor over the removed effects."""
     whole, rest = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
     rest = rest.and_rest(other.clearest, reduced.residual)
     effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
@@ -98,7 +96,7 @@ def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
 def confirmed(selection: EffectSelection, rest: Unexplained, gap: Gap) -> tuple[EffectSelection, Unexplained]:
     """Return a selection and its residual's cause, or without any effect if the selection may enlarge the error.
 
-    What one stretch alone tells, as a leap by one turn, is kept if no unknown cause explains the data instead.
+    An effect that one stretch alone determines, as a clock jump by one turn, is kept if no unknown cause replaces it.
     """
     if not selection.selected or gap.interval[0] > 0.0:
         return selection, rest

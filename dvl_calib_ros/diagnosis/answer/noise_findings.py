@@ -1,6 +1,4 @@
-"""What the noise is like, beside the verdict: outliers, repeats, larger than reported, coloured; and whether it follows
-what messages claim of their own noise, where that differs from sample to sample.
-"""
+"""Findings on the noise: outliers, repeats, inflation, colour, and dependence on reported covariances."""
 
 from __future__ import annotations
 
@@ -23,13 +21,13 @@ from .gap_closure import claimed_std, high_frequency_variance
 
 LEVEL = 0.01
 OUTLIER_SIGMA = 6.0
-# Repeats that chance and a coarse resolution may bring
+# Rate of repeats under the null hypothesis, with a coarse resolution
 CHANCE_OF_REPEAT = 1e-3
-# A floor this much above the reported one is worth telling
+# Least ratio of actual to reported noise that is reported
 INFLATION = 1.2
-# Recordings with white noise that tell what colour comparing gives it
+# Simulated recordings with white noise, for the colour from interpolation
 MADE_UP = 5
-# An exponent below this is of a claim that does not hold; the other stream's noise lowers that of an honest one, too
+# Exponent below which reported covariances are invalid; the other stream's noise lowers it even if they are valid
 HALF = 0.5
 
 
@@ -43,7 +41,7 @@ class NoiseFinding:
 
 
 def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
-    """Findings that are significant, the clearest first; p is Holm's over all."""
+    """Return significant findings, the most significant first; p is Holm's over all."""
     problem = fitter.problem
     raw = fit.residual + fitter.outliers
     innovations = fit.noise.whiten(raw).reshape(raw.shape)
@@ -88,7 +86,7 @@ def _stale(problem: Problem) -> NoiseFinding | None:
 
 
 def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
-    """Whether the noise has a memory, beyond that which streams of white noise get where they are compared."""
+    """Test whether the noise is coloured beyond the colour that interpolation gives to white noise."""
     noise, residual = fit.noise, fit.residual
     if all(not len(arma.ar) for arma in noise.axes):
         return None
@@ -98,7 +96,7 @@ def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
     interval = problem.interval
     constant = _time_constant(clearest, interval)
     if constant < 2.0 * interval:
-        return None  # neighbours share samples of the reference by interpolation
+        return None  # interpolated neighbours share samples
     if float(chi2_sf(drop, dof)) < LEVEL:
         drop = min(drop, _made_by_comparing(problem, fit).deviance(residual) - noise.deviance(residual))
     spread = constant * 2.0 / np.sqrt(max(1.0, sum(r.seconds for r in problem.recordings) / max(constant, interval)))
@@ -107,10 +105,10 @@ def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
 
 
 def _made_by_comparing(problem: Problem, fit: Fit) -> Noise:
-    """The noise with the colour that comparing gives to white noise.
+    """Return the noise with the colour that interpolation gives to white noise.
 
-    A stream that is `quiet` between its samples has only the low frequencies of its noise left, which are as slow as
-    the vehicle's motion.
+    A stream that is `quiet` between its samples retains only low frequencies of its noise, as slow as the vehicle's
+    motion.
     """
     noise, white = fit.noise, replace(fit, noise=fit.noise.white)
     residuals = [residual for _, _, residual in simulated_recordings(problem, white, MADE_UP)]
@@ -164,9 +162,9 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
 
 
 def _reported_covariance(problem: Problem, fit: Fit, even: Array) -> NoiseFinding | None:
-    """How the noise even (M, A), with its level left in, follows covariances that differ: 1 as claimed, 0 not at all.
+    """Test the dependence of noise (M, A), level included, on reported covariances: exponent 1 if valid, 0 if none.
 
-    p: of not following at all, or, of less than half, of following. None where claims are all alike.
+    p: of no dependence, or, for an exponent below half, of a valid one. Return None if reported values are all equal.
     """
     found = fit_claims(problem, fit.seen, even, fit.noise.rotation)
     if found is None:

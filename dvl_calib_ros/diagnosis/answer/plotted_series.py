@@ -24,10 +24,10 @@ BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
 
 @dataclass(frozen=True)
 class HeldOutTwin:
-    """What the DVL of a recording measured, less what a simulated one does whose parameters had not seen it.
+    """Recorded minus simulated DVL velocity of a recording, with parameters fitted to other data.
 
-    These are the errors that the gap is made of, on the same samples: between those of a slow reference there is none
-    of its noise, and an error without it would be of another size than the noise that is told beside it.
+    These are the gap's errors on the same samples. A slow reference's noise is unknown between its samples, so an error
+    elsewhere would not match the stated noise.
 
     Parameters
     ----------
@@ -40,10 +40,9 @@ class HeldOutTwin:
     without, with_effects
         (N, 3) m/s, ahead, to port and up; zero on an axis that is not measured.
     noise
-        (3,) m/s, rms of what of it is noise.
+        (3,) m/s, RMS of the noise in it.
     regimes
         Name -> (N,) bool.
-
     """
 
     name: str
@@ -56,11 +55,11 @@ class HeldOutTwin:
 
     @property
     def level(self) -> float:
-        """Length of `noise`, m/s."""
+        """Return the length of `noise`, m/s."""
         return float(np.sqrt((self.noise**2).sum()))
 
     def errors(self, has_effects: bool) -> dict[str, Array]:
-        """Recorded less twin (N, 3) m/s by what the twin has; of a diagnosis without effects there is one twin."""
+        """Return recorded minus twin (N, 3) m/s by the twin's content; a diagnosis without effects has one twin."""
         return {"without": self.without, "with": self.with_effects} if has_effects else {"twin": self.without}
 
 
@@ -69,10 +68,10 @@ class DiagnosisSeries:
     """F samples of all recordings, ahead, to port and up; zero on an axis that is not measured.
 
     recordings: names. recording_of: (F,) index into them. time: (F,) s since the recording's start. segments: stretches
-    without a gap. held_out: errors before and after the effects, and the noise. regimes: name -> (F,) bool.
-    traces: by effect (F, 3) m/s, as fitted, without what misalignment and scale take in. phi: (3,) rad and scale: (3,),
-    the calibration beside the effects, DVL frame; calibration_std: (6,) of both. rest: what is left after them.
-    measured: (3,) axes that the reference measures. followed: what is left beside what it follows most.
+    without a gap. held_out: errors before and after the effects, and the noise. regimes: name -> (F,) bool. traces: by
+    effect (F, 3) m/s, as fitted, without the part that misalignment and scale absorb. phi: (3,) rad and scale: (3,),
+    calibration, DVL frame; calibration_std: (6,) of both. rest: tests of the residual. measured: (3,) axes that the
+    reference measures. followed: residual against its regressor.
     """
 
     recordings: tuple[str, ...]
@@ -91,12 +90,12 @@ class DiagnosisSeries:
 
     @property
     def axes(self) -> dict[str, str]:
-        """Axes that the reference measures, with what they are called."""
+        """Return the measured axes and their names."""
         return {axis: BODY_AXES[axis] for axis, measured in zip("xyz", self.measured, strict=True) if measured}
 
     @property
     def twins(self) -> tuple[HeldOutTwin, ...]:
-        """Recorded against simulated, by recording."""
+        """Return recorded against simulated velocities, by recording."""
         return tuple(self._twin(index) for index in range(len(self.recordings)) if (self.recording_of == index).any())
 
     def _twin(self, index: int) -> HeldOutTwin:
@@ -115,14 +114,14 @@ class DiagnosisSeries:
 def collect_series(
     selection: EffectSelection, residuals: HeldOutResiduals, rest: Unexplained, covariance: Array
 ) -> DiagnosisSeries:
-    """The series of what was selected and of what it leaves. covariance: (6 + p, 6 + p) of the fit."""
+    """Collect the series of a selection and its residual. covariance: (6 + p, 6 + p) of the fit."""
     fitter, fit = selection.fitter, selection.fit
     problem, n = fitter.problem, len(fit.seen)
     errors = problem.errors(fit.seen)
     traces = {}
     for effect in fit.effects:
         others = [other for other in fit.effects if other is not effect]
-        # the calibration takes in what it can of the trace, so it is fitted anew without the effect
+        # the calibration absorbs part of the trace, so it is re-estimated without the effect
         without = fitter.fit_kept(fit.hypothesis.with_effects(others, n, {}), fit.noise)
         traces[effect.name] = problem.errors(without.seen) - errors
     recording_of = problem.recording_of[problem.bin_of]
@@ -144,16 +143,15 @@ def collect_series(
     )
 
 
-# Groups of equally many samples in which the mean is told
+# Number of groups of equally many samples for which a mean is plotted
 GROUPS = 15
 MIN_GROUP = 4
 
 
 @dataclass(frozen=True)
 class Followed:
-    """label: what is left follows, with its unit. axis: x, y or z, that follows it most. at: (M,) values of it.
-    left: (M,) m/s, what the fit leaves along the axis.
-    """
+    """Residual against a regressor. label: of the regressor, with unit. axis: x, y or z, of the strongest dependence.
+    at: (M,) regressor. left: (M,) m/s, residual along the axis."""
 
     label: str
     axis: str
@@ -161,7 +159,7 @@ class Followed:
     left: Array
 
     def groups(self) -> tuple[Array, Array, Array, Array]:
-        """(G,) means of what it follows; mean, standard deviation, and that of the mean (m/s), of what is left."""
+        """Return group means (G,) of the regressor; mean, standard deviation and standard error (m/s) of residuals."""
         count = max(1, min(GROUPS, len(self.at) // MIN_GROUP))
         parts = np.array_split(np.argsort(self.at, kind="stable"), count)
         at = np.array([self.at[part].mean() for part in parts])
@@ -171,9 +169,9 @@ class Followed:
 
 
 def what_it_follows(problem: Problem, fit: Fit, about: str | float) -> Followed | None:
-    """What a fit leaves beside the regressor it follows most, of those that a name stands for; None if there is none.
+    """Return the residual against its strongest regressor among those of a name. Return None if there is none.
 
-    That axis and that regressor of which groups' means scatter most, against chance.
+    Strongest: axis and regressor whose group means scatter most relative to their standard errors.
     """
     best: tuple[float, Followed] | None = None
     names = [name for name, measured in zip("xyz", problem.measured, strict=True) if measured]
@@ -188,7 +186,7 @@ def what_it_follows(problem: Problem, fit: Fit, about: str | float) -> Followed 
 
 
 def _regressors(problem: Problem, fit: Fit, about: str | float) -> Mapping[str, Array]:
-    """Label -> (M,) values, of what a name in `dictionary`, or a period in s, stands for."""
+    """Return regressors (M,) by label, of a name in `dictionary` or a period in s."""
     if isinstance(about, float):
         return {f"time within a period of {about:.0f} s, s": np.mod(problem.time, about)}
     parts = [_of_motion(each.motion, about) for each in fit.seen]
@@ -212,7 +210,7 @@ def _of_motion(motion: EffectInput, about: str) -> dict[str, Array]:
         return {"yaw, ° from east to north": np.degrees(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))}
     if rotation is not None and about == "tilt":
         pitch = np.degrees(-np.arcsin(np.clip(rotation[:, 2, 0], -1.0, 1.0)))
-        up = np.sign(rotation[:, 2, 2].mean())  # of a body that is z down -1
+        up = np.sign(rotation[:, 2, 2].mean())  # -1 for a z-down body
         roll = np.degrees(np.arctan2(up * rotation[:, 2, 1], up * rotation[:, 2, 2]))
         return {"pitch, ° (bow down)": pitch, "roll, °": roll}
     if rotation is not None and about == "depth":

@@ -1,4 +1,4 @@
-"""What a diagnosis says, as data, and as the JSON of `diagnose --json`."""
+"""Result of a diagnosis, and the JSON of `diagnose --json`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .simulated_twin import Twin
 
 
 class DiagnosisVerdict(str, Enum):
-    """The answer in a word."""
+    """Verdict of a diagnosis."""
 
     NO_GAP = "no_gap"
     KNOWN = "known"
@@ -31,10 +31,10 @@ class DiagnosisVerdict(str, Enum):
 
 @dataclass(frozen=True)
 class FoundEffect:
-    """An effect that was found. equivalent_to: others that this data cannot tell from it. parameters: value, low, high
-    (95 per cent) by name; of the day's, in several recordings, their weighted mean, and by_recording the values of
-    each. closure: of the gap by this effect alone. p: adjusted over the library. combination: of a clock that a lever
-    arm could stand in for, what is known of both.
+    """Effect in the result. equivalent_to: effects that explain the data equally well. closure: of the gap, alone.
+
+    parameters: value, low, high (95 per cent) by name; of parameters per recording the weighted mean, and by_recording
+    each one's. p: adjusted over the library. combination: observable combination of an ambiguous lever arm and clock.
     """
 
     name: str
@@ -48,11 +48,10 @@ class FoundEffect:
 
 @dataclass(frozen=True, repr=False)
 class Diagnosis(Answering):
-    """The whole answer. reasons: the verdict first. notes: on the data. series: for pictures, if they were asked for
-    and there are any. calibration: value, low, high of φ (rad) and δk, three of each, beside the effects.
-    compared_axes: in words. recordings: names and first stamps (ns). twins: of the recordings. dvl: as another
-    simulator has to be told of it. selection: the fits behind it, None where nothing could be fitted.
-    """
+    """Result of a diagnosis. reasons: the verdict first. notes: on the data. series: for pictures, if requested.
+    calibration: value, low, high of φ (rad) and δk, three of each. compared_axes: in words. recordings: names and first
+    stamps (ns). twins: of the recordings. dvl: description for another simulator. selection: the fits, None without
+    one."""
 
     verdict: DiagnosisVerdict
     reasons: tuple[Reason, ...]
@@ -74,17 +73,17 @@ class Diagnosis(Answering):
 
     @property
     def sentence(self) -> str:
-        """The verdict in words."""
+        """Return the verdict in words."""
         return " ".join(reason.full_sentence for reason in self.reasons)
 
     @property
     def next_manoeuvre(self) -> str:
-        """What to record next, in words."""
+        """Return the next recording's manoeuvre in words."""
         return "; ".join(each.sentence for each in self.next_steps)
 
 
 def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
-    """The JSON of diagnosis.md."""
+    """Return the JSON document of diagnosis.md."""
     gap = diagnosis.gap
     return {
         "verdict": diagnosis.verdict.value,

@@ -1,4 +1,4 @@
-"""Simulated twins of recordings, without and with what was found, and their bags."""
+"""Simulated twins of recordings, without and with the effects, and their bags."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ from ..model.hypothesis import Hypothesis
 from ..model.recorded_streams import RecordedStreams
 from ..search.effect_selection import EffectSelection
 
-# Passes in which the true time of a late stamp is found, and the motion of which a reference makes what it says
+# Fixed-point iterations for the true time of a delayed stamp, and for the true motion from the reference's
 _PASSES = 3
 
 
 @dataclass(frozen=True)
 class Twin:
-    """One recording and its twins. recording: its streams. time: (N,) s by the DVL's stamps, since its first. recorded,
-    without, with_effects: (N, 3) m/s, DVL frame; without: the calibration alone.
-    """
+    """One recording and its twins. time: (N,) s by the DVL's stamps, since its first. recorded, without, with_effects:
+    (N, 3) m/s, DVL frame; without: the calibration alone."""
 
     recording: RecordedStreams
     time: Array
@@ -36,7 +35,7 @@ class Twin:
 
 
 def twins(selection: EffectSelection) -> tuple[Twin, ...]:
-    """Of every recording, on its own motion, at its DVL's stamps; without noise."""
+    """Simulate every recording without noise, on its own motion, at its DVL's stamps."""
     problem = selection.fitter.problem
     found = []
     for index, recording in enumerate(problem.recordings):
@@ -47,13 +46,13 @@ def twins(selection: EffectSelection) -> tuple[Twin, ...]:
 
 
 def with_quiet_reference(problem: Problem) -> Problem:
-    """The problem with the noise of every reference taken off where there is no motion in it."""
+    """Remove the noise of every reference at frequencies without motion."""
     quiet = tuple(replace(one, reference=one.reference.quiet) for one in problem.recordings)
     return replace(problem, recordings=quiet)
 
 
 def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
-    """(N, 3) m/s: the composed model forwards, from the reference's motion to what the DVL measures."""
+    """Simulate the DVL velocity (N, 3) m/s from the reference's motion by the composed model."""
     recording, injections = problem.recordings[index], hypothesis.injections(index)
     time = recording.dvl.time
     for _ in range(_PASSES):
@@ -67,7 +66,7 @@ def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     rates = recording.angular_velocity(oriented) if has_rates else None
     nominal = problem.rotation_dvl_from_body
     motion = EffectInput(time, velocity, nominal, rotation, rates, recording.frame, 0.0)
-    for _ in range(_PASSES):  # the trace is that of the true motion, which is what is looked for
+    for _ in range(_PASSES):  # the trace depends on the true motion
         motion = replace(motion, velocity_body=velocity + traces(injections, motion, ActsOn.REFERENCE))
     moved = at_dvl(injections, motion)
     if rates is not None:
@@ -78,14 +77,14 @@ def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
 
 
 def twin_paths(folder: Path, name: str) -> tuple[Path, Path]:
-    """Where the twins of a recording go, without and with what was found."""
+    """Return the paths of a recording's twins, without and with the effects."""
     return folder / f"{name}_without", folder / f"{name}_with"
 
 
 def write_twins(folder: Path, twin: Twin) -> None:
     """Write NAME_without and NAME_with: DVL simulated without noise, reference and IMU as recorded. Raises InputError.
 
-    Stamps are the recording's, less what the parameters know of its clocks.
+    Stamps are the recording's, corrected by the clock parameters.
     """
     for path, velocity in zip(twin_paths(folder, twin.recording.name), (twin.without, twin.with_effects), strict=True):
         with BagWriter(path, Storage.MCAP, Compression.NONE) as bag:

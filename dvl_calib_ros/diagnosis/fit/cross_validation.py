@@ -1,4 +1,4 @@
-"""Stretches of time, or whole recordings, that are held out in turn, and what is fitted to all the others."""
+"""Cross-validation over stretches of time or whole recordings."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from .gauss_newton import Fit, Fitter
 from .selection_criteria import NuisanceFit
 
 Integers = NDArray[np.intp]
-# Columns, and the residual (M, A) m/s that they are fitted to
+# Columns, and the residual (M, A) m/s to which they are fitted
 Predictor = tuple[NuisanceFit, Array]
-# Steps of a fit that starts from that to all of the data
+# Steps of a fit that starts from the fit to all data
 FOLD_STEPS = 6
-# Time constant, s, of the slowest noise that an effect is compared with: GNSS multipath lasts minutes
+# Time constant, s, of the slowest noise as an alternative to an effect: GNSS multipath lasts minutes
 SLOWEST_S = 100.0
 
 
@@ -33,9 +33,9 @@ def fitted_without(
     fold_of: Integers,
     fixed: frozenset[str] = frozenset(),
 ) -> Iterator[tuple[int, list[Fit]]]:
-    """Every fold of bins (M,), and fits of hypotheses to all the others.
+    """Yield every fold of bins (M,), and fits of hypotheses to the other folds.
 
-    Models that are linear need no further fit: `calibration.filters.cross_validation` leaves out what a fold told.
+    Linear models need no further fit: `calibration.filters.cross_validation` downdates a fold.
     """
     for fold in np.unique(fold_of).tolist():
         train = fitter.without(fold_of == fold)
@@ -43,23 +43,22 @@ def fitted_without(
 
 
 def folds_of(problem: Problem) -> Integers:
-    """(M,) fold of each bin: whole recordings, of one recording stretches in turn."""
+    """Return (M,) fold of each bin: recordings, or alternating stretches of one recording."""
     if len(problem.recordings) > 1:
         return problem.recording_of
     return stretch_of(problem.time) % SETTINGS.folds
 
 
 def stretch_of(time: Array) -> Integers:
-    """Which of the stretches of time that are held out together times (M,) s are in; folds take them in turn."""
+    """Return the index of the hold-out stretch of times (M,) s; folds take them in turn."""
     return np.floor(time / SETTINGS.block).astype(np.intp)
 
 
 def surprise_elsewhere(problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array) -> float:
-    """How unlikely a residual (M, A) is, as deviance, on stretches of time that columns were not fitted to: of the same
-    data it is the lower, the better it is predicted.
+    """Return the held-out deviance of a residual (M, A), predicted from other stretches of time.
 
-    By how well the columns are known there: of the only dive of a run, held out, no other stretch tells what an effect
-    of the pitch does, and none claims to.
+    It accounts for the columns' uncertainty: if the only dive of a run is held out, no other stretch determines an
+    effect of the pitch, and the prediction is correspondingly uncertain.
     """
     folds = list(_held_out(problem, noise, fitted, residual))
     held, trained = folds[0]
@@ -70,7 +69,7 @@ def surprise_elsewhere(problem: Problem, noise: Noise, fitted: NuisanceFit, resi
 def _held_out(
     problem: Problem, noise: Noise, fitted: NuisanceFit, residual: Array
 ) -> Iterator[tuple[WhitenedLeastSquares, WhitenedLeastSquares]]:
-    """Of each fold, the least squares of the stretches held out, and of those that are fitted to."""
+    """Yield per fold the least squares systems of the held-out and of the training stretches."""
     white, series = noise.whiten(fitted.columns), noise.whiten(residual)
     rows = np.repeat(stretch_of(problem.time) % SETTINGS.folds, residual.shape[1])
     parts = [(white[rows == fold], series[rows == fold]) for fold in np.unique(rows)]
@@ -83,8 +82,8 @@ def _held_out(
 def predictive_gain(problem: Problem, noise: Noise, simpler: Predictor, richer: Predictor) -> float:
     """Return the held-out deviance gain of one set of columns over a simpler one, each under its own noise.
 
-    The noise is estimated anew with either, so that slow noise is one of the explanations compared; each takes the one
-    that predicts better. noise: its level and frame.
+    The noise is re-estimated with either, so that slow noise is an alternative explanation. Each takes the noise with
+    the better prediction. noise: its level and frame.
     """
     noise = replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
     colours = [_coloured_anew(noise, *each) for each in (simpler, richer)]
@@ -96,14 +95,14 @@ def predictive_gain(problem: Problem, noise: Noise, simpler: Predictor, richer: 
 
 
 def predictive_gain_of(problem: Problem, simpler: Fit, richer: Fit) -> float:
-    """Return the `predictive_gain` of a fit over a simpler one, without the instruments' noise that that smooths."""
+    """Return the `predictive_gain` of a fit over a simpler one, without the gain from smoothing instrument noise."""
     own, other = ((NuisanceFit.of_fit(problem, each), each.residual) for each in (simpler, richer))
     smoothed = float(simpler.own_noise @ simpler.own_noise - richer.own_noise @ richer.own_noise)
     return predictive_gain(problem, richer.noise, own, other) + max(-smoothed, 0.0)
 
 
 def _coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> Noise:
-    """Return the noise of what columns leave of a residual (M, A)."""
+    """Return the noise re-estimated from a residual (M, A) with fitted columns subtracted."""
     for _ in range(2):
         left = residual + fitted.columns @ fitted.step(noise, residual).solution()
         noise = noise.refitted(left, taken=noise.taken_by(fitted.columns, fitted.std))

@@ -1,4 +1,4 @@
-"""Fits of hypotheses in the composed model, by Gauss-Newton until they stand still."""
+"""Gauss-Newton fits of hypotheses in the composed model."""
 
 from __future__ import annotations
 
@@ -19,55 +19,53 @@ from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 
-# Gauss-Newton: at most so many steps; it stands still when none is longer than this share of its standard deviation
+# Largest number of steps; converged if each step is shorter than this share of its standard deviation
 MAX_STEPS, STANDS_STILL = 30, 0.01
-# or when one gains less than this in deviance, of which differences of 1 begin to count
+# or if it reduces the deviance by less than this; differences of 1 begin to matter
 GAINS_NOTHING = 1e-3
 HALVINGS = 5
-# Times by which the last step may make the misfit larger; one that goes further is not taken
+# The last step is rejected if it increases the misfit by this factor
 ASTRAY = 30.0
-# Squared cosine between steps from which on they are one series
+# Squared cosine between successive steps from which they are extrapolated
 ALIKE = 0.9
-# Standard deviations of what other noise explains by chance that are taken off
+# Standard deviations of the chance gain from other noise that are subtracted
 BY_CHANCE = 1.5
-# Prior of an effect's parameters, in their typical sizes: wide enough to do nothing but where the data says nothing
+# Prior σ of an effect's parameters, in typical sizes: wide, to act only on unobservable parameters
 PRIOR_IN_TYPICAL = 50.0
-# A fit is not made where it would come out worse by so much deviance, and by this share of what its first step gains
+# Bounds below which a fit is skipped as worse: deviance, plus a share of its first step's gain for nonlinearity
 SURELY, BENT = 2.0, 0.2
-# The first, times this, where what a fit nearby promises, and does not keep, is taken off
+# Multiple of the first if the gain of a converged fit's step is subtracted
 NEARBY = 2.0
-# A burst: bins beyond so many standard deviations of what is usually left, those about them that are beyond fewer, and
-# the share of a recording up to which all of them are taken for errors of an instrument
+# A burst: bins beyond BURST robust standard deviations with neighbours beyond ABOUT_BURST, of at most this share of the
+# recording; instrument errors, not an effect
 BURST, ABOUT_BURST, RARE = 6.0, 3.0, 0.02
-# Deviance by which a time at which something changes may be worse in 95 of 100 (Hansen, 2000, Econometrica 68, theorem
-# 2), and from which on, going on from it, no other as good is looked for: turns show a leap, straight legs do not
+# Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2), and deviance from
+# which its search stops: turns make a clock jump observable, straight legs do not, so there may be a second minimum
 OF_A_TIME, NO_TIME_BEYOND = -2.0 * float(np.log(1.0 - np.sqrt(0.95))), 40.0
-# Standard deviations from the middle to the ends of an interval of 95 per cent
+# Half width, in standard deviations, of a 95 per cent interval
 OF_INTERVAL = 1.96
 Mask = NDArray[np.bool_]
-# A hypothesis through the model, and its residual (M, A)
+# Evaluation of a hypothesis, and its residual (M, A)
 Evaluated = tuple[tuple[Seen, ...], Array]
 
 
 def around(value: float, std: float) -> tuple[float, float, float]:
-    """A value with its interval of 95 per cent."""
+    """Return a value with its 95 per cent interval."""
     return value, value - OF_INTERVAL * std, value + OF_INTERVAL * std
 
 
 def prior_std(hypothesis: Hypothesis) -> Array:
-    """(6 + p,) standard deviations of the prior of calibration and effects."""
+    """Return the prior's standard deviations of calibration and effects, (6 + p,)."""
     own = [PRIOR_IN_TYPICAL * each.spec.typical for each in hypothesis.parameters()]
     return np.array([SETTINGS.prior_angle] * 3 + [SETTINGS.prior_scale] * 3 + own)
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A hypothesis fitted. seen: per recording. residual: (M, A) m/s that is left, outliers drawn in. made: gives its
-    derivatives, `columns`. system: the last step's. own_noise: whitened, what made-up noise of the velocities
-    makes in it. deviance: whitened squares and prior, less those of that: a delay interpolates at another phase, a
-    low-pass takes noise off, which must not count for or against them. of_tails: by how much the squares of own_noise
-    are larger where that has heavier tails than what is made up.
-    """
+    """Fitted hypothesis. seen: per recording. residual: (M, A) m/s, winsorised. made: evaluates `columns`. system: of
+    the last step. own_noise: whitened residual from simulated noise of the velocities. deviance: whitened squares and
+    prior, minus the squares of own_noise: a delay changes the interpolation phase and a low-pass smooths noise, neither
+    of which is evidence. of_tails: additional squares of own_noise if its tails are heavier than simulated."""
 
     hypothesis: Hypothesis
     seen: Sequence[Seen]
@@ -81,13 +79,13 @@ class Fit:
 
     @cached_property
     def columns(self) -> Array:
-        """(M, A, 6 + p) derivatives of the residual, of which of most fits nobody asks."""
+        """Return derivatives of the residual, (M, A, 6 + p), on demand."""
         return self.made()
 
     def gain_over(self, rest: Fit) -> float:
-        """Deviance that this explains beyond another, for sure.
+        """Return the lower bound of the deviance gain over another fit.
 
-        With other noise in it, it may fit the reference's noise better by chance: by a normal variable of this size.
+        Fits with different noise differ in deviance by a normal variable of this size under the null hypothesis.
         """
         other = self.own_noise - rest.own_noise
         sure = rest.deviance - self.deviance - BY_CHANCE * 2.0 * float(np.sqrt(other @ other))
@@ -95,34 +93,34 @@ class Fit:
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """Of the hypothesis."""
+        """Return the effects of the hypothesis."""
         return self.hypothesis.effects
 
     @property
     def values(self) -> Mapping[str, tuple[Values, ...]]:
-        """Of the hypothesis."""
+        """Return the values of the hypothesis."""
         return self.hypothesis.values
 
     @property
     def dof(self) -> float:
-        """Degrees of freedom that the effects use up."""
+        """Return the degrees of freedom of the effects."""
         return float(self.system.freedom()[6:].sum())
 
     def covariance(self, block: NDArray[np.intp]) -> Array:
-        """(6 + p, 6 + p), of noise as it is whitened or as the scatter of blocks (M,) shows it, what is larger.
+        """Return the covariance (6 + p, 6 + p) from the noise model or from blocks (M,), whichever is larger.
 
         The sandwich H⁻¹ (Σ s sᵀ) H⁻¹ of the blocks' scores s holds whatever colour and level the noise has in a block.
         """
         inverse = self.system.covariance()
         scores = self.scores(block)
-        scores = scores - scores.mean(axis=0)  # their mean is what the prior and the velocities' own noise make
+        scores = scores - scores.mean(axis=0)  # prior and own noise make the mean
         n = len(scores)
         sandwich = inverse @ (scores.T @ scores) @ inverse * n / max(n - 1, 1)
         grown = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
         return np.asarray(inverse * np.outer(grown, grown))
 
     def scores(self, block: NDArray[np.intp]) -> Array:
-        """(B, 6 + p) sums of whitened columns times residual over blocks (M,)."""
+        """Return sums (B, 6 + p) of whitened columns times residual over blocks (M,)."""
         white = self.noise.whiten(self.columns).reshape(len(block), -1, self.columns.shape[2])
         left = self.noise.whiten(self.residual).reshape(len(block), -1)
         each = np.einsum("map,ma->mp", white, left)
@@ -131,7 +129,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Looked:
-    """A hypothesis as it is looked at under a noise: seen, residual and columns as of a `Fit`; system of its step."""
+    """Linearisation of a hypothesis under a noise: seen, residual and columns as in `Fit`; system of its step."""
 
     seen: tuple[Seen, ...]
     residual: Array
@@ -141,7 +139,7 @@ class _Looked:
 
 @dataclass(frozen=True)
 class Fitter:
-    """Fits hypotheses to one problem. outliers: (M, A) m/s, taken off the residual. held: (M,) bins not to be seen."""
+    """Fitter of hypotheses to a problem. outliers: (M, A) m/s, subtracted from residuals. held: (M,) bins held out."""
 
     problem: Problem
     outliers: Array | float = 0.0
@@ -149,13 +147,13 @@ class Fitter:
     _fits: dict[tuple[object, ...], Fit] = field(default_factory=dict, repr=False)
 
     def without(self, held: Mask) -> Fitter:
-        """One that does not see some bins (M,)."""
+        """Return a fitter with some bins (M,) held out."""
         return replace(self, held=held, _fits={})
 
     def bursts(self, fit: Fit) -> Mask:
-        """(M,) bins in which an instrument is off for some seconds: far off, and too few for an effect.
+        """Return (M,) bins with large errors for some seconds, too few for an effect.
 
-        Noise with a memory does not show them: it is the bursts' own.
+        The residual is not whitened: bursts would determine the noise's colour.
         """
         raw = (fit.residual + self.outliers) / fit.noise.level
         size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
@@ -164,18 +162,18 @@ class Fitter:
         return far & (np.count_nonzero(far) <= RARE * len(far))
 
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
-        """Through the model, and residual (M, A)."""
+        """Evaluate a hypothesis; return the evaluation and the residual (M, A)."""
         seen = tuple(self.problem.all_seen(hypothesis))
         return seen, self.problem.residual(seen) - self.outliers
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
-        """(M, A, 6 + p) derivatives of the residual."""
+        """Return derivatives of the residual, (M, A, 6 + p)."""
         return self.problem.all_columns(hypothesis, seen)
 
     def _looked(
         self, hypothesis: Hypothesis, noise: Noise, seen: tuple[Seen, ...] | None = None, residual: Array | None = None
     ) -> _Looked:
-        """seen, residual: where they are known already."""
+        """Linearise a hypothesis. seen, residual: its evaluation, if known."""
         if seen is None or residual is None:
             seen, residual = self.evaluated(hypothesis)
         columns = self.columns(hypothesis, seen)
@@ -202,12 +200,12 @@ class Fitter:
         looked: _Looked | None = None,
         evaluated: Evaluated | None = None,
     ) -> Fit:
-        """Fit a hypothesis from where it is, under a noise; of the day: all that belongs to the vehicle is kept.
+        """Fit a hypothesis under a noise. only_of_the_day: fit parameters per recording only.
 
-        fixed: names of effects whose values are kept. careful: the last step, with what noise makes in the columns
-        taken off, is not one that was just seen to make it worse, as at the kink of a slow attitude. Where a fit is
-        stuck far from the best, that step is what takes it out. looked, evaluated: the start, where that is done
-        already.
+        fixed: names of effects whose values are fixed. careful: omit a failed ordinary step from the last step, which
+        corrects for noise in the columns; such steps fail at the kink of a slow attitude. If a fit is stuck far from
+        the optimum, the whole last step frees it. looked, evaluated: linearisation or evaluation of the start, if
+        known.
         """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
         kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
@@ -264,10 +262,10 @@ class Fitter:
     def _without_own_noise(
         self, system: WhitenedLeastSquares, hypothesis: Hypothesis, noise: Noise, columns: Array, residual: Array
     ) -> WhitenedLeastSquares:
-        """A system less what the velocities' own noise makes in it, as made-up noise shows it.
+        """Subtract from a system the contribution of the velocities' own noise, from simulated noise.
 
-        The columns of scale and misalignment hold the noise of the very velocities that are in the residual, so each
-        would explain the other: scale for noise (errors in variables).
+        The columns of scale and misalignment contain the same noise as the residual, so scale would fit noise (errors
+        in variables).
         """
         gram = system.gram
         for shaken in self.problem.shaken:
@@ -281,14 +279,14 @@ class Fitter:
         return found if found.is_definite else system
 
     def step_of(self, other: Problem, seen: Sequence[Seen], residual: Array, fit: Fit) -> Array:
-        """(6 + p,) the step that a fit's hypothesis would take in another problem, seen through it, with a residual."""
+        """Return the step (6 + p,) of a fit's hypothesis in another problem, from its evaluation and residual."""
         fitter = replace(self, problem=other, outliers=0.0, _fits={})
         columns = fitter.columns(fit.hypothesis, seen)
         system = fitter._system(fit.noise, columns, residual, fit.hypothesis)
         return fitter._without_own_noise(system, fit.hypothesis, fit.noise, columns, residual).solution()
 
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
-        """(S n,) whitened, what made-up noise of the velocities makes in the residual (M, A) of a hypothesis."""
+        """Return the whitened contribution (S n,) of simulated velocity noise to a hypothesis' residual (M, A)."""
         white = [
             self._white(noise, shaken.residual(shaken.all_seen(hypothesis)) - residual)
             for shaken in self.problem.shaken
@@ -296,13 +294,13 @@ class Fitter:
         return np.concatenate(white)
 
     def _system(self, noise: Noise, columns: Array, residual: Array, hypothesis: Hypothesis) -> WhitenedLeastSquares:
-        """Of the step (6 + p,) from a hypothesis."""
+        """Return the system of the step (6 + p,) from a hypothesis."""
         return WhitenedLeastSquares.of(
             self._white(noise, columns), -self._white(noise, residual), prior_std(hypothesis), -hypothesis.vector()
         )
 
     def fit_kept(self, start: Hypothesis, noise: Noise) -> Fit:
-        """`fit`, not done twice for the same effects under the same noise."""
+        """Return the cached `fit` of the same effects under the same noise."""
         windows = tuple(
             value[spec.name]
             for effect in start.effects
@@ -315,7 +313,7 @@ class Fitter:
         key = (id(noise), *what)
         if key not in self._fits:
             nearest, evaluated = start, self.evaluated(start)
-            for each in self.problem.fitted.get(what, []):  # under other noise it ended nearby
+            for each in self.problem.fitted.get(what, []):  # optima under other noise are near
                 at_end = self.evaluated(each)
                 if self._misfit(noise, at_end[1], each) < self._misfit(noise, evaluated[1], nearest):
                     nearest, evaluated = each, at_end
@@ -327,14 +325,14 @@ class Fitter:
         return self._fits[key]
 
     def straight_on(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:
-        """Misfit that one step leaves, as straight lines tell it, and what it leads to; start: alike in the data."""
+        """Return the misfit after one linear step, and the step's end; start: a hypothesis with the same evaluation."""
         columns = self.columns(start, fit.seen)
         system = self._system(fit.noise, columns, fit.residual, start)
         step = system.solution()
         return system.misfit(step), start.moved(step)
 
     def refined(self, fit: Fit, steps: Sequence[float]) -> Fit:
-        """A fit with the times at which its effects begin and end made finer than the grid they were found on."""
+        """Refine the times at which a fit's effects begin and end, beyond the grid."""
         for step in steps:
             for effect in fit.effects:
                 for spec in (spec for spec in effect.parameters if is_time_of_run(spec)):
@@ -342,9 +340,9 @@ class Fitter:
         return fit
 
     def refined_as_white(self, fit: Fit, steps: Sequence[float]) -> Fit:
-        """`refined` as if the noise were white, where that is the better fit.
+        """Refine the times under white noise, if the fit is better.
 
-        Noise with a memory takes in what a wrong time leaves, all but the step itself: only the exact time is better.
+        Coloured noise absorbs the residual of a wrong time except the step itself: only the exact time is better.
         """
         if not fit.noise.is_coloured or not any(is_time_of_run(s) for e in fit.effects for s in e.parameters):
             return fit
@@ -370,17 +368,17 @@ class Fitter:
         return fit
 
     def _promised(self, fit: Fit) -> float:
-        """What a straight step from a fit would gain, although it stands still: so much is promised of no step."""
+        """Return the predicted gain of a linear step from a converged fit, which is not attainable."""
         system = self._system(fit.noise, fit.columns, fit.residual, fit.hypothesis)
         return self._misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
 
     def _is_surely_worse(
         self, hypothesis: Hypothesis, looked: _Looked, noise: Noise, deviance: float, promised: float = 0.0
     ) -> bool:
-        """Whether a hypothesis, fitted, would have a larger deviance, as one straight step tells well enough.
+        """Return whether a hypothesis, fitted, would have a larger deviance, by one linear step.
 
-        The deviance at which that step would end is the least there is, but for what is bent. promised: of what it
-        gains, what a step from a fit nearby, of this deviance, would gain as well, which is nothing (`_promised`).
+        The step's predicted deviance is the minimum except for nonlinearity. promised: predicted gain from a nearby
+        converged fit of this deviance, subtracted as unattainable (`_promised`).
         """
         own_noise = self._own_noise(hypothesis, noise, looked.residual + self.outliers)
         least = looked.system.misfit(looked.system.solution())
@@ -392,7 +390,7 @@ class Fitter:
         return least + alike > deviance + NEARBY * SURELY + BENT * (gained - alike)
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
-        """A time at which an effect begins or ends, with those that the data takes for as good (95 per cent)."""
+        """Return the time at which an effect begins or ends, with its 95 per cent interval."""
         value = fit.values[effect.name][recording][name]
         seconds = self.problem.recordings[recording].seconds
         if not np.isfinite(value):
@@ -402,7 +400,7 @@ class Fitter:
             step, end, was_as_good = 0.5 * self.problem.interval, value, True
             while 0.0 <= (at := value + sign * step) <= seconds:
                 worse = self._worse_at(_with_time(fit, effect, name, recording, at), fit)
-                if was_as_good or worse < OF_A_TIME:  # the first that is worse bounds those that are as good
+                if was_as_good or worse < OF_A_TIME:  # the first rejected time bounds the interval
                     end = at
                 if worse > NO_TIME_BEYOND:
                     break
@@ -411,14 +409,14 @@ class Fitter:
         return value, ends[0], ends[1]
 
     def _worse_at(self, moved: Hypothesis, fit: Fit) -> float:
-        """By how much deviance a fit is worse with another time, infinite where that is surely too much."""
+        """Return the deviance increase of a fit at another time, infinite if it is certainly too large."""
         looked = self._looked(moved, fit.noise)
         if self._is_surely_worse(moved, looked, fit.noise, fit.deviance + NO_TIME_BEYOND):
             return np.inf
         return self.fit(moved, fit.noise, 2, looked=looked).deviance - fit.deviance
 
     def moved_by_time(self, fit: Fit, effect: Effect, name: str, recording: int, ends: Sequence[float]) -> Array:
-        """(6 + p, 6 + p) what is not known of a time adds to the covariance. ends: of its interval (95 per cent), s."""
+        """Return the covariance (6 + p, 6 + p) due to a time's uncertainty. ends: of its 95 per cent interval, s."""
         added = np.zeros((len(fit.hypothesis.vector()),) * 2)
         for at in ends:
             if np.isfinite(at) and at != fit.values[effect.name][recording][name]:
@@ -429,17 +427,17 @@ class Fitter:
 
 
 def _with_time(fit: Fit, effect: Effect, name: str, recording: int, at: float) -> Hypothesis:
-    """The hypothesis of a fit with another time, s, at which an effect begins or ends in one recording."""
+    """Return the hypothesis of a fit with another time, s, of an effect in one recording."""
     per = fit.values[effect.name]
     moved = tuple({**each, name: at} if index == recording else each for index, each in enumerate(per))
     return replace(fit.hypothesis, values={**fit.values, effect.name: moved})
 
 
 def _length(step: Array, before: Array, length: float) -> float:
-    """How far to go along a Gauss-Newton step (n,), having gone a length of the one before (n,); both whitened.
+    """Return the length of a Gauss-Newton step (n,), given the previous step (n,) and length; steps are whitened.
 
-    Far from what explains the data (an effect left out that is there) the second derivatives count: each step is the
-    one before it times nearly the same factor, to and fro. Then this length leads to where they would end (Aitken, Δ²).
+    Far from the optimum (an effect is missing), second derivatives matter: each step is nearly the previous one times a
+    factor, possibly negative. This length then leads to the limit (Aitken, Δ²).
     """
     before_square, along = float(before @ before), float(step @ before)
     if along**2 < ALIKE * before_square * float(step @ step) or before_square == 0.0:
@@ -448,5 +446,5 @@ def _length(step: Array, before: Array, length: float) -> float:
 
 
 def n_amplitudes(effect: Effect, n_recordings: int) -> int:
-    """Number of parameters with a derivative, of all recordings."""
+    """Return the number of parameters with a derivative, of all recordings."""
     return len(amplitudes(effect)) * len(whose_parameters(effect, n_recordings))

@@ -1,8 +1,8 @@
-"""Recordings as a fit says that they came about, with other noise: what a test makes of these is chance.
+"""Parametric bootstrap: recordings simulated from a fit, for the null distribution of a test.
 
-The fitted model runs forwards on the recorded motion, at the recorded stamps. So a made-up recording has what the
-formulas of a test leave out: samples that are interpolated and share neighbours, regressors with noise in them. Between
-slow samples its motion goes another way than the one that the diagnosis takes for granted.
+The fitted model runs forwards on the recorded motion, at the recorded stamps. A simulated recording therefore has what
+a test's formulas omit: interpolated samples that share neighbours, and noisy regressors. Between slow samples, its
+motion differs from the diagnosis' interpolation.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from ..model.seen import Seen
 from ..model.stream_curve import FAST_ENOUGH_S, Curve
 from .gauss_newton import Fit
 
-# Passes in which the true time of a late stamp is found
+# Fixed-point iterations for the true time of a delayed stamp
 _PASSES = 3
 
 
@@ -38,15 +38,14 @@ class _OtherWay(Curve):
 
     @cached_property
     def smooth(self) -> Curve:
-        """It is."""
+        """Return the curve, which is smooth."""
         return self
 
 
 def simulated_recordings(problem: Problem, fit: Fit, count: int) -> Iterator[tuple[Problem, list[Seen], Array]]:
-    """`count` problems like one, each seen through the fit's hypothesis, with its residual (M, A) as large as the
-    fit's.
+    """Yield `count` simulated problems, their evaluation and a residual (M, A) of the fit's size.
 
-    White noise as large as the streams show it, drawn anew; what the residual has beyond that has its colour.
+    White noise is redrawn at the streams' noise level; the residual's excess has its own colour.
     """
     rng = np.random.default_rng(0)
     moving = replace(problem, recordings=tuple(map(_moving, problem.recordings)))
@@ -62,7 +61,7 @@ def simulated_recordings(problem: Problem, fit: Fit, count: int) -> Iterator[tup
         seen = other.all_seen(fit.hypothesis)
         residual = other.residual(seen)
         made = float(np.mean(fit.noise.whiten(residual) ** 2))
-        if number < 0:  # the roughness of a slow stream is turns as well
+        if number < 0:  # a slow stream is rough from turns too
             share = min(1.0, float(np.sqrt(wanted / max(made, 1e-300))))
             continue
         beyond = np.sqrt(max(0.0, wanted - made))
@@ -70,7 +69,7 @@ def simulated_recordings(problem: Problem, fit: Fit, count: int) -> Iterator[tup
 
 
 def _moving(recording: RecordedStreams) -> RecordedStreams:
-    """A recording whose curves are the motion between its samples."""
+    """Return a recording whose curves are the motion between its samples."""
 
     def through(curve: Curve | None) -> Curve | None:
         if curve is None or curve.interval <= FAST_ENOUGH_S or len(curve.time) < 5:
@@ -96,7 +95,7 @@ def _drawn(recording: RecordedStreams, reference: Array, share: float, rng: np.r
 
 
 def _reference(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
-    """(M, k) m/s that the reference of a recording would report without noise, in its frame, at its own stamps."""
+    """Return the noise-free reference (M, k) m/s of a recording, in its frame, at its own stamps."""
     recording, injections = problem.recordings[index], hypothesis.injections(index)
     time = recording.reference.time
     for _ in range(_PASSES):

@@ -1,4 +1,4 @@
-"""Cost and gain of a fit, with nuisance columns beside it."""
+"""Penalised deviance of a fit, and nuisance parameters."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .gauss_newton import Fit, Fitter, n_amplitudes, prior_std
 
-# Parts of the run at whose ends effects that come and go are tried to begin or end
+# Parts of the run at whose ends intermittent effects may begin or end
 WINDOW_STEPS = 10
-# Deviance within which the usual is preferred
+# Deviance within which the more usual effects are preferred
 AS_WELL = 2.0
 
 
 def windows(effect: Effect, seconds: float) -> list[dict[str, float]]:
-    """Times of the run, by name, that are tried: none at all first, then every part of the grid."""
+    """Return the times of the run to try, by name: the whole run first, then every part of the grid."""
     times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
     if not times:
         return [{}]
@@ -40,32 +40,32 @@ def windows(effect: Effect, seconds: float) -> list[dict[str, float]]:
 
 
 def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0) -> float:
-    """Deviance that an effect explains by chance, once in 1 / level data sets, having looked at all of them."""
+    """Return the deviance that the best of all effects explains under the null with probability `SETTINGS.level`."""
     dof = n_amplitudes(effect, n_recordings)
     return float(chi2_isf(SETTINGS.level / n_effects / tried, dof))
 
 
 def price_of_a_time(effect: Effect, n_effects: int) -> float:
-    """Deviance that the best of the times at which an effect may begin explains by chance, once in 1 / level data
-    sets, beyond what is there from the beginning."""
+    """Return the deviance that the best start time of an effect adds under the null to an effect throughout. The
+    probability is `SETTINGS.level`."""
     return float(chi2_isf(SETTINGS.level / n_effects / times_tried(effect), 1))
 
 
 def criterion(fit: Fit, n_effects: int) -> float:
-    """Deviance and the price of every effect."""
+    """Return the deviance plus the price of every effect."""
     n = len(fit.seen)
     return fit.deviance + sum(price(effect, n_effects, n, times_tried(effect)) for effect in fit.effects)
 
 
 def times_tried(effect: Effect) -> float:
-    """How many alternatives are looked at for an effect: twice its times of the run, or one."""
+    """Return the number of alternatives of an effect: twice its times of the run, or one."""
     return 2.0 * len(windows(effect, 1.0)) if any(is_time_of_run(s) for s in effect.parameters) else 1.0
 
 
 def best_of(fits: Sequence[Fit], effects: Mapping[str, Effect]) -> Fit:
-    """The fit that explains most for its price; of those that do as well, that of the most usual effects.
+    """Return the fit with the least criterion; of equivalent fits the one with the most usual effects.
 
-    These come first in the library.
+    Usual effects come first in the library.
     """
     scores = [criterion(fit, len(effects)) for fit in fits]
     rank = {name: index for index, name in enumerate(effects)}
@@ -74,25 +74,25 @@ def best_of(fits: Sequence[Fit], effects: Mapping[str, Effect]) -> Fit:
 
 
 def fit_without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
-    """A fit without one of its effects, under the same noise."""
+    """Fit without one of the effects, under the same noise."""
     rest = [other for other in fit.effects if other is not effect]
     return fitter.fit_kept(fit.hypothesis.with_effects(rest, len(fit.seen), {}), fit.noise)
 
 
 def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
-    """log p of a drop in deviance, times how many alternatives were tried."""
+    """Return log p of a drop in deviance, times the number of alternatives."""
     return min(0.0, float(chi2_logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
 
 
 def log_p_in_place(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> float:
-    """log p of an effect of a fit, given all others and what is not shown. rest: the fit without it."""
+    """Return log p of an effect given all others and unobservable parameters. rest: the fit without it."""
     problem = fitter.problem
     gain = fit.gain_over(rest) - max(_told_by_unshown(problem, rest) - _told_by_unshown(problem, fit), 0.0)
     return log_p_value(gain, fit.dof - rest.dof, times_tried(effect))
 
 
 def _told_by_unshown(problem: Problem, fit: Fit) -> float:
-    """Deviance that what is not shown, and not fitted, would explain beside a fit, as straight lines tell it."""
+    """Return the deviance that unobservable parameters would explain in addition to a fit, linearised."""
     if not problem.lacks_columns(fit.hypothesis):
         return 0.0
     both = NuisanceFit.of_fit(problem, fit).step(fit.noise, fit.residual)
@@ -101,9 +101,9 @@ def _told_by_unshown(problem: Problem, fit: Fit) -> float:
 
 
 def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "", moved: Array | float = 0.0) -> float:
-    """p of a Wald test with the covariance that blocks show, of all parameters of an effect or of one by name.
+    """Return p of a Wald test, with the covariance of blocks, of an effect or of one parameter by name.
 
-    moved: (6 + p,) by how much the parameters may be others for a cause that is not in the fit.
+    moved: (6 + p,) change of the parameters by a cause that is not in the fit.
     """
     at, start = np.zeros(0, dtype=int), 6
     for other in fit.effects:
@@ -122,19 +122,19 @@ def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "", 
 
 
 def blocks_of(problem: Problem) -> NDArray[np.intp]:
-    """(M,) block of each bin, from 0: stretches of time, half of those of hold-out."""
+    """Return (M,) block of each bin, from 0: half the length of a hold-out stretch."""
     index = np.floor(problem.time / (0.5 * SETTINGS.block)).astype(int)
     keys = problem.recording_of * (index.max() + 2) + index - index.min()
     return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)
 
 
 def step_of_times(problem: Problem) -> float:
-    """Seconds between the times of the run that are tried: what is nearer happens at once."""
+    """Return the interval, s, of the times of the run that are tried; closer events are simultaneous."""
     return max(recording.seconds for recording in problem.recordings) / WINDOW_STEPS
 
 
 def finer_steps(problem: Problem) -> list[float]:
-    """Steps (s) by which times of the run are refined: half of those tried, down to the time between samples."""
+    """Return steps (s) that refine times of the run: from half the grid's down to the sample interval."""
     seconds = step_of_times(problem)
     steps: list[float] = []
     while seconds > 0.5 * problem.interval and len(steps) < 8:
@@ -144,9 +144,8 @@ def finer_steps(problem: Problem) -> list[float]:
 
 
 class NuisanceFit(NamedTuple):
-    """What is fitted beside what is looked for. columns: (M, A, k) d residual / d parameters. std, centre: (k,), of the
-    prior of what they explain of a fit's residual.
-    """
+    """Nuisance parameters of a test. columns: (M, A, k) d residual / d parameters. std, centre: (k,), of the prior of
+    their contribution to a fit's residual."""
 
     columns: Array
     std: Array
@@ -154,7 +153,7 @@ class NuisanceFit(NamedTuple):
 
     @staticmethod
     def of(problem: Problem, hypothesis: Hypothesis, seen: Sequence[Seen], columns: Array) -> NuisanceFit:
-        """Columns (M, A, k) of the first k parameters of a hypothesis, and those of what is not shown (u more)."""
+        """Return columns (M, A, k) of the first k parameters of a hypothesis, and u unobservable ones."""
         unshown, sizes = problem.unshown_columns(hypothesis, seen)
         k, none = columns.shape[2], np.zeros(len(sizes))
         std, centre = np.append(prior_std(hypothesis)[:k], sizes), np.append(hypothesis.vector()[:k], none)
@@ -162,22 +161,22 @@ class NuisanceFit(NamedTuple):
 
     @staticmethod
     def of_fit(problem: Problem, fit: Fit) -> NuisanceFit:
-        """All parameters of a fit, and what is not shown."""
+        """Return all parameters of a fit and unobservable ones."""
         return NuisanceFit.of(problem, fit.hypothesis, fit.seen, fit.columns)
 
     def and_rest(self, raw: Array, residual: Array) -> NuisanceFit:
-        """And columns raw (M, A, c), of unit size, of what a residual (M, A) follows."""
+        """Add columns raw (M, A, c), scaled to unit size, that may explain a residual (M, A)."""
         size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
-        # all together are no larger than the residual: else stretches without a turn would be told of any size
+        # jointly no larger than the residual: stretches without a turn would otherwise not bound them
         std, none = np.full(raw.shape[2], _likely(raw, residual)), np.zeros(raw.shape[2])
         columns = np.concatenate([self.columns, raw / size], axis=2)
         return NuisanceFit(columns, np.append(self.std, std), np.append(self.centre, none))
 
     def step(self, noise: Noise, residual: Array) -> WhitenedLeastSquares:
-        """Of the step (k,) of what is fitted that leaves least of a residual (M, A) under a noise."""
+        """Return the system of the step (k,) that minimises a residual (M, A) under a noise."""
         return WhitenedLeastSquares.of(noise.whiten(self.columns), -noise.whiten(residual), self.std, -self.centre)
 
 
 def _likely(raw: Array, residual: Array) -> float:
-    """Size of each of columns (M, A, c) of unit size that all together are no larger than a residual (M, A)."""
+    """Return the size of each of columns (M, A, c) of unit size that jointly equal a residual (M, A) in size."""
     return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))

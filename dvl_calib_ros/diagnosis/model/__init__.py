@@ -1,1 +1,1 @@
-"""The forward model: recorded streams, hypotheses, and the residual that a hypothesis leaves."""
+"""Forward model: recorded streams, hypotheses and the residual."""

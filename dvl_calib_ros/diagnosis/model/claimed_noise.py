@@ -1,8 +1,8 @@
-"""How far the noise of single samples is what their messages claim.
+"""Dependence of each sample's noise on its reported standard deviation.
 
-Receivers go from a fixed to a floating solution, DVLs tell how good a ping was: then reported covariances differ from
-sample to sample. How large the noise is in all, the data tells; which sample is worth more, the claims may. The
-exponent of what they claim is fitted: 1 is a claim that holds, 0 one that says nothing.
+Receivers switch between fixed and float solutions and DVLs report ping quality, so reported covariances differ between
+samples. The data determine the overall noise; the reported values may determine the relative weights. The exponent of
+the reported values is estimated: 1 if they are valid, 0 if uninformative.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from ...calibration.numerics.frames import Array
 if TYPE_CHECKING:
     pass
 
-# A claim is followed where its exponent is above zero at this level (one-sided)
+# Level (one-sided) at which a positive exponent is significant
 SURE = 1e-4
-# Who writes standard deviations where variances belong claims the roots of what is: an exponent of 2
+# Largest exponent: if standard deviations are written as variances, the reported values are square roots
 LARGEST = 2.0
-# Claims that differ by less (standard deviation of their logarithm) tell no sample from another
+# Least standard deviation of the logarithm of reported values that is informative
 DIFFER = 0.05
-# Samples of one stretch whose squares may be alike, whatever makes them so
+# Stretch, s, within which squares may be correlated for any reason
 STRETCH_S = 20.0
-# However far claims lie apart: logarithm of the level about its mean
+# Bound of the log noise level about its mean
 FARTHEST = 4.0
 
 
 @dataclass(frozen=True)
 class Claims:
-    """Exponents (c,) of claims, and their standard deviations, by name of the stream."""
+    """Exponents (c,) of reported values and their standard deviations, by name of the stream."""
 
     names: tuple[str, ...]
     exponents: Array
@@ -42,17 +42,17 @@ class Claims:
 
     @property
     def sure(self) -> NDArray[np.bool_]:
-        """(c,) whether the noise follows the claim at all."""
+        """Return (c,) whether the noise depends significantly on the reported value."""
         return np.asarray(self.exponents > normal_isf(SURE) * self.stds)
 
 
 def differ(log_claims: Array) -> bool:
-    """Whether claims (M, A) tell some samples from others."""
+    """Return whether reported values (M, A) are informative."""
     return bool(np.max(np.std(log_claims, axis=0), initial=0.0) > DIFFER)
 
 
 def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: NDArray[np.intp]) -> Claims:
-    """Fit of log squares of values (M, A) to claims (M, A, c), each axis about its own mean.
+    """Fit log squares of values (M, A) to reported values (M, A, c), each axis about its own mean.
 
     Parameters
     ----------
@@ -60,7 +60,6 @@ def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: N
     log_claims: Logarithms of standard deviations.
     values: Noise, white; of any size.
     stretch: (M,) index of stretches of time, by whose scatter the fit is judged.
-
     """
     y = np.log(np.maximum(values**2, 1e-12 * np.median(values**2) + 1e-300))
     y = y - y.mean(axis=0)
@@ -68,7 +67,7 @@ def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: N
     inverse = np.linalg.pinv(np.einsum("mac,mad->cd", x, x))
     slopes = inverse @ np.einsum("mac,ma->c", x, y)
     scores = np.einsum("mac,ma->mc", x, y - x @ slopes)
-    _, number = np.unique(stretch, return_inverse=True)  # of a pause there are none
+    _, number = np.unique(stretch, return_inverse=True)  # a pause has no stretches
     sums = np.stack([np.bincount(number, column) for column in scores.T], axis=1)
     n = len(sums)
     covariance = inverse @ (sums.T @ sums) @ inverse * n / max(n - len(slopes) - 1, 1)
@@ -76,7 +75,7 @@ def exponents(names: Sequence[str], log_claims: Array, values: Array, stretch: N
 
 
 def followed(log_claims: Array, values: Array, names: Sequence[str], stretch: NDArray[np.intp]) -> Array:
-    """(M, A) relative standard deviation of values (M, A), as far as they surely follow claims (M, A, c)."""
+    """Return relative standard deviations (M, A) of values (M, A), if significant, from reported ones (M, A, c)."""
     kept = list(range(log_claims.shape[2]))
     while kept:
         found = exponents([names[each] for each in kept], log_claims[:, :, kept], values, stretch)
@@ -91,15 +90,14 @@ def followed(log_claims: Array, values: Array, names: Sequence[str], stretch: ND
 
 
 def loudness(time: Array, claims: Array | None, differences: Array, weights: Array) -> Array:
-    """(N, k) relative standard deviation of a stream's samples, of the usual one, as far as it follows their claims.
+    """Return the relative standard deviation (N, k) of a stream's samples, as far as reported values predict it.
 
     Parameters
     ----------
     time: (N,) s.
     claims: (N, k) standard deviations, None without.
-    differences: (N - w + 1, k) of w neighbours, in which motion does not count.
+    differences: (N - w + 1, k) of w neighbours, free of motion.
     weights: (w,) of the neighbours in these.
-
     """
     shape = len(time), differences.shape[1]
     if claims is None or len(differences) < len(weights) or not differ(np.log(claims)):

@@ -1,15 +1,15 @@
-"""The composed model: what is left of the difference between DVL and reference, with any effects, at any size.
+"""The composed model: residual of DVL and reference under any effects of any size.
 
-The physics of `effects.composition`, gone backwards. At a true time s, with the stamps that each clock gives it,
+It inverts the physics of `effects.composition`. At a true time s, with the stamp of each clock,
 
     u = D⁻¹ (v_dvl - T traces on DVL(u))        v = u - traces on MOTION(v)        e = v - g - traces on REFERENCE(v)
 
 with D = (I + diag(δk)) Exp(φ + turns on MOUNTING(u)) T and g the reference velocity in the body frame. Exp(φ) is the
-rotation that I + [φ×] stands for. Nothing is paired: every stream is a curve of its own, so a delay of seconds is a
-change of argument, and e is averaged over bins of two intervals of the slower stream (`DiagnosisSettings`).
+finite rotation of which I + [φ×] is the first order. Streams are not paired: each is a curve of time, so a delay of
+seconds is a change of argument. e is averaged over bins of two intervals of the slower stream (`DiagnosisSettings`).
 
-Regressors are made of the smoothed DVL velocity, whose noise is small; those made from the reference would pull
-estimates towards zero (errors in variables).
+Regressors use the smoothed DVL velocity, whose noise is small. Regressors from the reference would bias estimates
+towards zero (errors in variables).
 """
 
 from __future__ import annotations
@@ -48,10 +48,9 @@ from .time_grid import Grid, Offsets, make_grid
 
 
 class _Moved(NamedTuple):
-    """What a DVL says of the motion at F times. motion, at_dvl, angles, body_from_measured, dvl_stamps: as of `Seen`.
-    raw, smooth: (F, 3) m/s, what it measured, its frame. added: (F, 3) or (3,) m/s that a lever arm that is known, and
-    effects before the reference, add to the motion, body frame. attitude_stamps: (F,) s.
-    """
+    """DVL measurement of the motion at F times. motion, at_dvl, angles, body_from_measured, dvl_stamps: as in `Seen`.
+    raw, smooth: (F, 3) m/s, measured, DVL frame. added: (F, 3) or (3,) m/s that the known lever arm and effects before
+    the reference add to the motion, body frame. attitude_stamps: (F,) s."""
 
     motion: EffectInput
     at_dvl: EffectInput
@@ -65,7 +64,7 @@ class _Moved(NamedTuple):
 
 
 class SeenAgain(Sequence[Seen]):
-    """What is seen of a hypothesis for who asks for it: of hours it is large, and of most fits nobody asks."""
+    """Lazy evaluation of a hypothesis: for hours of data it is large, and most fits never need it."""
 
     def __init__(self, problem: Problem, hypothesis: Hypothesis) -> None:
         self._problem, self._hypothesis = problem, hypothesis
@@ -87,11 +86,10 @@ class SeenAgain(Sequence[Seen]):
 
 @dataclass(frozen=True)
 class Problem:
-    """Recordings to be explained. lever_arm: (3,) m, known already. grids: per recording. of_axes: those to compare.
-    bursts: of how many samples an instrument was far off, which are left out. shown_turns: (3, 3) projection of φ on
-    the turns of the mounting that a reference without a vertical shows; by the others it is not turned. unshown: what
-    it does not show of effects; where one of these is in a hypothesis, or on every vehicle, there may be some of that.
-    """
+    """Recordings to explain. lever_arm: (3,) m, known. grids: per recording. of_axes: axes to compare. bursts: number
+    of samples excluded as instrument errors. shown_turns: (3, 3) projection of φ on the mounting rotations that are
+    observable without a vertical reference; φ is held at zero along others. unshown: unobservable parts of effects,
+    nuisance where the effect is in a hypothesis or on every vehicle."""
 
     recordings: tuple[RecordedStreams, ...]
     rotation_dvl_from_body: Array
@@ -101,19 +99,19 @@ class Problem:
     bursts: int = 0
     shown_turns: Array = field(default_factory=lambda: np.eye(3), repr=False, compare=False)
     unshown: tuple[Effect, ...] = ()
-    # Hypotheses as they were fitted last, by what they are made of: where to start from again
+    # Last fitted hypotheses by effects and times: starting points for further fits
     fitted: dict[Any, list[Hypothesis]] = field(default_factory=dict, repr=False, compare=False)
 
     # ------------------------------------------------------------------ the data
 
     @cached_property
     def available(self) -> frozenset[EffectNeeds]:
-        """What effects may need and every recording has."""
+        """Return the inputs of effects that every recording has."""
         return frozenset.intersection(*(recording.available for recording in self.recordings))
 
     @cached_property
     def measured(self) -> tuple[bool, bool, bool]:
-        """Axes that are compared, of those that the reference measures in all recordings."""
+        """Return the axes to compare that the reference measures in all recordings."""
         x, y, z = (
             self.of_axes[axis] and all(recording.measured[axis] for recording in self.recordings) for axis in range(3)
         )
@@ -121,16 +119,16 @@ class Problem:
 
     @property
     def axes(self) -> int:
-        """Number of axes that are compared."""
+        """Return the number of axes that are compared."""
         return sum(self.measured)
 
     @cached_property
     def time(self) -> Array:
-        """(M,) s of all bins, since the beginning of the bin's recording."""
+        """Return (M,) s of all bins since the beginning of their recording."""
         return np.concatenate([grid.bin_time for grid in self.grids])
 
     def without(self, far: NDArray[np.bool_]) -> Problem:
-        """The problem without some bins (M,), as if nothing had been measured then."""
+        """Return the problem without some bins (M,)."""
         of_sample, ends = far[self.bin_of], np.cumsum([len(grid.stamps) for grid in self.grids])[:-1]
         grids = tuple(
             replace(grid, stamps=grid.stamps[~off])
@@ -140,28 +138,28 @@ class Problem:
 
     @cached_property
     def recording_of(self) -> NDArray[np.intp]:
-        """(M,) index of the recording that a bin belongs to."""
+        """Return (M,) index of the recording of each bin."""
         return np.repeat(np.arange(len(self.grids)), [len(grid.bin_time) for grid in self.grids])
 
     @cached_property
     def rows_of(self) -> tuple[slice, ...]:
-        """Which of the M bins belong to each recording."""
+        """Return the range of bins of each recording."""
         ends = np.cumsum([0, *(len(grid.bin_time) for grid in self.grids)]).tolist()
         return tuple(slice(*each) for each in pairwise(ends))
 
     @cached_property
     def segments(self) -> tuple[slice, ...]:
-        """Stretches of the M bins without a gap."""
+        """Return the ranges of the M bins without a gap."""
         return segments_of([grid.bin_time for grid in self.grids])
 
     @cached_property
     def interval(self) -> float:
-        """Median time, s, between neighbours of the M bins."""
+        """Return the median time, s, between neighbours of the M bins."""
         return float(np.median(np.concatenate([np.diff(grid.bin_time) for grid in self.grids])))
 
     @cached_property
     def earth_from_compared(self) -> Array | None:
-        """(M, A, A) from the frame of the residual to the earth's, None without attitude."""
+        """Return rotations (M, A, A) from the residual's frame to the earth's, None without attitude."""
         if EffectNeeds.ATTITUDE not in self.available:
             return None
         parts = []
@@ -171,7 +169,7 @@ class Problem:
         return np.concatenate(parts)[:, [axis for axis in range(3) if self.measured[axis]]]
 
     def projection(self, recording: RecordedStreams, rotation_enu_from_body: Array | None) -> Array:
-        """(F, A, 3) from the body frame to the axes that are compared: those of the body, or of it held level."""
+        """Return (F, A, 3) from the body frame to the compared axes: of the body, or levelled."""
         if all(self.measured):
             return np.eye(3)[None]
         rows = [axis for axis in range(3) if self.measured[axis]]
@@ -186,7 +184,7 @@ class Problem:
         return projected
 
     def to_compared(self, recording: RecordedStreams, at: Array, of_dvl: bool) -> Array:
-        """(M, A, 3) or (1, A, 3) from the frame of the DVL or of the reference to the axes that are compared."""
+        """Return (M, A, 3) or (1, A, 3) from the DVL's or the reference's frame to the compared axes."""
         oriented = EffectNeeds.ATTITUDE in self.available
         rotation = recording.rotation_enu_from_body(at) if oriented else None
         projection = self.projection(recording, rotation)
@@ -198,9 +196,9 @@ class Problem:
 
     @cached_property
     def shaken(self) -> tuple[Problem, ...]:
-        """The problem with made-up noise, like its own, in one velocity and then in the other.
+        """Return the problem with simulated noise in the DVL velocity and then in the reference velocity.
 
-        Not in that of the reference where it is looked at its own samples: there its noise is the same for all.
+        The reference is omitted if the grid uses its own samples: its noise then is the same for all hypotheses.
         """
         rng = np.random.default_rng(0)
         dvl = [replace(one, dvl=one.dvl.shaken(rng)) for one in self.recordings]
@@ -211,20 +209,20 @@ class Problem:
 
     @cached_property
     def tails(self) -> tuple[float, ...]:
-        """By what factor the noise that is made up for each of `shaken` has a smaller variance than its own."""
+        """Return the variance ratio of actual to simulated noise for each of `shaken`, at least 1."""
         dvl = max(one.dvl.tails for one in self.recordings)
         return (dvl, max(one.reference.tails for one in self.recordings))[: len(self.shaken)]
 
     @property
     def rougher_than_claimed(self) -> float:
-        """By what factor the DVL may be noisier than what is made up for it: no more than it is rough."""
+        """Return the ratio of the DVL's roughness, the upper bound of its noise, to its simulated noise."""
         each = [(one.dvl.roughness, one.dvl.noise) for one in self.recordings]
         return max(float((rough / np.maximum(noise, 1e-12)).max()) for rough, noise in each)
 
     # ------------------------------------------------------------------ the model
 
     def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None) -> Seen:
-        """A recording through a hypothesis; at: true times (F,) s, by default those of the grid."""
+        """Evaluate a hypothesis for a recording. at: true times (F,) s, by default of the grid."""
         stream, injections = self.recordings[recording], hypothesis.injections(recording)
         time = self.grids[recording].true_time(injections) if at is None else at
         reference = time + late(injections, ActsOn.REFERENCE_CLOCK, time)
@@ -251,13 +249,13 @@ class Problem:
             as_it_is=partial(self._close_as_it_is, hypothesis, recording, time),
         )
         if any(each.effect.acts_on is ActsOn.REFERENCE for each in injections):
-            error -= found.on_reference(injections)  # in place: what it is seen as close by is kept
+            error -= found.on_reference(injections)  # in place: `found` keeps its cached `close`
         for lag, values in hypothesis.lags(recording):
             error -= lag.of_before(found.motion, error, values)
         return found
 
     def _moved(self, hypothesis: Hypothesis, recording: int, time: Array, as_it_is: bool = False) -> _Moved:
-        """What a DVL says of the motion at true times (F,) s; as_it_is: not smoothed, of a slow one."""
+        """Return the DVL's motion at true times (F,) s. as_it_is: without smoothing a slow DVL."""
         stream, injections = self.recordings[recording], hypothesis.injections(recording)
         dvl, attitude = (time + late(injections, clock, time) for clock in (ActsOn.DVL_CLOCK, ActsOn.ATTITUDE_CLOCK))
         rotation, rates = self._oriented(stream, attitude)
@@ -269,7 +267,7 @@ class Problem:
         matrix = hypothesis.body_from_measured(nominal)
         measured = EffectInput(time, rotate_vectors(matrix, followed), nominal, rotation, rates, stream.frame, 0.0)
         if any(each.effect.acts_on is ActsOn.MOUNTING for each in injections):
-            # turned a little otherwise, it is as fast
+            # a small rotation does not change the speed
             turn = turns(injections, undo_effects(injections, measured, ActsOn.DVL, matrix @ nominal)[0])
             matrix = hypothesis.body_from_measured(nominal, turn)
             measured = replace(measured, velocity_body=rotate_vectors(matrix, followed))
@@ -280,19 +278,19 @@ class Problem:
         return _Moved(motion, at_dvl, raw, smooth, added, hypothesis.phi + turn, matrix, dvl, attitude)
 
     def _close(self, hypothesis: Hypothesis, recording: int, time: Array) -> tuple[Seen, NDArray[np.intp]] | None:
-        """For `Seen.close`; None where the times are close."""
+        """Evaluate `Seen.close`. Return None if the times are close already."""
         between = self.grids[recording].between(time)
         return between and (self.seen(hypothesis.without_memory, recording, between[0]), between[1])
 
     def _close_as_it_is(
         self, hypothesis: Hypothesis, recording: int, time: Array
     ) -> tuple[EffectInput, NDArray[np.intp]] | None:
-        """For `Seen.close_as_it_is`; None where the times are close."""
+        """Evaluate `Seen.close_as_it_is`. Return None if the times are close already."""
         between = self.grids[recording].between(time)
         return between and (self._moved(hypothesis.without_memory, recording, between[0], True).motion, between[1])
 
     def _kept_projection(self, stream: RecordedStreams, rotation: Array | None, at: Array) -> Array:
-        """`projection` at times (F,) s of the attitude, of which the last few are kept."""
+        """Return the `projection` at attitude times (F,) s, cached for the last few."""
         if stream.attitude is None or all(self.measured):
             return self.projection(stream, rotation)
         what = f"projection {self.measured}"
@@ -303,34 +301,34 @@ class Problem:
         return rotation, stream.angular_velocity(at) if EffectNeeds.ANGULAR_VELOCITY in self.available else None
 
     def all_seen(self, hypothesis: Hypothesis) -> list[Seen]:
-        """Every recording through a hypothesis."""
+        """Evaluate a hypothesis for every recording."""
         return [self.seen(hypothesis, recording) for recording in range(len(self.recordings))]
 
     def residual(self, seen: Sequence[Seen]) -> Array:
-        """e (M, A) m/s in the frame that is compared."""
+        """Return e (M, A) m/s in the compared frame."""
         return self.binned([each.error for each in seen], seen)
 
     def binned(self, bodies: Sequence[Array], seen: Sequence[Seen]) -> Array:
-        """(F, 3, ...) of each recording, body frame, -> (M, A, ...) means, in the frame that is compared."""
+        """Return means (M, A, ...) in the compared frame of each recording's (F, 3, ...) in the body frame."""
         return np.concatenate(list(map(self._in_bins, self.grids, bodies, seen)))
 
     def _in_bins(self, grid: Grid, body: Array, seen: Seen) -> Array:
-        """(F, 3, ...) of one recording -> its bins, (m, A, ...)."""
+        """Return means (m, A, ...) per bin of (F, 3, ...) of one recording."""
         return grid.averaged(body if all(self.measured) else seen.compared(body))
 
     @cached_property
     def bin_of(self) -> NDArray[np.intp]:
-        """(F,) bin of every sample of all recordings."""
+        """Return (F,) bin of every sample of all recordings."""
         per_bin = np.concatenate([np.full(len(grid.bin_time), grid.per_bin) for grid in self.grids])
         return np.repeat(np.arange(len(per_bin)), per_bin)
 
     @cached_property
     def sample_time(self) -> Array:
-        """(F,) s of every sample, since the beginning of its recording, as true as the first guess."""
+        """Return (F,) s of every sample since the beginning of its recording, corrected by the initial guess."""
         return np.concatenate([grid.stamps - grid.late for grid in self.grids])
 
     def errors(self, seen: Sequence[Seen]) -> Array:
-        """(F, 3) m/s, e of every sample, not averaged, ahead, to port and up; zero on an axis that is not measured."""
+        """Return e (F, 3) m/s per sample, ahead, to port and up; zero on unmeasured axes."""
         parts = []
         for each in seen:
             error = each.error
@@ -341,16 +339,16 @@ class Problem:
         return np.concatenate(parts)
 
     def sampled(self, seen: Sequence[Seen], of: Callable[[EffectInput], Array]) -> Array:
-        """A function of the motion (F, ...) at the M bins."""
+        """Return the mean of a function of the motion (F, ...) in the M bins."""
         return np.concatenate([grid.averaged(of(each.motion)) for grid, each in zip(self.grids, seen, strict=True)])
 
     # ------------------------------------------------------------------ its derivatives
 
     def calibration_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
-        """(M, A, 6) d e / d (φ, δk)."""
+        """Return d e / d (φ, δk), (M, A, 6)."""
         parts = []
         for recording, (grid, each) in enumerate(zip(self.grids, seen, strict=True)):
-            # of one mounting they are linear in the velocity, and so in its mean over each bin
+            # of one mounting they are linear in the velocity: average it first
             lags = hypothesis.lags(recording)
             if each.body_from_measured.ndim == 2 and all(self.measured) and not lags:
                 parts.append(self._by_calibration(hypothesis, each, grid.averaged(each.measured)))
@@ -361,7 +359,7 @@ class Problem:
         return np.concatenate(parts)
 
     def _by_calibration(self, hypothesis: Hypothesis, seen: Seen, measured: Array) -> Array:
-        """(F, 3, 6) d e / d (φ, δk), body frame, of velocities (F, 3) m/s in the DVL's."""
+        """Return d e / d (φ, δk), (F, 3, 6), body frame, of DVL velocities (F, 3) m/s in its frame."""
         columns = np.empty((len(measured), 3, 6))
         by_turn = columns_by_turn(hypothesis, seen, measured)
         columns[:, :, :3] = by_turn if all(self.measured) else by_turn @ self.shown_turns
@@ -370,12 +368,12 @@ class Problem:
         return columns
 
     def all_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> Array:
-        """(M, A, 6 + p) d e / d (φ, δk) and all parameters of a hypothesis, in its order."""
+        """Return d e / d (φ, δk) and all parameters of a hypothesis, in its order, (M, A, 6 + p)."""
         effects = hypothesis.effects
         if not hypothesis.lags(0):
             of_each = [self.columns(hypothesis, seen, each, hypothesis.values[each.name]) for each in effects]
             return np.concatenate([self.calibration_columns(hypothesis, seen), *of_each], axis=2)
-        # what a lag filters, of all effects at once: to filter many columns takes little longer than to filter one
+        # filter all lagging effects jointly: many columns take little longer than one
         lagging = [effect for effect in effects if effect.acts_on is not ActsOn.REFERENCE]
         bodies = []
         for recording, each in enumerate(seen):
@@ -398,7 +396,7 @@ class Problem:
         return np.concatenate([joined[:, :, :6], *(parts[effect.name] for effect in effects)], axis=2)
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
-        """(M, A, p) d e / d parameters of an effect about values, per recording; of the day: by recording."""
+        """Return d e / d parameters of an effect about values, (M, A, p); per recording if its parameters are."""
         per_recording = []
         for recording, each in enumerate(seen):
             lags = hypothesis.lags(recording)
@@ -417,8 +415,7 @@ class Problem:
         return self._of_the_day(effect, self.binned(per_recording, seen))
 
     def _of_the_day(self, effect: Effect, columns: Array) -> Array:
-        """(M, A, p) of an effect -> (M, A, p), or (M, A, r p) where it is another in each recording: each one's own and
-        zero in the others."""
+        """Return columns (M, A, p), or (M, A, r p) for parameters per recording, zero in other recordings."""
         whose, p = whose_parameters(effect, len(self.grids)), columns.shape[2]
         if whose == [None]:
             return columns
@@ -429,15 +426,15 @@ class Problem:
         return found
 
     def lacks_columns(self, hypothesis: Hypothesis) -> bool:
-        """Whether there is anything that `unshown_columns` gives of a hypothesis."""
+        """Return whether `unshown_columns` of a hypothesis is not empty."""
         named = {*hypothesis.values, *OF_EVERY}
         return any(effect.name in named for effect in self.unshown) or not np.allclose(self.shown_turns, np.eye(3))
 
     def unshown_columns(self, hypothesis: Hypothesis, seen: Sequence[Seen]) -> tuple[Array, Array]:
-        """(M, A, u) d e / d what is not shown and not fitted: turns of the mounting, parts of effects; and their usual
-        sizes (u,).
+        """Return d e / d unobservable parameters, (M, A, u), and their usual sizes (u,).
 
-        Each is next to nothing, but so is an effect of which there is little: what these explain is not its.
+        They are rotations of the mounting and parts of effects. Each is small, but so is an insignificant effect:
+        variance that they explain is not evidence for it.
         """
         parts, sizes = [], []
         held, turns = np.linalg.eigh(np.eye(3) - self.shown_turns)
@@ -463,14 +460,14 @@ class Problem:
         return np.concatenate(parts, axis=2), np.concatenate(sizes)
 
     def _of_unshown_turns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect) -> list[Array]:
-        """(M, A, t) d e / d turns of the mounting that are not shown, and (M, A, r) d e / d half their square, by
-        recording: by its cosine a turn of 4° makes all velocities of a day slower by a quarter of a per cent."""
+        """Return d e / d unobservable mounting rotations, (M, A, t), and d e / d half their square by recording, (M, A,
+        r). The cosine of a 4° rotation scales all velocities of a recording by -0.25 per cent."""
         turned = self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen))
         slower = self.binned([-each.motion.velocity_body for each in seen], seen)[:, :, None]
         return [turned, self._of_the_day(effect, slower)]
 
     def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
-        """(M, A) m/s that an effect adds to the residual of a hypothesis that has not got it."""
+        """Return (M, A) m/s that an effect adds to the residual of a hypothesis without it."""
         without = [other for other in hypothesis.effects if other is not effect]
         n = len(self.recordings)
         plain = hypothesis.with_effects(without, n, {})
@@ -478,7 +475,7 @@ class Problem:
         return self.residual(self.all_seen(plain)) - self.residual(self.all_seen(with_it))
 
     def _derivatives(self, hypothesis: Hypothesis, seen: Seen, effect: Effect, values: Values) -> Array:
-        """(F, 3, p), body frame."""
+        """Return d e / d parameters of an effect, (F, 3, p), body frame."""
         specs = amplitudes(effect)
         if isinstance(effect, ClockEffect):
             by_late = self._by_late(seen, effect.acts_on)
@@ -495,7 +492,7 @@ class Problem:
         return np.asarray(seen.body_from_measured @ self.rotation_dvl_from_body @ of_dvl)
 
     def _by_late(self, seen: Seen, clock: ActsOn) -> Array:
-        """(F, 3) d e / d lateness of a clock, m/s per s, body frame."""
+        """Return d e / d delay of a clock, (F, 3), m/s per s, body frame."""
         if clock is ActsOn.DVL_CLOCK:
             return rotate_vectors(seen.body_from_measured, seen.rate_of_change)
         motion = seen.motion
@@ -510,19 +507,19 @@ class Problem:
 def make_problem(
     recordings: Sequence[RecordedStreams], rotation_dvl_from_body: Array, lever_arm: Array, offsets: Sequence[Offsets]
 ) -> Problem:
-    """The problem on bins where all streams are known, with offsets (about which hypotheses lie) and without."""
+    """Make the problem on bins where all streams are available, at the initial offsets and at none."""
     grids = tuple(make_grid(recording, offset) for recording, offset in zip(recordings, offsets, strict=True))
     problem = Problem(tuple(recordings), rotation_dvl_from_body, np.asarray(lever_arm, dtype=float), grids)
     return problem if problem.measured[2] else replace(problem, shown_turns=_shown_turns(problem))
 
 
-# A turn of the mounting that, as large as its prior, does less than this (m/s rms), is not fitted: it would take in
-# what is left of the waves, by tens of degrees
+# Mounting rotations that act by less than this (m/s RMS) at their prior size are not fitted: they would absorb the
+# residual of waves with tens of degrees
 TURN_SHOWN_MPS = 0.002
 
 
 def _shown_turns(problem: Problem) -> Array:
-    """(3, 3) projection of φ on the turns that are shown, whatever the scale."""
+    """Return the projection (3, 3) of φ on rotations that are observable whatever the scale."""
     columns = problem.calibration_columns(no_effect(), problem.all_seen(no_effect())).reshape(-1, 6)
     if not len(columns):
         return np.eye(3)

@@ -1,4 +1,4 @@
-"""The streams of a recording as they are, each with its own stamps, and steps back of the DVL's clock."""
+"""Streams of a recording with their own stamps, and backward steps of the DVL's clock."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ from ...verdict.reasons import Reason
 from .settings import SETTINGS
 from .stream_curve import Curve
 
-# Two steps of a stream are one where it is stamped twice: shorter than so many usual steps, so many times running
+# A stream is stamped twice where two steps span less than this many usual steps, at least FEWEST times in a row
 TWO_STEPS, FEWEST = 1.25, 4
-# In order of stamps its samples go to and fro between two times, by so many times what they do elsewhere; where they
-# do not, the mixture is as good as either
+# Sorted by stamp, such samples alternate between two times: second differences exceed the usual ones by this factor.
+# Otherwise the mixture does no harm.
 TO_AND_FRO = 2.0
-# A step that differs from the usual one by a share of it tells of a clock, where so many do at most: by so many times
-# how steps scatter, within these
+# Irregular steps indicate a clock if there are at most RARE. Irregular: by FAR times the scatter of steps, within these
+# relative bounds
 RARE, REGULAR, FAR = 3, (0.03, 0.1), 8.0
-# Of two samples nearer than this share of the usual step, measured a while apart, a curve through both would ring
+# Of two samples closer than this share of the usual step, one is removed: an interpolating curve would ring
 TOO_SHORT = 0.5
-# By as much at most, s, is a clock set back of which the stamps do not tell by how much; and of which they do
+# Largest backward steps, s: if the stamps do not show the size, and if they do
 UP_TO_S, LONGEST_S = 2.0, 5.0
 
 
 class SetBack(NamedTuple):
-    """before, after: stamps (s) between which a clock was set back. by: s; how much at most, where it is not known."""
+    """Backward clock step between stamps `before` and `after` (s). by: s; upper bound if unknown."""
 
     before: float
     after: float
@@ -57,12 +57,11 @@ class SetBack(NamedTuple):
 
 
 def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray[np.bool_]]:
-    """Where a clock was set back, and which samples (N,) are to be kept: stamped in a time that was stamped once.
+    """Find backward steps of a clock, and the samples (N,) outside doubly stamped times.
 
-    time: (N,) s, stamps in order. velocity: (N, 3) m/s, of the same samples. A clock that is set back by two seconds
-    stamps two seconds once more; or a driver that wants stamps in order throws two seconds away, which leaves one step
-    that is short, of which one sample at most is kept. A DVL that pings faster for a while has short steps as well, but
-    for longer, and its velocity goes on as smoothly.
+    time: (N,) s, sorted stamps. velocity: (N, 3) m/s of these samples. A backward step of two seconds stamps two
+    seconds twice. A driver that requires increasing stamps drops two seconds instead: one short step, of which at most
+    one sample is kept. A DVL that pings faster for a while has short steps for longer, and a smooth velocity.
     """
     once = np.ones(len(time), dtype=bool)
     if len(time) < 4 * FEWEST:
@@ -88,26 +87,26 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
 
 
 SECOND_NS = 1_000_000_000
-# Of files that are recordings by themselves
+# Suffixes of files that are recordings by themselves
 SUFFIXES = (".mcap.zstd", ".db3.zstd", ".mcap", ".db3", ".bag")
-# A reference that moves faster than this shows that a DVL's zero is none, m/s
+# m/s; while the reference is faster than this, a DVL velocity of zero is a dropout
 MOVING_MPS = 0.1
-# However long a recording is, its streams are averaged to no less
+# Lowest rate of averaged streams, however long a recording is
 SLOWEST_AVERAGE_HZ = 2.5
-# So many samples of the reference tell all that can be compared with one of the DVL
+# Samples of the reference per DVL sample that suffice for the comparison
 PER_DVL_SAMPLE = 2.5
 
 
 @dataclass(frozen=True)
 class RecordedStreams:
-    """The streams of one recording. Times in s since its first DVL stamp (first_ns).
+    """Streams of one recording. Times in s since its first DVL stamp (first_ns).
 
     name: of the bag. dvl: (N, 3) m/s, DVL frame. reference: (M, 3) m/s, in the earth (ENU) or the body by `frame`.
-    attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of neighbours alike in sign. rates: (G, 3) rad/s,
-    body. dvl_std, reference_std: (3,) m/s, RMS of what the messages claim, the reference's in its frame; None where
-    they do not. measured: (3,) which axes of the reference are measured. repeats: of `received` DVL samples, how many
-    have the very velocity of the one before; spikes: how many were far off and are left out. registration: how the
-    instruments stand, where that is known already. set_back: where the DVL's clock was.
+    attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of continuous sign. rates: (G, 3) rad/s, body.
+    dvl_std, reference_std: (3,) m/s, RMS of reported standard deviations, the reference's in its frame; None if not
+    reported. measured: (3,) axes that the reference measures. repeats: number of the `received` DVL samples that equal
+    the previous velocity; spikes: number of outliers removed. registration: initial guess, if known. set_back: backward
+    steps of the DVL's clock.
     """
 
     name: str
@@ -128,7 +127,7 @@ class RecordedStreams:
 
     @property
     def available(self) -> frozenset[EffectNeeds]:
-        """What effects may need and this recording has."""
+        """Return the inputs of effects that this recording has."""
         has = {
             EffectNeeds.ATTITUDE: self.attitude is not None,
             EffectNeeds.ANGULAR_VELOCITY: self.attitude is not None or self.rates is not None,
@@ -137,11 +136,11 @@ class RecordedStreams:
 
     @property
     def seconds(self) -> float:
-        """Length of the DVL's stream, s."""
+        """Return the length of the DVL's stream, s."""
         return float(self.dvl.time[-1] - self.dvl.time[0]) if len(self.dvl.time) else 0.0
 
     def rotation_enu_from_body(self, at: Array) -> Array:
-        """(M, 3, 3)."""
+        """Return rotation matrices (M, 3, 3) at times (M,) s."""
         if self.attitude is None:
             raise ValueError(f"{self.name}: no attitude")
         attitude = self.attitude
@@ -153,14 +152,14 @@ class RecordedStreams:
         return np.asarray(attitude.kept.at("rotation", at, rotation))
 
     def angular_velocity(self, at: Array) -> Array:
-        """(M, 3) rad/s, body: of the IMU's own rates, or of its attitude where these are too slow."""
+        """Return (M, 3) rad/s, body: of the gyroscopes, or of the attitude if these are too slow."""
         rates, attitude = self.rates, self.attitude
         if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
             own = rates.quiet
             return np.asarray(own.kept.at("values", at, lambda: own(at)))
         if attitude is None:
             raise ValueError(f"{self.name}: no angular velocity")
-        oriented = attitude.quiet  # a hundredth of a degree ten times a second is a tenth of a degree per second
+        oriented = attitude.quiet  # 0.01° of noise at 10 Hz is 0.1°/s
 
         def turning() -> Array:
             q = oriented(at)
@@ -186,17 +185,16 @@ def make_recording(
     axes: str = "auto",
     first_ns: int = 0,
 ) -> RecordedStreams:
-    """A recording from stamps (s) and values of each stream; attitude as quaternions (A, 4).
+    """Make a recording from stamps (s) and values of each stream; attitude as quaternions (A, 4).
 
     Parameters
     ----------
     name: Of the recording.
     dvl, reference, attitude, rates: (N,) s and (N, k).
     frame: Of the reference.
-    dvl_std, reference_std: m/s that messages claim, (3,) or of each sample (N, 3); None where they do not.
+    dvl_std, reference_std: Reported standard deviation, m/s, (3,) or per sample (N, 3); None if not reported.
     axes: As gnss_axes.
     first_ns: Stamp of the DVL's first sample.
-
     """
     events, once = set_back(*dvl)
     if not once.all():
@@ -233,12 +231,12 @@ def make_recording(
 
 
 def _usual(std: Array | None) -> Array | None:
-    """(3,) median of claims (3,) or (N, 3)."""
+    """Return the median (3,) of standard deviations (3,) or (N, 3)."""
     return std if std is None or std.ndim == 1 else np.asarray(np.median(std, axis=0))
 
 
 def _rms(std: Array | None) -> Array | None:
-    """(3,) RMS of claims (3,) or (N, 3), without those that say that nothing was measured."""
+    """Return the RMS (3,) of standard deviations (3,) or (N, 3), without those of unmeasured axes."""
     usual = _usual(std)
     if std is None or usual is None or std.ndim == 1:
         return std
@@ -249,7 +247,7 @@ def _rms(std: Array | None) -> Array | None:
 
 
 def _claiming(stream: tuple[Array, Array], std: Array | None) -> Curve:
-    """A stream with what its messages claim, (3,) or (N, 3); who says -1 or nothing claims what is usual."""
+    """Return a curve with reported standard deviations (3,) or (N, 3); missing ones (-1) are the median."""
     usual = _usual(std)
     if std is None or usual is None or std.ndim == 1:
         return Curve(*stream, std)
@@ -277,7 +275,7 @@ def _measured_axes(velocity: Array, std: Array | None, axes: str) -> tuple[bool,
 
 @dataclass(frozen=True)
 class Loaded:
-    """Recordings and what the user should know of the data."""
+    """Recordings and notes on the data for the user."""
 
     recordings: tuple[RecordedStreams, ...]
     notes: tuple[str, ...]
@@ -286,9 +284,9 @@ class Loaded:
 def load_recordings(
     source: Opened | Sequence[Path], parameters: Parameters, topics: Topics, *, forget: bool = False
 ) -> Loaded:
-    """The recordings of every bag. Raises InputError, also for a bag without a reference velocity.
+    """Load the recordings of every bag. Raises InputError, also for a bag without a reference velocity.
 
-    forget: let go of the messages of each, once its samples are taken (`Recording.forget`).
+    forget: free the messages of each after reading (`Recording.forget`).
     """
     paths = source.paths if isinstance(source, Opened) else source
     if len(set(paths)) < len(paths):
@@ -304,7 +302,7 @@ def load_recordings(
         if forget:
             one.forget()
         blocks = [*streams]
-        del streams  # `_recording` lets go of each as soon as it can
+        del streams  # `_recording` frees each as soon as it can
         registration = one.registration(topics, parameters)
         recordings.append(replace(_recording(name, blocks, parameters, own), registration=registration))
         if len(paths) > 1:
@@ -319,7 +317,7 @@ def load_recordings(
 
 
 def recording_names(paths: Sequence[Path]) -> list[str]:
-    """A name for each bag that no other has: its own, with its folder's where two are called the same."""
+    """Return a unique name for each bag, prefixed by its folder's if necessary."""
     full = [path.resolve() for path in paths]
     names = [_without_suffix(path.name) for path in full]
     shared = Counter(names)
@@ -333,7 +331,7 @@ def _without_suffix(name: str) -> str:
 
 
 def _read(path: Path, opened: Opened, parameters: Parameters, topics: Topics) -> tuple[Streams, list[str]]:
-    """All samples of a recording, and what the user should know of them."""
+    """Read all samples of a recording, and notes on the data."""
     found: list[Reason] = []
     chosen = topics.found_in(opened.types)
     check_topics(opened, chosen, found)
@@ -353,7 +351,7 @@ def _read(path: Path, opened: Opened, parameters: Parameters, topics: Topics) ->
 
 
 def _unfit_positions(path: Path, msgtype: str, topic: str, velocities: Array) -> list[str]:
-    """What to do with positions whose velocities (N, 3) m/s are too noisy to be compared; nothing about others."""
+    """Return advice for positions with velocities (N, 3) m/s too noisy to compare, else nothing."""
     kind = VELOCITY_TYPES.get(msgtype)
     is_noisy = not len(velocities) or math.sqrt(white_noise(velocities)) > NOISY_MPS
     if kind is None or kind.position is None or not is_noisy:
@@ -365,7 +363,7 @@ def _unfit_positions(path: Path, msgtype: str, topic: str, velocities: Array) ->
 
 
 def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, notes: list[str]) -> RecordedStreams:
-    """blocks: of DVL, reference and IMU, which it takes out of the list."""
+    """Make a recording. blocks: of DVL, reference and IMU; removed from the list to free memory."""
     clocks = Clocks.of(parameters)
     given = blocks.pop(0)
     dvl = _in_order(_valid(given, parameters), parameters, notes)
@@ -421,20 +419,20 @@ def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, not
 
 def _stream(stamps_ns: NDArray[np.int64], values: Array, first_ns: int) -> tuple[Array, Array]:
     time = 1e-9 * (stamps_ns - first_ns)
-    later = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0.0])  # a jump taken off may cross two
+    later = np.concatenate([[True], np.diff(np.maximum.accumulate(time)) > 0.0])  # corrected steps may cross two
     return (time, values) if later.all() else (time[later], values[later])
 
 
 def _claimed_stream(
     stamps_ns: NDArray[np.int64], values: Array, std: Array | None, first_ns: int
 ) -> tuple[tuple[Array, Array], Array | None]:
-    """`_stream` with the claims (N, 3) of its samples."""
+    """Return `_stream` with the standard deviations (N, 3) of its samples."""
     stream = _stream(stamps_ns, values, first_ns)
     return stream, None if std is None else _stream(stamps_ns, std, first_ns)[1]
 
 
 def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
-    """Rows that are samples, finite, no faster than max_speed, without a negative variance but for -1."""
+    """Return rows that are finite, no faster than max_speed and without a negative variance except -1."""
     speed = np.linalg.norm(block.values, axis=1)
     valid = (block.refused == 0) & np.isfinite(speed) & (speed <= parameters.max_speed)
     if block.stream is Stream.DVL:
@@ -444,12 +442,12 @@ def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
 
 
 def _part(block: SampleBlock, at: NDArray[np.bool_]) -> SampleBlock:
-    """Rows of a mask (N,); no copy of them where these are all."""
+    """Return the rows of a mask (N,), without a copy if these are all."""
     return block if at.all() else block.part(at)
 
 
 def zeros_while_moving(dvl: SampleBlock, reference: SampleBlock) -> NDArray[np.bool_]:
-    """(N,) DVL rows of exactly zero while the reference, nearest in time, moves: dropouts, not velocities."""
+    """Return (N,) whether a DVL row is exactly zero while the reference, nearest in time, moves: a dropout."""
     zero = (dvl.values == 0.0).all(axis=1)
     if not zero.any() or not len(reference):
         return zero & False
@@ -466,7 +464,7 @@ def _without_zeros(dvl: SampleBlock, reference: SampleBlock, notes: list[str]) -
 
 
 def _in_order(block: SampleBlock, parameters: Parameters, notes: list[str]) -> SampleBlock:
-    """Rows of the longest stretch without a restart, in strictly increasing order of stamps."""
+    """Return the rows of the longest part without a restart, in strictly increasing order of stamps."""
     stamps = block.stamps_ns
     jump_ns = round(parameters.max_time_jump * SECOND_NS)
     kept = np.flatnonzero(~strays(stamps, jump_ns))
@@ -484,7 +482,7 @@ def _in_order(block: SampleBlock, parameters: Parameters, notes: list[str]) -> S
 
 
 def _std(covariances: Covariances) -> Array | None:
-    """(N, 3) standard deviation per axis that messages claim; infinite where -1 or more; None where not given."""
+    """Return reported standard deviations (N, 3), infinite for a negative variance. Return None if not reported."""
     if not len(covariances.index) or (covariances.index < 0).any():
         return None
     variance = np.diagonal(covariances.distinct, axis1=1, axis2=2)[covariances.index]

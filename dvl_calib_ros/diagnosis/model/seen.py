@@ -1,4 +1,4 @@
-"""A recording as a hypothesis has it, and the derivatives of its residual."""
+"""Evaluation of a hypothesis for a recording, and derivatives of the residual."""
 
 from __future__ import annotations
 
@@ -19,13 +19,11 @@ from .time_grid import PASSES
 
 @dataclass(frozen=True)
 class Seen:
-    """A recording through a hypothesis, at F times. motion: of the reference point. at_dvl: of the DVL. measured:
-    (F, 3) m/s smoothed DVL velocity, its frame. error: (F, 3) e, body frame.
-    angles: φ and all turns of the mounting, rad, (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or more.
-    dvl_stamps, reference_stamps: (F,) s that these give the same times. projection: (F, A, 3) or (1, A, 3) from the
-    body frame to the axes that are compared. change, closely, as_it_is: make `rate_of_change`, `close` and
-    `close_as_it_is`.
-    """
+    """A recording under a hypothesis, at F times. motion: of the reference point. at_dvl: of the DVL. measured: (F, 3)
+    m/s smoothed DVL velocity, its frame. error: (F, 3) e, body frame. angles: φ plus rotations of the mounting, rad,
+    (3,) or (F, 3). body_from_measured: D⁻¹ with these, (3, 3) or (F, 3, 3). dvl_stamps, reference_stamps: (F,) s of the
+    same times. projection: (F, A, 3) or (1, A, 3) from the body frame to the compared axes. change, closely, as_it_is:
+    evaluate `rate_of_change`, `close` and `close_as_it_is`."""
 
     motion: EffectInput
     at_dvl: EffectInput
@@ -42,21 +40,21 @@ class Seen:
 
     @cached_property
     def rate_of_change(self) -> Array:
-        """(F, 3) m/s² of the smoothed DVL velocity, which few ask for."""
+        """Return (F, 3) m/s² of the DVL velocity, on demand."""
         return self.change()
 
     @cached_property
     def close(self) -> tuple[Seen, NDArray[np.intp] | slice]:
-        """The same without effects that have a memory, at times so close that these miss nothing, and which are its."""
+        """Return the evaluation without memory effects at closely spaced times, and the indices of the own times."""
         return self.closely() or (self, slice(None))
 
     @cached_property
     def close_as_it_is(self) -> tuple[EffectInput, NDArray[np.intp] | slice]:
-        """The motion of `close` not smoothed: smoothed, it would lack what a filter takes off."""
+        """Return the unsmoothed motion of `close`: smoothing would remove the variation that a filter acts on."""
         return self.as_it_is() or (self.motion, slice(None))
 
     def on_reference(self, injections: Sequence[Injection]) -> Array:
-        """(F, 3) m/s, traces on REFERENCE, body frame."""
+        """Return (F, 3) m/s, traces on REFERENCE, body frame."""
         lagging = [each for each in injections if isinstance(each.effect, EffectWithMemory)]
         if not lagging or self.close_as_it_is[0] is self.motion:
             return traces(injections, self.motion, ActsOn.REFERENCE)
@@ -65,12 +63,12 @@ class Seen:
         return np.asarray(found + traces(lagging, close, ActsOn.REFERENCE)[own])
 
     def compared(self, body: Array) -> Array:
-        """(F, 3) or (F, 3, p) of the body frame along the axes that are compared, (F, A) or (F, A, p)."""
+        """Project (F, 3) or (F, 3, p) of the body frame on the compared axes."""
         return self.projection @ body if body.ndim > 2 else rotate_vectors(self.projection, body)
 
 
 def measured_velocity(curve: Curve, at: Array, at_samples: bool) -> tuple[Array, Array]:
-    """(F, 3) velocity and smoothed velocity."""
+    """Return (F, 3) velocity and smoothed velocity."""
 
     def made() -> tuple[Array, Array]:
         smooth = curve.smooth
@@ -83,7 +81,7 @@ def measured_velocity(curve: Curve, at: Array, at_samples: bool) -> tuple[Array,
 
 
 def velocity_change(curve: Curve, at: Array) -> Array:
-    """(F, 3) m/s² of a velocity."""
+    """Return (F, 3) m/s² of a velocity."""
     clipped = np.clip(at, curve.time[0], curve.time[-1])
     return np.asarray(curve.kept.at("change", at, lambda: curve.derivative(clipped)))
 
@@ -91,10 +89,10 @@ def velocity_change(curve: Curve, at: Array) -> Array:
 def undo_effects(
     injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn, turned: Array | None
 ) -> tuple[EffectInput, Array]:
-    """The motion before the effects of one stage have acted on it, and what they have added (F, 3), or (3,) nothing.
+    """Return the motion before the effects of one stage, and their contribution (F, 3), or (3,) zeros.
 
-    Where an effect is not small against the motion, as of a spike of 7 m/s, a pass may lead further off than the one
-    before; it is not taken there.
+    If an effect is not small against the motion, as for a spike of 7 m/s, iterations may diverge. Samples keep their
+    last converging iteration.
     """
     here = [each for each in injections if each.effect.acts_on is acts_on]
     if not here:
@@ -104,7 +102,7 @@ def undo_effects(
     for _ in range(PASSES):
         before, added = added, traces(here, motion, acts_on)
         added = added if turned is None else rotate_vectors(turned, added)
-        if not any(isinstance(each.effect, Effect) and each.effect.of_velocity for each in here):  # that is all
+        if not any(isinstance(each.effect, Effect) and each.effect.of_velocity for each in here):  # exact
             return replace(motion, velocity_body=after - added), added
         if np.array_equal(added, before):
             break
@@ -122,8 +120,8 @@ def lagged_columns(
     own: NDArray[np.intp] | slice,
     columns: Array,
 ) -> Array:
-    """Derivatives (C, 3, p) of the reference point's velocity, m/s, at close times, of which some are a recording's
-    own -> (F, 3, p) of references that follow with a lag, as `_begun`."""
+    """Filter derivatives (C, 3, p) at close times by lags of the reference; return (F, 3, p) at own times. Input is the
+    reference point's velocity, m/s."""
     if close is seen and len(lags) == 1:
         ((lag, values),) = lags
         return lag.follows(seen.motion, columns, values)
@@ -133,34 +131,34 @@ def lagged_columns(
 
 
 def without_remembered(lags: Sequence[tuple[EffectWithMemory, Values]], seen: Seen, columns: Array) -> Array:
-    """Derivatives (F, 3, p) m/s without what a lag explains of them by what it remembers of before."""
+    """Subtract from derivatives (F, 3, p) m/s the part that a lag remembers from earlier samples."""
     for lag, values in lags:
         columns = columns - lag.of_before(seen.motion, columns, values)
     return columns
 
 
 def rotate_vectors(matrix: Array, values: Array) -> Array:
-    """(N, 3) values, multiplied by one matrix (3, 3), (1, 3, 3) or by one each (N, 3, 3)."""
+    """Multiply values (N, 3) by one matrix (3, 3), (1, 3, 3) or one each (N, 3, 3)."""
     if matrix.ndim == 2 or len(matrix) == 1:
         return values @ (matrix if matrix.ndim == 2 else matrix[0]).T
     return np.asarray(np.einsum("nij,nj->ni", matrix, values))
 
 
 def columns_by_turn(hypothesis: Hypothesis, seen: Seen, measured: Array) -> Array:
-    """(F, 3, 3) d e / d (φ + turns), body frame, of velocities (F, 3) m/s in the DVL's.
+    """Return d e / d (φ + turns), (F, 3, 3), body frame, of DVL velocities (F, 3) m/s.
 
     D⁻¹ y with y the unscaled velocity is Exp(θ)ᵀ y, and Exp(θ + δ) = Exp(J δ) Exp(θ) with J the left Jacobian.
     """
     matrix = seen.body_from_measured * (1.0 + hypothesis.scale)
     unscaled, jacobian = measured / (1.0 + hypothesis.scale), _left_jacobian(seen.angles)
-    if matrix.ndim == 2:  # linear in the velocity: one product of matrices in place of many small ones
+    if matrix.ndim == 2:  # linear in the velocity: one matrix product
         of_axes = (matrix @ skew(np.eye(3)) @ jacobian).reshape(3, 9)
         return np.asarray((unscaled @ of_axes).reshape(-1, 3, 3))
     return np.asarray(matrix @ skew(unscaled) @ jacobian)
 
 
 def _left_jacobian(angles: Array) -> Array:
-    """(..., 3, 3) of rotation vectors (..., 3) rad: I + (1 - cos θ) / θ² [θ×] + (θ - sin θ) / θ³ [θ×]²."""
+    """Return (..., 3, 3) of rotation vectors (..., 3) rad: I + (1 - cos θ) / θ² [θ×] + (θ - sin θ) / θ³ [θ×]²."""
     square = np.maximum((angles**2).sum(axis=-1), 1e-12)[..., None, None]
     size = np.sqrt(square)
     cross = skew(angles)
@@ -169,13 +167,13 @@ def _left_jacobian(angles: Array) -> Array:
 
 
 def trace_columns(effect: Effect, motion: EffectInput, values: Values) -> Array:
-    """(F, 3, p) d e / d parameters of an effect of its trace on a motion, in the frame of that."""
+    """Return d e / d parameters of an effect's trace on a motion, (F, 3, p), in the motion's frame."""
     specs = amplitudes(effect)
     if all(spec.linear for spec in specs):
         none = {**values, **{spec.name: 0.0 for spec in specs}}
         slopes = [effect.trace(motion, {**none, spec.name: 1.0}) for spec in specs]
         own = {spec.name for spec in effect.parameters}
-        if any(value for name, value in none.items() if name not in own):  # a height that is known and not fitted
+        if any(value for name, value in none.items() if name not in own):  # a known height is not fitted
             still = effect.trace(motion, none)
             slopes = [slope - still for slope in slopes]
     else:
@@ -184,7 +182,7 @@ def trace_columns(effect: Effect, motion: EffectInput, values: Values) -> Array:
 
 
 def central_difference(spec: EffectParameter, values: Values, of: Callable[[Values], Array]) -> Array:
-    """d of / d parameter, by central differences, within its bounds."""
+    """Return d of / d parameter by central differences within its bounds."""
     step = 0.05 * spec.typical
     low, high = max(values[spec.name] - step, spec.low), min(values[spec.name] + step, spec.high)
     slope: Array = (of({**values, spec.name: high}) - of({**values, spec.name: low})) / (high - low)

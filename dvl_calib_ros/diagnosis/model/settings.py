@@ -1,4 +1,4 @@
-"""Every threshold of the diagnosis, with its reason."""
+"""Thresholds of the diagnosis, with reasons."""
 
 from __future__ import annotations
 
@@ -9,30 +9,27 @@ from dataclasses import dataclass
 class DiagnosisSettings:
     """Thresholds. Times in s, rates in Hz, velocities in m/s, angles in rad.
 
-    Reading: samples of a stream closer than 1 / max_stream_rate are averaged (what the effects do lies below 1 Hz);
-    across max_gap_intervals of a stream nothing is known of it. own_rates_from: angular velocities of an IMU at least
-    so fast are its own; a slower one says more by the curve of its attitude. unmeasured_std: a standard deviation from
-    which on an axis counts as not measured (drivers write 1e3 (m/s)² and more).
+    Reading: samples of a stream closer than 1 / max_stream_rate are averaged (effects lie below 1 Hz); a gap is longer
+    than max_gap_intervals of a stream. own_rates_from: lowest rate of gyroscopes in use; at lower rates the derivative
+    of the attitude is better. unmeasured_std: standard deviation from which an axis is unmeasured (drivers write 1e3
+    (m/s)² and more).
 
-    Comparing: the residual is averaged over bins_per_interval intervals of the slower stream, so that what is lost and
-    gained near its Nyquist frequency by interpolation at one phase or another does not look like a delay; over
-    shortest_bin at least, and so that no more than max_bins are left. max_points: of a stream, to which a long
-    recording is averaged.
+    Comparing: the residual is averaged over bins_per_interval intervals of the slower stream, so that interpolation
+    errors near its Nyquist frequency do not resemble a delay. Bins are at least shortest_bin long and at most max_bins
+    in number. max_points: number of samples of a stream; longer recordings are averaged.
 
-    Finding: level: family-wise, of the claim that
-    there is an effect. max_effects: named at most. ghost_share: of what is explained already that a further effect
-    must add; less is what the inexactness of a strong one leaves, unless it is all that is left, or an arm, a clock or
-    a lag and more than ghost_of_noise of the noise's deviance. indistinguishable: deviance within which two
-    explanations are one answer: with truth j and a rival that looks better by d, the odds are those of a normal
-    variable beyond √d. robust_level: p of an effect by the scatter of its blocks, a test with few degrees of freedom
-    that no colour of the noise upsets.
+    Finding: level: family-wise, of any effect. max_effects: largest number of effects. ghost_share: least share of the
+    explained deviance that a further effect adds. Less may be the residual of an inexact strong effect. Exceptions: the
+    effect explains all of the residual; an arm, a clock or a lag adds more than ghost_of_noise of the noise's deviance.
+    indistinguishable: deviance within which two explanations are equivalent: for a rival better by d, the odds are
+    those of a normal variable beyond √d. robust_level: p of an effect from the scatter of blocks, valid for noise of
+    any colour.
 
-    Judging: block, folds: of hold-out. noise_tolerance: so many standard errors may the noise of all frequencies lie
-    above that of the high ones. instead_of: deviance of effects that an unknown cause may stand in for; more would show
-    without a test, and what a curve between samples leaves of it is more than noise. instead_share: of that, by which
-    it must explain more.
-    prior_angle, prior_scale: standard deviation of misalignment and scale, held so where the data says little (roll,
-    the scale of sway): else these would take in much of a lever arm.
+    Judging: block, folds: of hold-out. noise_tolerance: standard errors by which the noise of all frequencies may
+    exceed the high ones. instead_of: deviance up to which an unknown cause may replace effects; a larger unknown cause
+    would be significant without a test, and interpolation leaves more than noise of it. instead_share: relative
+    deviance by which the unknown cause must be better. prior_angle, prior_scale: standard deviation of misalignment and
+    scale. They hold insignificant parameters (roll, scale of sway), which would absorb a lever arm.
     """
 
     max_stream_rate: float = 10.0

@@ -1,4 +1,4 @@
-"""One stream as a function of time: between its samples, without its spikes, and what of it is noise."""
+"""One stream as a function of time: interpolation, outlier rejection and noise estimate."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from ...calibration.streams.outliers import deviation_from_neighbours, neighbour
 from .claimed_noise import loudness
 from .settings import SETTINGS
 
-# Shorter stretches have too few frequencies to tell motion from noise, whose power is averaged over so many bands
+# Fewest samples for a spectrum that separates motion from noise; number of bands whose power is averaged
 MIN_SPECTRUM, BANDS = 60, 40
-# Power of a band over that of noise up to which it is noise alone, and from which all of it is kept
+# Ratios of a band's power to noise up to which it is removed as noise, and from which it is kept
 NOISE_ALONE, SOME_MOTION = 1.4, 2.5
-# Fourth differences
+# Weights of fourth differences
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
-# Streams slower than this show turns and waves barely; they have no frequencies to spare
+# Longest interval, s, of a stream that resolves turns and waves: only its noise is removed; samples per smoothing cubic
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
-# Standard deviations beyond which a sample is an outlier that pulls no more; and by how many of itself the size of the
-# tails has to be above that of normal noise: a median of neighbours' differences is known to 1.6 / √n
+# Clipping of outliers, in standard deviations; relative excess of tails that is significant (3 σ): the median of
+# neighbours' differences has a relative σ of 1.6 / √n
 SPIKY, SURELY_HEAVY = 6.0, 3.0 * 1.6
-# Times before and after, in intervals, whose product is larger lie where a sample is lost: 0.25 in the middle of two
+# Largest product of the intervals to both neighbours, in usual intervals; at the middle of two samples it is 0.25
 TOLD = 0.4
 
 
 class Remembered:
-    """What was made of a stream at some times, the last few: fits look at the same times again and again."""
+    """Cache of values at the last few sets of times: fits evaluate the same times repeatedly."""
 
     _LIMIT = 8
 
@@ -44,10 +44,10 @@ class Remembered:
         self._made: dict[Any, Any] = {}
 
     def at(self, what: str, times: Array, make: Callable[[], Any]) -> Any:
-        """What `make` gives, which is asked if this is not kept for these times (M,) s."""
+        """Return the result of `make`, cached for times (M,) s."""
         key = what, len(times), float(times.sum()), *times[[0, len(times) // 2, -1] if len(times) else []].tolist()
         made = self._made.pop(key) if key in self._made else make()
-        self._made[key] = made  # as the newest
+        self._made[key] = made  # newest entry
         if len(self._made) > self._LIMIT:
             self._made.pop(next(iter(self._made)))
         return made
@@ -55,10 +55,9 @@ class Remembered:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One stream as a function of time: cubic between samples. time: (N,) s, increasing. values: (N, k). claimed:
-    (k,) standard deviation that messages claim. like: a curve of the same stream, without made-up noise, that tells
-    what is noise. claims: (N, k) standard deviation that each sample's message claims.
-    """
+    """Stream as a function of time, cubic between samples. time: (N,) s, increasing. values: (N, k). claimed: (k,)
+    reported standard deviation. like: curve of the same stream without simulated noise, which defines the noise level.
+    claims: (N, k) standard deviation reported per sample."""
 
     time: Array
     values: Array
@@ -69,7 +68,7 @@ class Curve:
 
     @cached_property
     def interval(self) -> float:
-        """Median time between samples, s."""
+        """Return the median time between samples, s."""
         return float(np.median(np.diff(self.time))) if len(self.time) > 1 else 1.0
 
     @cached_property
@@ -77,17 +76,17 @@ class Curve:
         return make_interp_spline(self.time, self.values, k=min(3, len(self.time) - 1))
 
     def __call__(self, at: Array) -> Array:
-        """(M, k) at times (M,) s; before the first and after the last as there."""
+        """Return values (M, k) at times (M,) s, constant beyond the ends."""
         values: Array = self._spline(np.clip(at, self.time[0], self.time[-1]))
         return values
 
     @cached_property
     def quiet(self) -> Curve:
-        """The same without those frequencies in which there is next to nothing but noise, stretch by stretch.
+        """Return the curve without frequencies of pure noise, stretch by stretch.
 
-        So a stream is as noisy between its samples as at them, and a delay does not gain by the noise. On sines about
-        the line from end to end, so that nothing rings there. What holds any motion is left as it is: turns are rare,
-        and a filter that is best on average would bend them.
+        Noise then is equal between and at samples, and a delay does not gain from it. The sine transform about the line
+        between the ends avoids ringing. Frequencies with any motion are kept: turns are rare, and a filter of least
+        mean error would distort them.
         """
         values = self.values.copy()
         for part in self.stretches:
@@ -102,28 +101,28 @@ class Curve:
 
     @cached_property
     def smooth(self) -> Curve:
-        """The same for regressors: `quiet`, or of a slow stream each sample on the cubic through those around it."""
+        """Return the curve for regressors: `quiet`, or for a slow stream each sample on a local cubic."""
         if self.interval <= FAST_ENOUGH_S or len(self.time) <= SMOOTH_SAMPLES:
             return self.quiet
         return Curve(self.time, _on_cubics(self.values))
 
     @cached_property
     def stretches(self) -> list[slice]:
-        """Parts without a gap."""
+        """Return the ranges without a gap."""
         breaks = np.flatnonzero(np.diff(self.time) > SETTINGS.max_gap_intervals * self.interval) + 1
         edges = [0, *breaks.tolist(), len(self.time)]
         return [slice(start, end) for start, end in pairwise(edges)]
 
     @cached_property
     def derivative(self) -> Any:
-        """(M,) -> (M, k) per s, of the curve as it is."""
+        """Return the derivative (M,) -> (M, k) per s of the unsmoothed curve."""
         return self._spline.derivative()
 
     @cached_property
     def roughness(self) -> Array:
-        """(k,) what neighbours do not tell of a usual sample, std: its noise, and what it is too far from them to show.
+        """Return the standard deviation (k,) of a usual sample about its neighbours: noise, and unresolved motion.
 
-        Of fourth differences, to which turns are nothing and white noise is √70 times itself.
+        From fourth differences, which cancel turns and inflate white noise by √70.
         """
         if self.like is not None:
             return self.like.roughness
@@ -133,9 +132,9 @@ class Curve:
 
     @cached_property
     def tails(self) -> float:
-        """By what factor the variance of the noise, spikes apart, is surely more than that of the usual sample's.
+        """Return the significant variance ratio of noise without outliers to a usual sample's noise.
 
-        1 of normal noise; of Student's t with few degrees more, and of a slow stream unknown, whose turns look like it.
+        1 for normal noise, more for Student's t of few degrees of freedom; 1 for a slow stream, whose turns look alike.
         """
         if self.interval > FAST_ENOUGH_S or len(self.time) < MIN_SPECTRUM:
             return 1.0
@@ -149,25 +148,25 @@ class Curve:
 
     @cached_property
     def loudness(self) -> Array:
-        """(N, k) standard deviation of each sample's noise over that of the usual one, if its claim tells it."""
+        """Return each sample's noise level (N, k) relative to the usual one, if reported values predict it."""
         if self.like is not None:
             return self.like.loudness
         return loudness(self.time, self.claims, np.diff(self.values, 4, axis=0), FOURTH)
 
     def part(self, kept: NDArray[np.bool_]) -> Curve:
-        """The samples (N,) that are to be kept."""
+        """Return the samples selected by a mask (N,)."""
         claims = None if self.claims is None else self.claims[kept]
         return Curve(self.time[kept], self.values[kept], self.claimed, claims=claims)
 
     @cached_property
     def from_neighbours(self) -> Array:
-        """(N, k) how far samples are from the cubic through two neighbours on either side, over their loudness."""
+        """Return the deviation (N, k) from the cubic through two neighbours on either side, over the noise level."""
         return deviation_from_neighbours(self.values) / self.loudness
 
     def without_spikes(self) -> Curve:
-        """The same without samples far from where their neighbours are, which would bend the curve about them.
+        """Reject samples far from their neighbours, which would bend the curve.
 
-        Of a fast stream only: between the samples of a slow one a vehicle can turn (`without_slow_outliers`).
+        Fast streams only: between the samples of a slow one a vehicle can turn (`without_slow_outliers`).
         """
         if self.interval > FAST_ENOUGH_S:
             return self
@@ -176,9 +175,9 @@ class Curve:
 
     @cached_property
     def noise(self) -> Array:
-        """(k,) standard deviation of a usual sample's noise: the roughness; of a slow stream no more than is claimed.
+        """Return the standard deviation (k,) of usual noise: the roughness; for a slow stream at most the reported one.
 
-        Between the samples of a slow stream a vehicle turns, which is rough as well; else a claim is not believed.
+        A slow stream is rough from turns between samples as well; otherwise reported values are not trusted.
         """
         if self.like is not None:
             return self.like.noise
@@ -187,19 +186,19 @@ class Curve:
         return np.minimum(self.roughness, self.claimed)
 
     def shaken(self, rng: np.random.Generator) -> Curve:
-        """The same with as much noise again."""
+        """Return the curve with additional simulated noise of the same size."""
         noise = self.noise * self.loudness * rng.standard_normal(self.values.shape)
         return Curve(self.time, self.values + noise, like=self)
 
     def covers(self, at: Array) -> NDArray[np.bool_]:
-        """(M,) whether samples stand on both sides, not too far apart."""
+        """Return (M,) whether samples lie on both sides within the largest gap."""
         after = np.clip(np.searchsorted(self.time, at), 1, len(self.time) - 1)
         apart = self.time[after] - self.time[after - 1]
         inside = (at >= self.time[0]) & (at <= self.time[-1])
         return inside & (apart <= SETTINGS.max_gap_intervals * self.interval)
 
     def tells(self, at: Array) -> NDArray[np.bool_]:
-        """(M,) whether `covers`, and no sample is lost there of a slow stream, of which nothing else tells a wave."""
+        """Return (M,) whether the stream `covers` a time and, if slow, lost no sample there."""
         known = self.covers(at)
         if self.interval <= FAST_ENOUGH_S:
             return known
@@ -208,7 +207,7 @@ class Curve:
         return known & (apart <= TOLD * self.interval**2)
 
     def averaged(self, rate_hz: float) -> Curve:
-        """Means over groups of samples, so that they come at no more than a rate."""
+        """Average groups of samples to at most a given rate."""
         every = int(np.ceil(1.0 / (rate_hz * self.interval) - 0.05))
         if every <= 1:
             return self
@@ -224,7 +223,7 @@ class Curve:
 
 
 def _on_cubics(values: Array) -> Array:
-    """Each of values (N, k), evenly spaced, on the cubic through SMOOTH_SAMPLES about it (Savitzky and Golay)."""
+    """Smooth evenly spaced values (N, k) by local cubics of SMOOTH_SAMPLES (Savitzky and Golay)."""
     half = SMOOTH_SAMPLES // 2
     powers = np.vander(np.arange(-half, half + 1.0), 4)
     fitted = powers @ np.linalg.pinv(powers)  # (5, 5) values on the cubic of values
@@ -235,13 +234,13 @@ def _on_cubics(values: Array) -> Array:
 
 
 def _sines(values: Array) -> tuple[Array, Array]:
-    """Coefficients (N, k) of sines of values (N, k) about the line from their first to their last, and that line."""
+    """Return sine coefficients (N, k) of values (N, k) about the line between their ends, and that line."""
     line = np.linspace(values[0], values[-1], len(values))
     return dst(values - line, type=2, axis=0, norm="ortho"), line
 
 
 def _gain(power: Array, noise: float) -> Array:
-    """(N,) zero where the power (N,) of sines is that of noise, one where it is more; low bands are narrow."""
+    """Return (N,) zero where sine power (N,) is noise, one where it is more; low bands are narrow."""
     n = len(power)
     edges = np.unique(np.concatenate([[0], np.geomspace(1.0, n, BANDS), [n]]).astype(int))
     mean = np.add.reduceat(power, edges[:-1]) / np.diff(edges)
@@ -250,7 +249,7 @@ def _gain(power: Array, noise: float) -> Array:
 
 
 def segments_of(times: Sequence[Array]) -> tuple[slice, ...]:
-    """Stretches of the concatenated times, one array per recording, without a gap of three intervals or more."""
+    """Return ranges of the concatenated times, one array per recording, without a gap of three intervals or more."""
     parts: list[slice] = []
     begin = 0
     for time in times:

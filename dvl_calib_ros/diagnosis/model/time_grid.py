@@ -1,4 +1,4 @@
-"""The times at which the streams of a recording are compared."""
+"""Times at which the streams of a recording are compared."""
 
 from __future__ import annotations
 
@@ -16,22 +16,21 @@ from .recorded_streams import RecordedStreams
 from .settings import SETTINGS
 from .stream_curve import FAST_ENOUGH_S
 
-# A longer silence (s) is a pause, which makes no bin wider
+# Longer silences (s) are pauses: they do not widen the bins
 PAUSE_S = 60.0
-# Passes in which an effect is undone that acts on the very motion it changes: it is small against that motion
+# Fixed-point iterations that undo an effect on the motion it changes; the effect is small against the motion
 PASSES = 3
-# Seconds between the times of a motion that a filter follows as it was, where it is looked at more seldom than
-# `FAST_ENOUGH_S`: by its slopes at 1 Hz a wave of 5 s is a quarter too small
+# Interval, s, of the motion that a filter follows if the grid is slower than `FAST_ENOUGH_S`: from slopes at 1 Hz, a
+# wave of 5 s is a quarter too small
 CLOSE_S = 0.1
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Where a recording is looked at: at its rougher stream's own samples, which so need no interpolation.
+    """Times of the comparison: the samples of the rougher stream, which avoids interpolating it.
 
-    What is interpolated is as noisy at one phase as at another only if it has next to no noise, and is as it was
-    between its samples only if these are close. clock: that of the rougher stream, DVL_CLOCK or REFERENCE_CLOCK.
-    stamps: (M * per_bin,) s, by that clock. late: s, by a first guess.
+    Interpolated noise depends on the phase, and motion between distant samples is lost. clock: of the rougher stream,
+    DVL_CLOCK or REFERENCE_CLOCK. stamps: (M * per_bin,) s, of that clock. late: its delay, s, from the initial guess.
     """
 
     clock: ActsOn
@@ -41,20 +40,20 @@ class Grid:
 
     @property
     def bin_time(self) -> Array:
-        """(M,) s, middles, as true as the first guess."""
+        """Return (M,) s, centres of the bins, corrected by the initial guess."""
         return self.stamps.reshape(-1, self.per_bin).mean(axis=1) - self.late
 
     def averaged(self, values: Array) -> Array:
-        """(F, ...) -> (M, ...)."""
+        """Average (F, ...) per bin, (M, ...)."""
         total = values[:: self.per_bin].astype(float)
-        for of_bin in range(1, self.per_bin):  # few: faster than a mean along so short an axis
+        for of_bin in range(1, self.per_bin):  # few passes are faster than a mean along a short axis
             total += values[of_bin :: self.per_bin]
         return total / self.per_bin
 
     def between(self, time: Array) -> tuple[Array, NDArray[np.intp]] | None:
-        """Times (C,) s among which are those of the samples (F,), with those between, but over gaps; and which are.
+        """Return closer times (C,) s that include the samples (F,), except in gaps, and the samples' indices.
 
-        None where these are close enough by themselves, or too many.
+        Return None if the samples are close enough, or too many.
         """
         if len(time) < 2:
             return None
@@ -68,11 +67,10 @@ class Grid:
         return np.interp(np.arange(own[-1] + 1), own, time), own
 
     def true_time(self, injections: Sequence[Injection]) -> Array:
-        """(F,) s, increasing, at which what is stamped so was measured.
+        """Return the true times (F,) s, increasing, of the stamps.
 
-        A leap that is tried where there is none would have samples measured before those that came first; these then
-        follow one another at half the usual time between stamps, until they are as late as the leap has them. A leap
-        that is there leaves its gap in the stamps, not in time.
+        A tried clock jump where there is none reverses some samples. These follow at half the usual interval until they
+        have the jump's delay. An actual jump leaves a gap in the stamps, not in time.
         """
         time = self.stamps
         for _ in range(PASSES):
@@ -82,25 +80,25 @@ class Grid:
 
     @cached_property
     def _least(self) -> Array:
-        """(F,) s, least time since the first sample: asked for by every hypothesis, and the same for all."""
+        """Return the least time (F,) s since the first sample; cached, as it is the same for all hypotheses."""
         steps = np.diff(self.stamps, prepend=self.stamps[:1])
         return np.asarray(0.5 * np.cumsum(np.minimum(steps, np.median(steps))))
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """Lateness, s, of the DVL's and the reference's stamps against the attitude's: a first guess."""
+    """Delays, s, of the DVL's and the reference's stamps against the attitude's; initial guess."""
 
     dvl: float = 0.0
     reference: float = 0.0
 
 
-# Offsets of hypotheses may lie so far from the first guess without leaving what is known, s
+# Largest difference of a hypothesis' offsets from the initial guess, s, with data on all bins
 MARGIN_S = 0.5
 
 
 def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
-    """Choose the times at which all streams of a recording are known, by the rougher of DVL and reference."""
+    """Choose the times at which all streams of a recording are available, from the rougher of DVL and reference."""
     settings = SETTINGS
     by_dvl = float(np.linalg.norm(recording.dvl.roughness)) > float(np.linalg.norm(recording.reference.roughness))
     base, clock = (recording.dvl, ActsOn.DVL_CLOCK) if by_dvl else (recording.reference, ActsOn.REFERENCE_CLOCK)
@@ -120,7 +118,7 @@ def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
     for curve, own_late in others:
         for at in (base_late - own_late, -MARGIN_S, MARGIN_S):
             known &= curve.covers(true + own_late + at)
-    if not by_dvl:  # the DVL has nothing of the time that its clock went back over, whatever it is late by
+    if not by_dvl:  # the DVL has no samples while its clock repeats, whatever its delay
         for event in recording.set_back:
             of_dvl, around = true + offsets.dvl, event.by + MARGIN_S
             known &= (of_dvl < event.before - around) | (of_dvl > event.after + around)

@@ -1,4 +1,4 @@
-"""How the noise's level follows what messages claim, sample by sample, and the vehicle: louder at speed or in turns."""
+"""Noise level as a function of reported covariances per sample, speed and turn rate."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from ..model.seen import Seen
 from .noise_model import Noise, white_noise
 
 SIGNIFICANT = 1e-4
-# Rows that are out alone, of which no level is called for
+# Extreme rows that alone do not establish a level
 FEW = 6
-# What a fit takes in of noise depends little on its colour: so often is one found by the other
+# Rounds of alternating estimates of colour and absorbed noise, which depend weakly on each other
 TAKEN_ROUNDS = 2
 
 
 @dataclass(frozen=True)
 class Level:
-    """log standard deviation = const + Σ slope · (covariate - mean). p: of all slopes together, p_of: of each."""
+    """Log-linear noise level: log σ = const + Σ slope · (covariate - mean). p: of all slopes jointly, p_of: of each."""
 
     names: tuple[str, ...]
     slopes: Array
@@ -35,7 +35,7 @@ class Level:
 
 
 def covariates(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
-    """(M,) each: speed m/s, turn rate rad/s where there is an IMU."""
+    """Return (M,) each: speed m/s, and turn rate rad/s if there is an IMU."""
     found = {"speed": problem.sampled(seen, lambda motion: motion.speed)}
     if EffectNeeds.ANGULAR_VELOCITY in problem.available:
         found["turn_rate"] = problem.sampled(seen, lambda motion: np.linalg.norm(motion.turn_rate, axis=1))
@@ -43,7 +43,7 @@ def covariates(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
 
 
 def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Level | None:
-    """Least squares of log squared innovations (M, A) on the covariates, which no outlier upsets; None without any."""
+    """Fit log squared innovations (M, A) to the covariates, robustly. Return None without covariates."""
     found = covariates(problem, seen)
     if not found:
         return None
@@ -60,7 +60,7 @@ def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Lev
 
 
 def _sloped(found: Sequence[Array], log_square: Array) -> tuple[Array, Array, float]:
-    """Slopes (c,) of log squares (M,) along c covariates (M,), their covariance, and Wald's statistic of all."""
+    """Return slopes (c,) of log squares (M,) along c covariates (M,), their covariance, and the Wald statistic."""
     x = np.column_stack([np.ones(len(log_square)), *(values - values.mean() for values in found)])
     inverse = np.linalg.pinv(x.T @ x)
     parameters = inverse @ x.T @ log_square
@@ -71,7 +71,7 @@ def _sloped(found: Sequence[Array], log_square: Array) -> tuple[Array, Array, fl
 
 
 def _common(values: Array) -> Array:
-    """Values (M,) no further out than `FEW` rows are: these few may be quiet by chance, and pull at a slope."""
+    """Clip values (M,) to the range without `FEW` extreme rows: these may be quiet by chance and bias a slope."""
     ordered = np.sort(values)
     few = min(FEW, (len(values) - 1) // 2)
     return np.clip(values, ordered[few], ordered[-1 - few])
@@ -80,10 +80,9 @@ def _common(values: Array) -> Array:
 def estimated(
     problem: Problem, seen: Sequence[Seen], left: Array, rotation: Array | None, columns: Array, std: Array
 ) -> tuple[Noise, Array]:
-    """The noise that is left (M, A) of a problem's residual, in a frame, with the level that it calls for if it does
-    so clearly; and what is left with its outliers drawn in.
+    """Estimate the noise of a residual (M, A) in a frame, with a significant level, and the winsorised residual.
 
-    columns, std: (M, A, p) and (p,) of what is not left, which has taken in some of the noise.
+    columns, std: (M, A, p) and (p,) of the fit that the residual is from, which has absorbed some of the noise.
     """
     noise = white_noise(left, problem.segments, rotation, problem.interval).refitted(left)
     for _ in range(TAKEN_ROUNDS):
@@ -102,7 +101,7 @@ def estimated(
 
 
 def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotation: Array | None) -> Claims | None:
-    """How innovations (M, A), of noise at one level, follow claims that differ from sample to sample; None without."""
+    """Fit innovations (M, A) of constant level to informative reported values. Return None without."""
     names, log_claims = claims_of(problem, seen, rotation)
     return exponents(names, log_claims, innovations, stretches_of(problem)) if names else None
 
@@ -111,7 +110,7 @@ def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotat
 
 
 def claims_of(problem: Problem, seen: Sequence[Seen], rotation: Array | None) -> tuple[tuple[str, ...], Array]:
-    """Streams whose claims differ, and logarithms (M, A, c) of these in the frame of the noise."""
+    """Return streams with informative reported values, and their logarithms (M, A, c) in the noise's frame."""
     names, columns = [], []
     for name in ("dvl", "reference"):
         each = _of_stream(problem, seen, rotation, name)
@@ -122,7 +121,7 @@ def claims_of(problem: Problem, seen: Sequence[Seen], rotation: Array | None) ->
 
 
 def _of_stream(problem: Problem, seen: Sequence[Seen], rotation: Array | None, name: str) -> Array | None:
-    """(M, A) log standard deviation; None where a recording has none, or all claim the same."""
+    """Return the log standard deviation (M, A). Return None if a recording has none, or all are equal."""
     given = [(each.dvl if name == "dvl" else each.reference).claims for each in problem.recordings]
     claims = [each for each in given if each is not None and len(each)]
     if len(claims) < len(given) or all(bool((each == claims[0][0]).all()) for each in claims):
@@ -140,7 +139,7 @@ def _of_stream(problem: Problem, seen: Sequence[Seen], rotation: Array | None, n
         if name == "reference":
             variance = np.where(recording.measured, variance, 0.0)
         used = variance[:, variance.any(axis=0)]
-        if np.ptp(used, axis=1).max(initial=0.0) <= 1e-9 * used.max(initial=0.0):  # alike on all axes, so in any frame
+        if np.ptp(used, axis=1).max(initial=0.0) <= 1e-9 * used.max(initial=0.0):  # equal on all axes, so in any frame
             parts.append(np.repeat(used[:, :1], problem.axes, axis=1))
             continue
         to_compared = problem.to_compared(recording, grid.bin_time, of_dvl=name == "dvl")
@@ -150,7 +149,7 @@ def _of_stream(problem: Problem, seen: Sequence[Seen], rotation: Array | None, n
 
 
 def stretches_of(problem: Problem) -> NDArray[np.intp]:
-    """(M,) index of the stretch of time of each bin."""
+    """Return (M,) index of the stretch of time of each bin."""
     index = np.floor(problem.time / STRETCH_S).astype(int)
     keys = problem.recording_of * (int(np.ptp(index)) + 1) + index - index.min()
     return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)

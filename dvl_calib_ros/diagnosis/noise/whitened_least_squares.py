@@ -1,4 +1,4 @@
-"""Whitened least squares with a prior: the one place where the diagnosis solves it."""
+"""Whitened least squares with a prior, for all of the diagnosis."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from ...calibration.numerics.frames import Array
 
-# Share of a direction's squares from which on it is mostly noise
+# Share of noise in a direction's squares from which the direction is excluded
 MOSTLY = 0.5
-# Added to normal equations of unit diagonal: columns that are alike have a solution
+# Added to normal equations of unit diagonal, so that collinear columns have a solution
 ROUNDING = 1e-9
 
 
 def root_of_inverse(normal: Array) -> Array:
-    """(n, n) with root.T @ root the inverse of a normal matrix (n, n), whose columns may be alike to rounding."""
+    """Return (n, n) with root.T @ root the inverse of a normal matrix (n, n), which may be singular to rounding."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     rounded = scale[:, None] * normal * scale + ROUNDING * np.eye(len(scale))
     return np.asarray(np.linalg.inv(np.linalg.cholesky(rounded)) * scale)
@@ -24,7 +24,7 @@ def root_of_inverse(normal: Array) -> Array:
 
 @dataclass(frozen=True)
 class WhitenedLeastSquares:
-    """Minimise ‖target - columns x‖² + Σ ((x - centre) / std)², all of it whitened.
+    """Least squares ‖target - columns x‖² + Σ ((x - centre) / std)² of whitened columns and target.
 
     gram: (n + 1, n + 1) of columns and target, in this order. std, centre: (n,), the prior.
     """
@@ -35,13 +35,13 @@ class WhitenedLeastSquares:
 
     @staticmethod
     def of(columns: Array, target: Array, std: Array, centre: Array) -> WhitenedLeastSquares:
-        """From whitened columns (m, n) and target (m,)."""
+        """Make the system of whitened columns (m, n) and target (m,)."""
         along = columns.T @ target
         gram = np.block([[columns.T @ columns, along[:, None]], [along, target @ target]])
         return WhitenedLeastSquares(gram, std, centre)
 
     def part(self, at: NDArray[np.intp]) -> WhitenedLeastSquares:
-        """With these columns only; the others are zero."""
+        """Return the system of some columns; other parameters are zero."""
         rows = np.append(at, len(self.std))
         return WhitenedLeastSquares(self.gram[np.ix_(rows, rows)], self.std[at], self.centre[at])
 
@@ -52,17 +52,17 @@ class WhitenedLeastSquares:
 
     @property
     def is_definite(self) -> bool:
-        """Whether there is one solution, that of a minimum."""
+        """Return whether there is a unique minimum."""
         scale = 1.0 / np.sqrt(np.maximum(np.diag(self._normal), 1e-300))
         return bool(np.linalg.eigvalsh(scale[:, None] * self._normal * scale)[0] > 1e-9)
 
     def solution(self) -> Array:
-        """x (n,)."""
+        """Return x (n,)."""
         right = self.gram[:-1, -1] + self.centre / self.std**2
         return np.linalg.solve(self._normal, right)
 
     def solution_without(self, noise: Array) -> Array:
-        """x (n,), with what noise makes of `gram`, (n + 1, n + 1), taken off; zero along what is mostly noise."""
+        """Return x (n,) with noise (n + 1, n + 1) subtracted from `gram`; zero along noisy directions."""
         root = root_of_inverse(self._normal)
         shares, along = np.linalg.eigh(root @ noise[:-1, :-1] @ root.T)
         right = along.T @ root @ (self.gram[:-1, -1] - noise[:-1, -1] + self.centre / self.std**2)
@@ -70,22 +70,22 @@ class WhitenedLeastSquares:
         return np.asarray(root.T @ along @ signal)
 
     def squares(self, x: Array) -> float:
-        """‖target - columns x‖², at x (n,)."""
+        """Return ‖target - columns x‖² at x (n,)."""
         extended = np.append(-x, 1.0)
         return float(extended @ self.gram @ extended)
 
     def misfit(self, x: Array) -> float:
-        """What is minimised, at x (n,)."""
+        """Return the objective at x (n,)."""
         return self.squares(x) + float(np.sum(((x - self.centre) / self.std) ** 2))
 
     def surprise(self) -> float:
-        """-2 log of how likely the target was, but for what columns have no part in and for the prior's own size."""
+        """Return -2 log marginal likelihood of the target, without constants and the prior's determinant."""
         return self.misfit(self.solution()) + float(np.linalg.slogdet(self._normal)[1])
 
     def covariance(self) -> Array:
-        """(n, n) of the solution, for noise of unit variance."""
+        """Return the covariance (n, n) of the solution, for noise of unit variance."""
         return np.asarray(np.linalg.inv(self._normal))
 
     def freedom(self) -> Array:
-        """(n,) degrees of freedom that each parameter uses up: less than one where the prior has to hold it."""
+        """Return the degrees of freedom (n,) per parameter, less than one where the prior contributes."""
         return np.asarray(1.0 - np.diag(self.covariance()) / self.std**2)

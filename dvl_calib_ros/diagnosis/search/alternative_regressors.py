@@ -1,4 +1,4 @@
-"""A dictionary of what a vehicle's error could follow: functions of its motion, or of time."""
+"""Dictionary of functions of motion or time that a systematic residual may follow."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from ..model.time_grid import Grid
 TIME_KNOTS = 7
 SPEED_KNOTS = 7
 STEPS = 11
-# Time constants, s, in which a turn may go on acting
+# Time constants, s, with which the effect of a turn decays
 FADES_S = (4.0, 12.0, 40.0)
-# rad/s from which the vehicle is in a turn, whose side may stay until the next
+# rad/s; threshold of a turn, whose side may act until the next
 TURNING_RADPS = float(np.deg2rad(2.0))
-# Of these one function is enough, and is looked for by itself, or so many: a cosine and its sine
+# Groups tested in parts of this many functions: one, or a cosine and its sine
 ALTERNATIVES = {"a step in time": 1, "a band of speeds": 1, "turns before": 1, "heading": 2}
 HEADING_HARMONICS = 4
 
 
 def dictionary(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
-    """Name -> (M, c) functions of motion or time, without unit."""
+    """Return functions (M, c) of motion or time, by name, dimensionless."""
     parts = [_of_motion(grid, each) for grid, each in zip(problem.grids, seen, strict=True)]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
@@ -73,25 +73,25 @@ def _spread(speed: Array) -> float:
 
 
 def _steps(time: Array, count: int) -> Array:
-    """(N, count) functions that step from zero to one at even parts of the time."""
+    """Return (N, count) step functions from zero to one at equal intervals."""
     at = np.linspace(time[0], time[-1], count + 2)[1:-1]
     return (time[:, None] >= at).astype(float)
 
 
 def faded(time: Array, values: Array, seconds: float) -> Array:
-    """(N,) what values (N,) were, fading with a time constant."""
+    """Return (N,) values (N,) low-pass filtered with a time constant."""
     steps = np.clip(np.diff(time, prepend=time[0]), 0.0, 10.0)
     decay = np.exp(-steps / seconds)
     return recursion(decay, (1.0 - decay) * values)
 
 
 def _side_of_last_turn(turn_rate: Array) -> Array:
-    """(N,) 1 after a turn to port, -1 after one to starboard, 0 before the first."""
+    """Return (N,) 1 after a turn to port, -1 after one to starboard, 0 before the first."""
     side = np.where(np.abs(turn_rate) > TURNING_RADPS, np.sign(turn_rate), 0.0)
     last = np.maximum.accumulate(np.where(side != 0.0, np.arange(len(side)), -1))
     return np.where(last >= 0, side[np.maximum(last, 0)], 0.0)
 
 
 def _hats(values: Array, knots: Array) -> Array:
-    """Piecewise linear functions (N, knots) that are one at one knot and zero at the others."""
+    """Return piecewise linear functions (N, knots) that are one at one knot and zero at the others."""
     return np.column_stack([np.interp(values, knots, row) for row in np.eye(len(knots))])

@@ -1,4 +1,4 @@
-"""At one speed a clock looks like a lever arm: what a diagnosis says of both, by the one registration."""
+"""Ambiguity of lever arm and clock offset at one speed."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from .initial_guess import FirstGuess
 ARM, LAG = "lever_arm", "reference_lag"
 DVL_CLOCK, REFERENCE_CLOCK, ATTITUDE_CLOCK = "dvl_time_offset", "reference_time_offset", "attitude_time_offset"
 CLOCKS = DVL_CLOCK, REFERENCE_CLOCK, ATTITUDE_CLOCK
-# What any two of the three say is told by these
+# Clocks that represent the two observable offsets of the three
 TWO_CLOCKS = DVL_CLOCK, REFERENCE_CLOCK
-# What makes a reference late, and from how late on (s) either is tried in place of the other
+# Alternatives for a delayed reference, and the delay from which each is tried for the other, s
 LAG_OR_DELAY, LAG_FROM_S = (LAG, REFERENCE_CLOCK), 0.2
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
-# A part of the arm that the columns do not show is guessed by registration where that knows it to this (σ), m.
+# Largest standard deviation of a registered arm that replaces an unobservable part, m
 GUESSED_STD_M = 0.2
-# A part of the arm is a clock's as well if, with clocks free, it is known so many times worse, and not to so many σ.
+# Part of the arm is ambiguous if free clocks inflate its σ by WORSE and it is insignificant (SHOWN σ)
 WORSE, SHOWN = 2.0, 2.0
-# At one speed, arm and clock are one whatever the fit with both says, if that knows the arm so many times worse
+# At one speed, arm and clock are inseparable if a joint fit inflates the arm's σ by this factor
 AS_ONE = 3.5
-# Metres of the arm that are a clock's as well, from which on neither is known better than registration knows them
+# Ambiguity of the arm, m, from which registration limits the precision of arm and clock
 OPEN_M = 0.1
 
 
 @dataclass(frozen=True)
 class Combination:
-    """What is known of a lever arm and a clock that cannot be told apart: the arm less speed times delay.
+    """Observable combination of an ambiguous lever arm and clock: the arm minus speed times delay.
 
     parameter: of the arm. clock: name of the effect. speed: m/s. value: m, with its 95 per cent interval.
     """
@@ -48,18 +48,16 @@ class Combination:
 
 @dataclass(frozen=True)
 class OpenArm:
-    """How far lever arm and the reference's clock are one. by: parameter of the arm -> by how much (m) a second of the
-    clock makes it another. late: how late the clock may be, σ, s.
-    """
+    """Ambiguity of arm and reference clock: change (m) of arm parameters per second of delay. late: σ of that, s."""
 
     by: Mapping[str, float]
     late: float
 
 
 def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, tuple[Values, ...]]]:
-    """Start values, by name, with which what makes the reference of a fit late is a lag alone, or a delay alone.
+    """Return start values, by name, that make a reference's delay a lag alone or a clock offset alone.
 
-    To first order a low-pass is a delay; of seconds, a straight line leads from neither to the other.
+    To first order a low-pass is a delay. For seconds, linear steps do not lead from one to the other.
     """
     own = [fit.values.get(LAG, ()), fit.values.get(REFERENCE_CLOCK, ())]
     each = [[next(iter(values.values())) for values in per] or [0.0] * len(fit.seen) for per in own]
@@ -75,22 +73,22 @@ def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, t
 
 
 def lag_not_taken_back(fit: Fit, rest: Fit | None = None) -> float:
-    """The share of a reference's lag, or of how early its stamps are beside the DVL's, that the other does not take
-    back, of the larger; the most of all recordings. rest: of how much earlier they are than in this."""
+    """Return the relative sum of a reference's lag and delay, the maximum of recordings; zero if both cancel. rest: fit
+    whose delay is the origin."""
     lag = np.array([each["time_constant_s"] for each in fit.values[LAG]])
     late = _late_beside_dvl(fit) - (0.0 if rest is None else _late_beside_dvl(rest))
     return float((np.abs(lag + late) / np.maximum(np.maximum(lag, np.abs(late)), 1e-9)).max())
 
 
 def _late_beside_dvl(fit: Fit) -> Array:
-    """How late the reference's stamps are beside the DVL's, s, by recording."""
+    """Return the delay of the reference's stamps relative to the DVL's, s, per recording."""
     of_none = ({"seconds": 0.0},) * len(fit.seen)
     dvl, reference = ([each["seconds"] for each in fit.values.get(name, of_none)] for name in TWO_CLOCKS)
     return np.subtract(reference, dvl)
 
 
 def is_open(guesses: Sequence[FirstGuess]) -> bool:
-    """Whether registration leaves open how much of a clock is a lever arm."""
+    """Return whether registration leaves lever arm and clock ambiguous."""
     return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)
 
 
@@ -101,9 +99,9 @@ def told_apart(guesses: Sequence[FirstGuess]) -> set[str]:
 
 
 def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> dict[str, float]:
-    """The lever arm to start from, as most recordings have it: what is not shown of it only where it is known.
+    """Return the lever arm to start from, the median of recordings; unobservable parts only where registered well.
 
-    A height of 5 m for one of 1 turns the rest of the arm. effects: with what of each is shown.
+    An error of metres in the height rotates the rest of the arm. effects: with observable parameters.
     """
     shown = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
     stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
@@ -116,9 +114,9 @@ def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) ->
 
 
 def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) -> Fit:
-    """The fit with clocks as registration tells them, and the lever arm beside, where that is left open.
+    """Return a fit with registration's clocks and the lever arm, where these are ambiguous.
 
-    As it is where no clock is in it, or the other explains less.
+    Return the fit unchanged if it has no clock, or if it is significantly better.
     """
     present = [effect.name for effect in fit.effects]
     own = [name for name in TWO_CLOCKS if name in present]
@@ -149,14 +147,13 @@ def with_clocks(
     block: Index,
     opened: OpenArm | None,
 ) -> Fit | None:
-    """The fit with both clocks beside the lever arm that it has, if a part of that is as likely theirs; else the fit.
-    None where the two are one, and the fit stays as it is.
+    """Return a fit with both clocks in addition, if part of the lever arm is equally likely theirs; else the fit.
 
-    block: (M,), of each bin, by which σ is found. opened: as `opened_arm` has it; where that is much, a part that is
-    another with clocks free, beyond chance, is as likely theirs as well.
+    Return None where arm and clock are inseparable. block: (M,) of each bin, for σ. opened: from `opened_arm`; if
+    given, a part that changes significantly with free clocks is ambiguous as well.
 
-    A boat at 0.87 m/s whose DVL sits 0.3 m astern and one whose compass is 0.35 s late look alike, but where it slows
-    down; and what turns make of the instruments there, a model that has no clocks calls the arm's.
+    At 0.87 m/s, a DVL 0.3 m astern and a compass delay of 0.35 s differ only while the boat slows down. A model without
+    clocks attributes instrument errors in turns to the arm.
     """
     present = [effect.name for effect in fit.effects]
     clocks = [effects[name] for name in TWO_CLOCKS if name in effects and name not in present]
@@ -167,7 +164,7 @@ def with_clocks(
         return None
     (own, own_std), (free, free_std) = (_arm_of(each, block) for each in (fit, joint))
     was_shown, is_shown = np.abs(own) > SHOWN * own_std, np.abs(free) > SHOWN * free_std
-    by_chance = np.sqrt(np.maximum(free_std**2 - own_std**2, 0.0))  # of the other, where no clock is late
+    by_chance = np.sqrt(np.maximum(free_std**2 - own_std**2, 0.0))  # change if no clock is delayed
     is_another = ~is_shown | ((opened is not None) & (np.abs(free - own) > SHOWN * by_chance))
     if bool((was_shown & is_another & (free_std > WORSE * own_std)).any()):
         return joint
@@ -175,13 +172,13 @@ def with_clocks(
 
 
 def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
-    """The parameters (p,) of the lever arm and their σ (p,), as blocks scatter."""
+    """Return the lever arm's parameters (p,) and standard deviations (p,) from blocks."""
     at = [*_places(fit, ARM).values()]
     return fit.hypothesis.vector()[at], np.sqrt(np.diag(fit.covariance(block))[at])
 
 
 def opened_arm(guesses: Sequence[FirstGuess]) -> OpenArm | None:
-    """As the recording has it that leaves it least open; None where one leaves next to nothing open."""
+    """Return the ambiguity of the least ambiguous recording. Return None if it is negligible."""
     found = [each.registration for each in guesses if each.registration is not None]
     least = min(found, key=lambda each: float(np.trace(each.left_open[3:6, 3:6])), default=None)
     if least is None or np.trace(least.left_open[3:6, 3:6]) < OPEN_M**2:
@@ -191,9 +188,9 @@ def opened_arm(guesses: Sequence[FirstGuess]) -> OpenArm | None:
 
 
 def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
-    """By parameter of the lever arm, by how much (m) it is another by what explains the data as well; the farthest.
+    """Return the largest change (m), by arm parameter, among rivals that explain the data equally well.
 
-    rivals: with another clock.
+    rivals: hypotheses with another clock.
     """
     if ARM not in fit.values:
         return {}
@@ -203,8 +200,7 @@ def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
 
 
 def moved_lag(fit: Fit, joint: Fit) -> dict[str, float]:
-    """By how much (s) a lag is another in a fit than in the same with more clocks, which are late in its place, where
-    it explains the data as well without these."""
+    """Return the change (s) of a lag from a joint fit with more clocks, if both are equally likely."""
     if not {LAG} <= fit.values.keys() & joint.values.keys():
         return {}
     if fit.deviance > joint.deviance + SETTINGS.indistinguishable:
@@ -213,7 +209,7 @@ def moved_lag(fit: Fit, joint: Fit) -> dict[str, float]:
 
 
 def with_moved(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
-    """A covariance (6 + p, 6 + p) in which lever arm or lag may be another, as `moved_arm` and `moved_lag` have it."""
+    """Return a covariance (6 + p, 6 + p) that includes changes from `moved_arm` and `moved_lag`."""
     step = np.zeros(len(covariance))
     for name, i in (_places(fit, ARM) | _places(fit, LAG)).items():
         step[i] = moved.get(name, 0.0)
@@ -221,8 +217,7 @@ def with_moved(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array
 
 
 def with_open(fit: Fit, covariance: Array, opened: OpenArm | None) -> Array:
-    """A covariance (6 + p, 6 + p) in which lever arm and the reference's clock are known no better than registration
-    knows them, which does not take turns between samples for what a fit makes of them."""
+    """Return a covariance (6 + p, 6 + p) that includes registration's ambiguity of arm and reference clock."""
     if opened is None:
         return covariance
     clock = [6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == REFERENCE_CLOCK]
@@ -235,7 +230,7 @@ def with_open(fit: Fit, covariance: Array, opened: OpenArm | None) -> Array:
 
 
 def opened_combination(fit: Fit, covariance: Array, opened: OpenArm | None) -> Combination | None:
-    """What is known of the lever arm and the reference's clock by a fit of one recording that has no such clock."""
+    """Return the observable combination of arm and reference clock from a fit of one recording without that clock."""
     at = _places(fit, ARM)
     if opened is None or not at or len(fit.seen) > 1:
         return None
@@ -245,7 +240,7 @@ def opened_combination(fit: Fit, covariance: Array, opened: OpenArm | None) -> C
 
 
 def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
-    """What is known of arm and clock of one recording, by a fit that has both and its covariance (6 + p, 6 + p)."""
+    """Return the observable combination of arm and clock of one recording from their covariance (6 + p, 6 + p)."""
     arm, delay = _places(fit, ARM), _places(fit, clock).get("seconds")
     if delay is None or not arm or len(fit.seen) > 1:
         return None
@@ -259,6 +254,6 @@ def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
 
 
 def _places(fit: Fit, effect: str) -> dict[str, int]:
-    """Where the parameters of an effect stand in a fit's vector, by name; of a recording each, the last one's."""
+    """Return the index of each parameter of an effect in a fit's vector; of the last recording."""
     parameters = enumerate(fit.hypothesis.parameters(), start=6)
     return {each.spec.name: i for i, each in parameters if each.effect.name == effect}

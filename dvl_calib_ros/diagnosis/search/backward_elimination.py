@@ -1,4 +1,4 @@
-"""Elimination of effects that the data do not call for, and effects that happen twice."""
+"""Backward elimination of insignificant effects, and effects that occur twice."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from .candidates import KEPT_VARIANTS
 from .clock_jumps import LEAP, gaps, is_in_stamps
 from .unexplained import Unexplained, unexplained
 
-# A clock that explains less than this share of what two leaps do, and makes them cancel, is not late before them
+# A constant delay explaining less than this share of two clock jumps that cancel is rejected
 LITTLE_OF_LEAPS = 0.02
 
 
 def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
-    """A fit without those effects that are not called for given all others, or add next to nothing to a strong one."""
+    """Return a fit without effects that are insignificant given the others, or negligible next to a strong one."""
     threshold = float(np.log(SETTINGS.level / n_effects))
     while fit.effects:
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
@@ -62,7 +62,7 @@ def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
 
 
 def _makes_leaps_cancel(fit: Fit, effect: Effect, drops: Mapping[str, float]) -> bool:
-    """Whether an effect is a clock, late before two leaps that cancel with it alone, and little of what they explain.
+    """Return whether an effect is a constant DVL delay that only makes two clock jumps cancel.
 
     drops: deviance that each effect explains, by name.
     """
@@ -72,11 +72,11 @@ def _makes_leaps_cancel(fit: Fit, effect: Effect, drops: Mapping[str, float]) ->
 
 
 def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect, drops: Mapping[str, float]) -> bool:
-    """Whether an effect is a lag that clocks take back, and explains no more than smoothing does. rest: without it.
+    """Return whether an effect is a lag cancelled by clock offsets that explains no more than smoothing does.
 
-    The two leave the motion where it is, but for its corners, and take noise off the DVL. That of a slow one is known
-    by its claims, which may be anything up to its roughness. Of a clock that is late without the lag as well, and
-    explains more than this, what it becomes earlier beside it is meant. drops: as for `_makes_leaps_cancel`.
+    Both together leave the motion unchanged except at corners and reduce DVL noise. The noise of a slow DVL is known
+    only by its claims, which may be too small by its roughness. If a clock is delayed without the lag as well (rest:
+    that fit), and explains more than the lag, only its change counts. drops: as for `_makes_leaps_cancel`.
     """
     if effect.name != LAG:
         return False
@@ -89,24 +89,24 @@ def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect, drops: Ma
 
 
 def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:
-    """Whether an effect adds next to nothing to what all of them explain; of what bends an arm, nor to the noise."""
+    """Return whether an effect explains a negligible share of the whole; if it bends the arm, also of the noise."""
     if drop > SETTINGS.ghost_share * explained:
         return False
     return not effect.bends_arm or drop < SETTINGS.ghost_of_noise * left
 
 
 def _is_all_that_is_left(fitter: Fitter, rest: Fit, left: Callable[[], Unexplained]) -> bool:
-    """Return whether a fit without an effect (rest) has a significant residual, and with it none. left: with it.
+    """Return whether the removed effect explains all of the residual. rest: fit without it; left: residual with it.
 
-    What an inexact strong effect leaves has the shape of no other: one takes in a part of it at most.
+    The residual of an inexact strong effect has another shape: a further effect explains part of it at most.
     """
     return unexplained(fitter, rest).found and not left().found
 
 
 def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:
-    """Whether an effect is that the DVL's clock is late before it leaps, by as much as nothing of the leap could be.
+    """Return whether an effect is a constant DVL delay too large to be part of the clock jump after it.
 
-    It tells of the time before the leap alone, which may be short, and so of little of what all of them explain.
+    It acts only before the jump, so it may explain a small share of the whole.
     """
     if effect.name != DVL_CLOCK or LEAP not in fit.values:
         return False
@@ -134,7 +134,7 @@ def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
 
 
 def once_where_confirmed(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
-    """A fit in which what happens twice happens once, where the scatter of the blocks does not bear out the other."""
+    """Return a fit with one occurrence of a repeated effect if blocks do not confirm the other."""
     block = blocks_of(fitter.problem)
     for effect in fit.effects:
         own = {spec.name for spec in effect.parameters}
@@ -151,21 +151,20 @@ def once_where_confirmed(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], 
     return fit
 
 
-# Standard deviations from which on a second time that something happens stands without being tried without
+# Standard deviations from which a second occurrence is kept without a trial
 CLEAR = 6.0
-# What is taken back but for this share of it, or within a step of the grid, may be anything that is there for a while
+# An effect reversed to within this share, or after one grid step, may be any temporary cause
 TAKEN_BACK = 0.25
-# (taken back exactly: but for this one), where it explains less than this much or an unknown cause in its place more
+# Share within which a reversal is exact; deviance below which a reversed effect is rejected
 TAKEN_BACK_EXACTLY, MUCH = 0.05, 150.0
 
 
 def repeated_effects(
     fitter: Fitter, fits: Sequence[Fit], every: Mapping[str, Effect], effects: Mapping[str, Effect]
 ) -> list[Fit]:
-    """Of what may happen twice, the best fit in which it happens once with a second time, where that promises to be
-    worth it, and the best in which it happens twice with either alone, where the other is small.
+    """Return the best fits with a second occurrence of an effect, or without a small one.
 
-    every: effects with what they are the second time. Several recordings share their times, which two of a day do not.
+    every: effects with their second occurrence. Recordings share the times of an effect, so several have no proposals.
     """
     found: list[Fit] = []
     if len(fitter.problem.recordings) > 1:
@@ -188,8 +187,7 @@ def repeated_effects(
 
 
 def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> list[Hypothesis]:
-    """The likeliest starts with a second time, one straight step about a fit, in the order of time, that are to leave
-    less deviance than a limit."""
+    """Return the best starts below a deviance `limit` with a second occurrence, both in order of time."""
     others = [effect for effect in fit.effects if effect.name != whole.name]
     (again,) = (spec.name for spec in whole.parameters if spec.name in whole.again and is_time_of_run(spec))
     seconds = max(recording.seconds for recording in fitter.problem.recordings)
@@ -213,9 +211,9 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
 
 
 def either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] | None = None) -> list[Hypothesis]:
-    """What happens twice in a fit, as the first alone and as the second, each where the other is not clear.
+    """Return starts with the first or the second occurrence alone, if the other is insignificant.
 
-    clear: names of the parameters that are; by default those many standard deviations large.
+    clear: names of significant parameters; by default larger than `CLEAR` standard deviations.
     """
     if clear is None:
         std = np.sqrt(np.diag(fit.system.covariance()))
@@ -236,11 +234,11 @@ def either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] |
 
 
 def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | None = None) -> bool:
-    """Whether what happens twice in a fit is undone the second time, or happens at once, in each recording.
+    """Return whether a second occurrence reverses the first in each recording, or follows immediately.
 
-    drop: deviance that it explains. What explains much may be undone where an unknown cause in its place (rest: without
-    it) explains less. That is asked of what explains more than such causes do unseen only if it is undone exactly. A
-    clock that is set back and then put right shows that by its stamps.
+    drop: deviance that the effect explains. A large reversed effect is rejected if an unknown cause explains more
+    without it (rest). Above `SETTINGS.instead_of` only an exact reversal is tested. A clock jump that the stamps
+    confirm is kept.
     """
     apart, share = apart_and_undone(fit, name)
     if apart < step_of_times(fitter.problem):
@@ -256,8 +254,7 @@ def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | 
 
 
 def apart_and_undone(fit: Fit, name: str) -> tuple[float, float]:
-    """How far (s) the second time that something happens in a fit is from the first, and what share is not undone by
-    it, of the larger; the most of all recordings. Infinite where it cannot happen twice."""
+    """Return interval (s) and share not reversed of two occurrences (maxima of recordings; infinite for one)."""
     effect = next(each for each in fit.effects if each.name == name)
     own = {spec.name: spec for spec in effect.parameters}
     if not effect.again or not effect.again.keys() <= own.keys():

@@ -1,7 +1,7 @@
-"""What is worth fitting, about a fit: combinations of effects by straight lines, and what says the same otherwise.
+"""Proposal of hypotheses about a fit: combinations of effects in the linearised model, and equivalent formulations.
 
-About a fit, every effect's derivatives make one Gram matrix, in which all combinations of up to three effects are small
-least squares problems.
+Linearised about a fit, all effects share one Gram matrix. Combinations of up to three effects are small least squares
+problems in it.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .arm_clock_ambiguity import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
 from .clock_jumps import LEAP
 
-# Effects from which combinations of three are made; proposals fitted in one round, and how much worse than the best
+# Variants to combine; proposals fitted per round, and their largest deviance above the best
 SHORTLIST, FITTED, NOT_WORTH_IT = 12, 7, 40.0
-# Of these, places of what adds most: beside seconds of a clock all others explain more by themselves than a drift adds
+# Places for the largest gains on top of the fit: next to seconds of clock offset a drift adds little
 ADDING_MOST = 4
-# How many times of the run are kept of an effect that comes and goes
+# Start times kept per intermittent effect
 KEPT_VARIANTS = 2
-# Standard deviation of noise over that of its innovations, from which on it has a memory to speak of
+# Ratio of the standard deviations of noise and innovations from which noise is coloured
 WITH_A_MEMORY = 1.2
-# Share of its squares, up to which what is left is noise of another kind
+# Share of the coloured noise's misfit that an intermittent effect may leave
 MOST_OF_NOISE = 0.5
 
 
 @dataclass(frozen=True)
 class Variant:
-    """An effect with its times of the run. tried: how many there are of its kind."""
+    """An effect with its times of the run. tried: number of variants of its kind."""
 
     effect: Effect
     values: tuple[Values, ...]
@@ -48,32 +48,32 @@ class Variant:
 
     @property
     def p(self) -> int:
-        """Number of columns."""
+        """Return the number of columns."""
         return self.columns.shape[2]
 
     @property
     def comes_and_goes(self) -> bool:
-        """Whether it is there for a part of the run only."""
+        """Return whether the effect acts during a part of the run only."""
         times = [spec.name for spec in self.effect.parameters if is_time_of_run(spec)]
         return any(each[name] != self.effect.defaults[name] for each in self.values for name in times)
 
 
 @dataclass(frozen=True)
 class StraightLines:
-    """Everything that can be combined, in one Gram matrix. blocks: columns of each variant."""
+    """Linearised model of all variants in one Gram matrix. blocks: columns of each variant."""
 
     variants: list[Variant]
     blocks: list[NDArray[np.intp]]
     system: WhitenedLeastSquares
 
     def drop(self, chosen: Sequence[int]) -> float:
-        """Misfit that a combination leaves."""
+        """Return the misfit of a combination."""
         part = self.system.part(np.concatenate([np.arange(6), *(self.blocks[index] for index in chosen)]))
         return part.misfit(part.solution())
 
 
 def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
-    """Hypotheses worth fitting, by their straight lines about a fit; the fit's own among them."""
+    """Return hypotheses to fit, by the linearised model about a fit; the fit's own is among them."""
     table, worth = _worth(fitter, fit, effects)
     own = tuple(range(len(fit.effects)))
     return [
@@ -84,10 +84,10 @@ def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hy
 
 
 def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
-    """The best with effects that come and go, as they would be if the noise were white.
+    """Return the best hypotheses with intermittent effects under white noise.
 
-    Noise with a memory takes in what a wrong time leaves, and of times on a grid the least wrong ones are no better.
-    Only such as are the most of it: of noise that has a memory by itself they would always explain some.
+    Coloured noise absorbs the residual of a wrong time, so no time on a grid improves the fit. Only effects that
+    explain most of the noise are proposed: an intermittent effect explains a part of any coloured noise.
     """
     if max(arma.ratio for arma in fit.noise.axes) < WITH_A_MEMORY:
         return []
@@ -104,7 +104,7 @@ def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]
 
 
 def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[StraightLines, list[tuple[int, ...]]]:
-    """The straight lines about a fit, and which variants of them are worth fitting together, the best first."""
+    """Return the linearised model about a fit, and the combinations to fit, best first."""
     table = straight_lines(fitter, fit, effects)
     n = len(fitter.problem.recordings)
     cost = [price(v.effect, len(effects), n, v.tried) for v in table.variants]
@@ -117,7 +117,7 @@ def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Str
             if len(names) == size:
                 scored.append((table.drop(chosen) + sum(cost[index] for index in chosen), chosen))
     scored.sort()
-    for _, chosen in scored[:3]:  # and one more on top of the best
+    for _, chosen in scored[:3]:  # one more on top of the best
         names = {table.variants[index].effect.name for index in chosen}
         scored += [
             (table.drop((*chosen, index)) + sum(cost[i] for i in (*chosen, index)), (*chosen, index))
@@ -127,13 +127,13 @@ def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Str
     scored.sort()
     scored = [each for each in scored if _is_told_by_two_clocks(table, each[1])]
     worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
-    if not any(_is_possible(table, chosen) for chosen in worth):  # lines are straight no more: the likely is tried too
+    if not any(_is_possible(table, chosen) for chosen in worth):  # outside the linear range
         worth += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
     return table, worth
 
 
 def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Variant]:
-    """Of every effect that is not in the fit, its columns about the fit, at every window that is tried."""
+    """Return the columns about a fit of every effect that it lacks, at every window."""
     problem, present = fitter.problem, {effect.name for effect in fit.effects}
     n = len(problem.recordings)
     seconds = max(recording.seconds for recording in problem.recordings)
@@ -151,7 +151,7 @@ def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> l
 
 
 def straight_lines(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> StraightLines:
-    """The effects of a fit, first and in its order, and every other at every time that is tried."""
+    """Linearise the effects of a fit, in its order, and then every other effect at every window."""
     problem, noise, hypothesis = fitter.problem, fit.noise, fit.hypothesis
     own: list[Variant] = []
     at = 6
@@ -160,7 +160,7 @@ def straight_lines(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> S
         own.append(Variant(effect, hypothesis.values[effect.name], fit.columns[:, :, at : at + p], 1.0))
         at += p
     variants = [*own, *variants_about(fitter, fit, effects)]
-    # the residual as it would be without the fit's effects, as far as straight lines tell
+    # linear prediction of the residual without the fit's effects
     vector = hypothesis.vector()
     defaults = [0.0] * 6 + [each.spec.default for each in hypothesis.parameters()]
     target = -(fit.residual - fit.columns @ (vector - np.array(defaults)))
@@ -176,8 +176,8 @@ def straight_lines(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> S
 
 
 def _gram(problem: Problem, noise: Noise, columns: Array, target: Array) -> Array:
-    """(n + 1, n + 1) of whitened columns (M, A, n) and target (M, A): the sum of those of each recording, in which what
-    is the day's of all others is zero."""
+    """Return the Gram matrix (n + 1, n + 1) of whitened columns (M, A, n) and target (M, A), summed by recording. A
+    recording's own parameters have zero columns in others."""
     total = np.zeros((columns.shape[2] + 1,) * 2)
     for rows in problem.rows_of:
         own, of_it = columns[rows], noise.part(rows)
@@ -196,7 +196,7 @@ def _std(effect: Effect, p: int, n_recordings: int) -> Array:
 
 
 def _shortlisted(table: StraightLines, own: Sequence[int], cost: Sequence[float]) -> list[int]:
-    """Variants that promise most, alone or on top of the fit's own; all of the fit's own."""
+    """Return all variants of the fit and the most promising others, alone or in addition."""
     alone, none = table.drop(own), table.drop([])
     gains: dict[int, float] = {}
     adds: dict[int, float] = {}
@@ -210,7 +210,7 @@ def _shortlisted(table: StraightLines, own: Sequence[int], cost: Sequence[float]
              for out in own),
             default=-np.inf,
         )  # fmt: skip
-        # of what explains much by itself, strong effects make all look alike: what it adds counts more
+        # strong effects resemble whatever explains much by itself: the gain in addition counts more
         gains[index] = max(adds[index], 0.1 * instead, 0.01 * by_itself)
     kept: list[int] = []
     of_effect: dict[str, int] = {}
@@ -225,7 +225,7 @@ def _shortlisted(table: StraightLines, own: Sequence[int], cost: Sequence[float]
 
 
 def combined(fitter: Fitter, fit: Fit, table: StraightLines, chosen: Sequence[int]) -> Hypothesis:
-    """A combination with the values that the table gives it to start from; effects of the fit start at theirs."""
+    """Return the hypothesis of a combination. The fit's effects start at its values, others at the linear solution."""
     part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
     solution = part.solution()[6:]
     n = len(fitter.problem.recordings)
@@ -246,7 +246,7 @@ def combined(fitter: Fitter, fit: Fit, table: StraightLines, chosen: Sequence[in
 
 
 def _is_possible(table: StraightLines, chosen: Sequence[int]) -> bool:
-    """Whether straight lines put every parameter of a combination within its bounds."""
+    """Return whether the linear solution of a combination is within the bounds of each parameter."""
     part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
     variants = [table.variants[index] for index in chosen]
     specs = [
@@ -258,15 +258,15 @@ def _is_possible(table: StraightLines, chosen: Sequence[int]) -> bool:
 
 
 def _is_told_by_two_clocks(table: StraightLines, chosen: Sequence[int]) -> bool:
-    """Of three clocks only two differences matter: what any two say is told by those of DVL and reference."""
+    """Return whether a combination has no redundant pair of clocks: DVL and reference represent any pair."""
     names = {table.variants[index].effect.name for index in chosen}
     return ATTITUDE_CLOCK not in names or len(names & set(CLOCKS)) == 1
 
 
 def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
-    """The fit's offsets said by fewer clocks, and by all that can say them: for large ones no straight line would.
+    """Return hypotheses with a fit's clock offsets assigned to other clocks; large offsets exceed the linear range.
 
-    A leap at the beginning is a DVL's clock that is late throughout.
+    A clock jump at the beginning is a constant DVL delay.
     """
     n, values = len(fit.seen), fit.values
     said = (*CLOCKS, LEAP) if jumps_at_start(fitter, fit) else CLOCKS
@@ -293,12 +293,12 @@ def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> 
 
 
 def _at_other_times(fit: Fit, effects: Sequence[Effect], later: Array) -> dict[str, tuple[Values, ...]]:
-    """Values of effects that come and go, all that happens being later by so many seconds (of each recording)."""
+    """Return the values of intermittent effects, delayed by some seconds per recording."""
     found: dict[str, tuple[Values, ...]] = {}
     for effect in effects:
         times = [spec.name for spec in effect.parameters if is_time_of_run(spec)]
         per = zip(fit.values[effect.name], later.tolist(), strict=True)
-        if times:  # what is there from the beginning goes on being so
+        if times:  # an effect from the beginning keeps its start
             found[effect.name] = tuple(
                 {**each, **{name: max(each[name] + by, 0.0) if each[name] else 0.0 for name in times}}
                 for each, by in per
@@ -307,7 +307,7 @@ def _at_other_times(fit: Fit, effects: Sequence[Effect], later: Array) -> dict[s
 
 
 def _told_by_a_lag(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
-    """The fit with a lag of the reference for its delay, or the other way round."""
+    """Return the fit with a lag of the reference for its delay, or a delay for its lag."""
     rest = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
     return [
         fit.hypothesis.with_effects([*rest, *(effects[name] for name in start)], len(fit.seen), start)
@@ -316,7 +316,7 @@ def _told_by_a_lag(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
 
 
 def jumps_at_start(fitter: Fitter, fit: Fit) -> bool:
-    """Whether there is one leap, and before the first of the times that are tried for it."""
+    """Return whether the fit has one clock jump only, before the first time that is tried."""
     leaps = fit.values.get(LEAP, ())
     first = step_of_times(fitter.problem)
     twice = any(np.isfinite(leap.get("again_at_s", np.inf)) for leap in leaps)

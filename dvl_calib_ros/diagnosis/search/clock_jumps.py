@@ -1,7 +1,7 @@
-"""Where the DVL's clock leaps: how late its stamps are in each part of a run, looked for over all delays at once.
+"""Detection of jumps of the DVL's clock: the delay per part of the run, by a search over all delays.
 
-Columns of a leap are straight lines about the delays of a fit. With leaps of seconds these lie between those of the
-parts, where a straight line tells of none of them.
+The linearised model of a clock jump is valid about the delays of a fit. For jumps of seconds, these lie between the
+delays of the parts, beyond the linear range of each.
 """
 
 from __future__ import annotations
@@ -22,37 +22,36 @@ from ..model.settings import SETTINGS
 from .arm_clock_ambiguity import ARM, CLOCKS, DVL_CLOCK, LAG, LAG_OR_DELAY, lags_and_delays
 
 LEAP = "time_offset_jump"
-# Effects of time, of which one is wrong where a clock leaps, and of these such as stand in for a leap
+# Effects that a clock jump biases, and among them those that a jump may replace
 MOVING_CLOCK = ("clock_drift", LEAP)
 OF_TIME = (*CLOCKS, LAG, *MOVING_CLOCK)
 STANDS_IN = (DVL_CLOCK, *MOVING_CLOCK)
-# Delays that are tried, s, about those of the fit; parts of the run between which one leap may lie, and of how many of
-# them a delay is, or it is not to be told from how a run begins or ends
+# DVL delays to try, s; parts of a run with constant delay, and fewest parts between jumps: shorter ones are not
+# identifiable from the ends of a run
 DELAYS = np.arange(-4.0, 4.01, 0.25)
 PARTS, FEWEST_PARTS = 60, 3
-# Squares of white noise that a leap takes off, from which on it is fitted, and a delay that is none, s
+# Drop in whitened squares from which a jump is fitted; delay below which a clock is synchronised, s
 WORTH_FITTING, NO_DELAY = 40.0, 0.13
-# The largest gaps in the stamps, from so many seconds on, are times at which a clock may have leapt ahead, if by as
-# much (but for that many seconds)
+# Largest gaps that may be jumps ahead: their number, least length, s, and tolerance of the jump's size, s
 GAPS, GAP_FROM_S, AS_LARGE_S = 6, 0.15, 0.3
-# Of those that a lost sample does not leave, so many are tried as leaps
+# Gaps without lost samples that are tried as clock jumps
 LEAPS = 3
-# Lost samples leave a gap of whole steps, a clock's leap such as differs by this share of a step
+# Lost samples leave a gap of whole steps; a clock jump differs from that by this share of a step
 OF_A_STEP = 0.15
 
 
 @dataclass(frozen=True)
 class Delays:
-    """How late the DVL is, s, in one part of the run after another, and where (part) each but the first begins."""
+    """DVL delay, s, per part of the run, and the first part of each delay but the first."""
 
     seconds: tuple[float, ...]
     begins: tuple[int, ...]
 
 
 def leaping(fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]) -> list[Hypothesis]:
-    """Hypotheses with the leaps that the delays of parts of one recording show, in place of what stands in for them.
+    """Return hypotheses with clock jumps at the delay changes of one recording, replacing effects that resemble jumps.
 
-    once, every: effects, with a leap that happens once, and twice. None without an effect of time in the fit.
+    once, every: effects with one and with two jumps. Empty if the fit has no effect of time.
     """
     present = {effect.name for effect in fit.effects}
     if len(fit.seen) > 1 or LEAP not in once or not present & {*OF_TIME}:
@@ -72,10 +71,10 @@ def leaping(fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping
 
 
 def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
-    """True times (s of the run) of the largest gaps in the stamps of the DVL of one recording, and what each is longer
-    than usual, s; and of where its clock was set back, by how much at most, below zero.
+    """Return true times (s) and excess (s) of the largest gaps in the DVL's stamps of one recording.
 
-    A clock that leaps ahead leaves a gap as large as the leap; lost samples leave gaps as well.
+    Backward clock steps have a negative excess, an upper bound of their size. A forward clock jump leaves a gap of its
+    own size; lost samples leave gaps as well.
     """
     if len(fit.seen) > 1:
         return []
@@ -89,7 +88,7 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     largest = np.argsort(-steps)[:GAPS]
     ahead = zip(stamps[largest].tolist(), (steps[largest] - usual).tolist(), strict=True)
     injections = [each for each in fit.hypothesis.injections(0) if each.effect.name != LEAP]
-    leaps: list[tuple[float, float]] = []  # stamps at which they come, s, and by how much
+    leaps: list[tuple[float, float]] = []  # stamps (s) of the jumps, and sizes (s)
     for each in fit.values.get(LEAP, ()):
         for at_s, seconds in (("at_s", "seconds"), ("again_at_s", "again_seconds")):
             if np.isfinite(each.get(at_s, np.inf)):
@@ -98,7 +97,7 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     found = []
     for stamp, gap in (*back, *ahead):
         alike = [each for each in leaps if _is_as_large(each[1], gap)]
-        its = min(alike, key=lambda each: abs(each[0] - stamp), default=None)  # that may have left it
+        its = min(alike, key=lambda each: abs(each[0] - stamp), default=None)  # the jump that may have left the gap
         others = [each for each in leaps if each != its]
         before = sum(by for at, by in others if at < stamp)
         at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * usual
@@ -110,11 +109,10 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
 def jumps_in_stamps(
     fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]
 ) -> list[Hypothesis]:
-    """Hypotheses of a fit of one recording that leaps where the stamps say so to a sample, once or twice, by what the
-    motion in each part says; but for those times of which a leap of the fit is one already.
+    """Return hypotheses with one or two clock jumps at gaps in the stamps, sized by the motion in each part.
 
-    once, every: effects, with a leap that happens once, and twice. In a part that says little of a leap it is small
-    beside the noise, and what then is left without it is taken for slow noise: it is found only where it is looked for.
+    Empty if the fit has as many jumps already. once, every: effects with one and with two jumps. A jump that explains
+    little would be taken for slow noise, so it is found only by this search.
     """
     if len(fit.seen) > 1 or LEAP not in once:
         return []
@@ -145,19 +143,19 @@ def jumps_in_stamps(
 
 
 def _is_shifted(gap: float, usual: float) -> bool:
-    """Whether stamps that go back, or a gap of no whole number of steps, are a clock's that leaps: not lost samples."""
+    """Return whether a gap is a clock jump: negative or not a whole number of steps, unlike lost samples."""
     return gap < 0.0 or OF_A_STEP < (gap / usual) % 1.0 < 1.0 - OF_A_STEP
 
 
 def _is_as_large(by: float, gap: float) -> bool:
-    """Whether a leap, s, is one that leaves a gap, s; below zero: of a clock that is set back by no more."""
+    """Return whether a jump (s) matches a gap (s); a backward step may be smaller than the gap."""
     return gap - AS_LARGE_S < by < (0.0 if gap < 0.0 else gap + AS_LARGE_S)
 
 
 def in_gaps(fitter: Fitter, fit: Fit) -> Fit:
-    """A fit whose leaps lie where the stamps have a gap as large or go back, if that is as good a time.
+    """Return a fit with its clock jumps moved to gaps of matching size, if the time is equally likely.
 
-    Without the outliers there that a wrong time has made: they would be for it.
+    Outliers near the gap are not corrected: a wrong jump time would have caused them.
     """
     for at_s, seconds in (("at_s", "seconds"), ("again_at_s", "again_seconds")):
         if not all(at_s in each for each in fit.values.get(LEAP, ({},))):
@@ -180,10 +178,10 @@ def in_gaps(fitter: Fitter, fit: Fit) -> Fit:
 
 
 def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, float] | None:
-    """The time of a leap with its interval (s of the run), where the stamps show it to a sample; else None.
+    """Return time and interval (s) of a clock jump that the stamps confirm to a sample, or None.
 
-    at_s: its name. They show it by a gap that is as large and no whole number of steps, as that of lost samples is, or
-    where they go back.
+    at_s: name of the time parameter. Evidence is a backward step, or a gap of matching size that is no whole number of
+    steps.
     """
     usual = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
     value, by = fit.values[LEAP][0][at_s], fit.values[LEAP][0][at_s.replace("at_s", "seconds")]
@@ -194,7 +192,7 @@ def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, f
 
 
 def is_in_stamps(fitter: Fitter, fit: Fit) -> bool:
-    """Whether the stamps of the DVL of one recording show one of the leaps of a fit, where they are next to it."""
+    """Return whether the DVL's stamps of one recording confirm a clock jump of a fit near it."""
     if len(fit.seen) > 1 or LEAP not in fit.values:
         return False
     beside = in_gaps(fitter, fit)
@@ -205,7 +203,7 @@ def is_in_stamps(fitter: Fitter, fit: Fit) -> bool:
 def _hypotheses(
     fit: Fit, rest: Sequence[Effect], once: Mapping[str, Effect], leap: Effect, values: Values, before: float
 ) -> list[Hypothesis]:
-    """With a leap and, before it, a clock that is late and one that is not; beside all else, and what is usual."""
+    """Return hypotheses with a jump, with and without a delay before it, next to all or only the usual effects."""
     usual = [effect for effect in rest if effect.name in (*OF_TIME, ARM)]
     if ARM in once and ARM not in {effect.name for effect in usual}:
         usual.append(once[ARM])
@@ -225,7 +223,7 @@ def _hypotheses(
 
 
 def _squares(fitter: Fitter, fit: Fit, rest: Sequence[Effect], clock: Effect) -> tuple[Array, Array]:
-    """(D, P) whitened squares that each delay leaves in each part of the run, and the (P,) last bins of these."""
+    """Return whitened squares (D, P) per delay and part of the run, and the last bins (P,) of the parts."""
     white = fit.noise.white
     ends = np.linspace(0, len(fit.residual), PARTS + 1).astype(int)
     squares = np.zeros((len(DELAYS), PARTS))
@@ -237,7 +235,7 @@ def _squares(fitter: Fitter, fit: Fit, rest: Sequence[Effect], clock: Effect) ->
 
 
 def _found(squares: Array) -> Delays:
-    """The delays with no leap, one or two: with as many as each takes off enough."""
+    """Return the delays with no, one or two jumps; each jump must reduce the squares enough."""
     until = np.concatenate([np.zeros((len(squares), 1)), np.cumsum(squares, axis=1)], axis=1)
     n = squares.shape[1]
 
@@ -263,7 +261,7 @@ def _found(squares: Array) -> Delays:
 
 
 def _time(fitter: Fitter, ends: Array, part: int, by: float) -> float:
-    """When a part begins, s of the run by a true clock, in which the DVL is late by so many seconds."""
+    """Return the true time, s of the run, at which a part with a DVL delay `by` (s) begins."""
     problem = fitter.problem
     (grid,) = problem.grids
     at = float(problem.time[min(int(ends[part - 1]), len(problem.time) - 1)])

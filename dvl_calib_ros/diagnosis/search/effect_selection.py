@@ -1,17 +1,16 @@
-"""Selection of the effects that the data call for.
+"""Selection of the effects that explain a recording.
 
-Columns propose: about the best fit so far, every effect's derivatives make one Gram matrix, in which all combinations
-of up to three effects are small least squares problems. The composed model decides: the best proposals are fitted in
-it until they stand still, and compared by what they explain less what so many parameters explain by chance. About the
-winner it is asked again, with the noise that is left by everything together: so that no effect is taken for noise.
+Proposal: linearised about the current fit, all effects share one Gram matrix. Combinations of up to three effects are
+small least squares problems in it. Decision: the best proposals are fitted in the composed model and compared by
+penalised deviance. The search repeats about the winner, with the noise re-estimated under all effects jointly, so that
+no effect is taken for noise.
 
-A constant error of a heading is not told from the DVL's mounting: the same heading navigates. One that swings once or
-twice around with the heading (magnetised iron, and iron that takes on the earth's field) or drifts looks like a
-mounting that moves, or that has moved between recordings on other headings. A compass does that every day and a
-mounting hardly ever, so it is named first: but where the same heading on another day contradicts.
+A constant heading error is not identifiable next to the DVL's mounting: navigation is identical. A heading error that
+varies with the heading (hard and soft iron) or drifts resembles a mounting that moves. Compass errors are common and
+moving mountings are rare, so the heading is named first, unless the same heading on another day contradicts it.
 
-Of a fast stream, neighbours tell a sample that is far off. Between the samples of a slow one a vehicle can turn; there
-the other stream has to say the same: that it is off, by as much and in the same direction.
+An outlier of a fast stream is found from its neighbours. A vehicle can turn between the samples of a slow stream: an
+outlier there must also contradict the other stream, by as much and in the same direction.
 """
 
 from __future__ import annotations
@@ -53,18 +52,19 @@ from .initial_guess import FirstGuess, first_guess, guess_beside
 from .observable_parameters import observable_parts, unobservable_parts, without_insignificant
 from .unexplained import unexplained
 
-# What a vehicle with a gap has most often; the first fit starts with all of these
+# The most common causes of a gap; the first fit includes all of them.
 START = (ARM, "dvl_time_offset", "reference_time_offset")
 ROUNDS = 4
-# Fits with outliers drawn in about the one before, from the first guess on
+# Robust fits from the first guess on; each re-estimates the outliers about the previous fit.
 ROBUST_ROUNDS = 3
 
 
 @dataclass(frozen=True)
 class EffectSelection:
-    """Outcome of a selection: the effects, strongest first; fits without and with them, under the same noise; the
-    fitter; guesses per recording; the effects there were, with what of each is shown. opened: at one speed.
-    moved: by part of the lever arm, by how much (m) it is another where another clock explains the data as well.
+    """Selected effects, strongest first, with the fits without (`base`) and with them under the same noise.
+
+    testable: effects with their observable parameters. opened: trade-off of lever arm and clock at one speed. moved: by
+    arm parameter, the difference (m) to a fit with another clock that explains the data equally well.
     """
 
     selected: tuple[Selected, ...]
@@ -77,19 +77,19 @@ class EffectSelection:
     moved: Mapping[str, float] = field(default_factory=dict)
 
     def without(self, names: Collection[str]) -> EffectSelection:
-        """Without some effects, the others fitted anew."""
+        """Return the selection without the named effects; re-estimate the others."""
         kept = [effect for effect in self.fit.effects if effect.name not in names]
         hypothesis = self.fit.hypothesis.with_effects(kept, len(self.fit.seen), {})
         selected = tuple(each for each in self.selected if each.effect.name not in names)
         return replace(self, selected=selected, fit=self.fitter.fit(hypothesis, self.fit.noise))
 
     def withdrawn(self) -> EffectSelection:
-        """Without any effect."""
+        """Return the selection without any effect."""
         return replace(self, selected=(), fit=self.base, opened=None, moved={})
 
 
 class TooFewBinsError(Exception):
-    """Streams that are known together for too short a time; says how many samples that is."""
+    """Error for streams that overlap too briefly, with their number of samples."""
 
     def __init__(self, samples: int) -> None:
         super().__init__(samples)
@@ -102,8 +102,7 @@ def started(
     lever_arm: Array,
     effects: Mapping[str, Effect],
 ) -> tuple[Problem, Hypothesis, tuple[FirstGuess, ...], dict[str, Effect]]:
-    """The problem about the first guess of each recording, a hypothesis with what it holds, the guesses, and effects
-    with what of each is shown."""
+    """Return the problem about each first guess, a start hypothesis, the guesses and the effects (observable parts)."""
     guesses = tuple(first_guess(recording, rotation_dvl_from_body, lever_arm) for recording in recordings)
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
     _check_size(problem)
@@ -128,7 +127,7 @@ def select(
 ) -> EffectSelection:
     """Select among testable effects. Raises TooFewBinsError."""
     heading = effects.get(HEADING)
-    effects = every = {name: effect.usual for name, effect in effects.items()}  # what is not shown is no noise either
+    effects = every = {name: effect.usual for name, effect in effects.items()}  # unobservable parameters are no noise
     problem, start, guesses, effects = started(recordings, rotation_dvl_from_body, lever_arm, effects)
     fitter, fit = _first_fit(problem, start)
     kept = without_slow_outliers(problem, fit.hypothesis)
@@ -175,7 +174,7 @@ def select(
 
 
 def _beside_moving_clocks(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess]) -> tuple[FirstGuess, ...]:
-    """Guesses of recordings whose DVL's clock leaps or drifts in a fit once more, with that taken off."""
+    """Repeat the guess of recordings whose DVL clock jumps or drifts in a fit, with that motion corrected."""
     problem, found = fitter.problem, list(guesses)
     for number, recording in enumerate(problem.recordings):
         moved = [each for each in fit.hypothesis.injections(number) if each.effect.name in MOVING_CLOCK]
@@ -191,7 +190,7 @@ def _check_size(problem: Problem) -> None:
 
 
 def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
-    """Robust fit of the first hypothesis, with white noise as large as the best fit so far leaves."""
+    """Fit the first hypothesis robustly, with white noise of the residual's size."""
     _check_size(problem)
     fitter = Fitter(problem)
     _, residual = fitter.evaluated(start)
@@ -205,7 +204,7 @@ def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
 
 
 def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit]:
-    """A fit once more with the noise that everything together leaves, and outliers about that."""
+    """Repeat a fit with noise and outliers re-estimated from the residual of all columns jointly."""
     problem = fitter.problem
     columns = _always_there(fitter, fit, effects)
     noise = fit.noise
@@ -228,13 +227,13 @@ def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fit
 
 
 def _always_there(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Array:
-    """(M, A, p) columns of a fit, and of every other effect that is there from the beginning to the end."""
+    """Return columns (M, A, p) of a fit and of all effects without a time of the run."""
     others = {name: effect for name, effect in effects.items() if not any(map(is_time_of_run, effect.parameters))}
     return np.concatenate([fit.columns, *(each.columns for each in variants_about(fitter, fit, others))], axis=2)
 
 
 def _shaken(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator[tuple[Array, Array]]:
-    """The same columns (M, A, p), and the residual (M, A), with made-up noise in one velocity and then in the other."""
+    """Yield the same columns (M, A, p) and residual (M, A) with simulated noise in each velocity in turn."""
     for problem in fitter.problem.shaken:
         other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
         again = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
@@ -246,11 +245,10 @@ def _frames(problem: Problem) -> list[Array | None]:
 
 
 def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Array]) -> tuple[Array, Array]:
-    """(M, A) what all columns of unit size explain of a residual, with a ridge that keeps those apart that are alike;
-    and that ridge, (p,).
+    """Return the part (M, A) of a residual that columns of unit size explain, and the ridge (p,).
 
-    own: (M, A, p + 1) each, what the velocities' own noise makes in columns and residual, which is taken off: they
-    would explain that of the residual by that in them, and what then is left is slower than any noise.
+    The ridge separates collinear columns. own: (M, A, p + 1) each, the contribution of a velocity's own noise to
+    columns and residual. It is subtracted: noise common to both would otherwise leave a residual slower than any noise.
     """
     white = noise.whiten(columns)
     ridge = np.full(columns.shape[2], 10.0 * np.sqrt(float((noise.whiten(residual) ** 2).sum())) / np.sqrt(len(white)))
@@ -262,9 +260,9 @@ def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Arra
 def _leapt_where_stamps_say_so(
     fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
 ) -> tuple[Fitter, Fit]:
-    """A fit, or the same with the leaps that the stamps show, each with the noise about it, by their likelihoods.
+    """Return a fit, or the same with the clock jumps in the stamps, by likelihood.
 
-    Under the noise about a fit without it, what a leap leaves is noise.
+    Each has its own noise: under the noise about a fit without it, the residual of a jump is noise.
     """
     fits = [fitter.fit(hypothesis, fit.noise) for hypothesis in jumps_in_stamps(fitter, fit, effects, every)]
     if not fits:
@@ -276,11 +274,11 @@ def _leapt_where_stamps_say_so(
 
 
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
-    """A fit with two clocks, or the same told by one of the three: what else it holds was only tried with the two."""
+    """Return a fit with two clocks, or a better one with one clock: candidates were combined with two only."""
     if not set(TWO_CLOCKS) <= set(fit.values) and not jumps_at_start(fitter, fit):
         return fit
     others = [fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in by_other_clocks(fitter, fit, effects)]
-    if others and jumps_at_start(fitter, fit):  # a clock that is late throughout has no time to choose
+    if others and jumps_at_start(fitter, fit):  # a constant delay chooses no time
         throughout = best_of(others, effects)
         if throughout.deviance < fit.deviance + price_of_a_time(effects[LEAP], len(effects)):
             return throughout
@@ -290,14 +288,14 @@ def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) ->
 def _with_what_is_shown_of_the_arm(
     fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
 ) -> tuple[Fitter, Fit, Mapping[str, Effect]]:
-    """A fit with that part of the lever arm that it shows, and the effects with no more than that of it.
+    """Return a fit and effects with only the observable parts of the lever arm.
 
-    every: effects with all that they have; effects: with what columns alone show.
+    every: effects with all parameters; effects: with those observable by their columns alone.
     """
     arm = without_insignificant(fitter.problem, fit)
     if arm is not None:
         effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
-        values = tuple(dict(each) for each in fit.values[ARM])  # what is not said of it is held where it is
+        values = tuple(dict(each) for each in fit.values[ARM])  # unobservable parts are held at their values
         hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
         fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
     whole = _with_all_of_the_arm(fitter, fit, every, effects)
@@ -307,10 +305,9 @@ def _with_what_is_shown_of_the_arm(
 def _with_all_of_the_arm(
     fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
 ) -> tuple[Fitter, Fit] | None:
-    """A fit with the whole lever arm, where that part which is not shown is so large that it is what is left, with the
-    noise about that; else None.
+    """Return a fit with the whole lever arm and its own noise, if unobservable parts explain the residual.
 
-    every: effects with all that they have; effects: with what is shown.
+    Return None otherwise. every: effects with all parameters; effects: with the observable ones.
     """
     if ARM not in fit.values or effects[ARM].parameters == every[ARM].parameters or not unexplained(fitter, fit).found:
         return None
@@ -331,18 +328,18 @@ __all__ = ["EffectSelection", "Selected", "select"]
 
 
 HEADING, MOVED, DRIFT = "heading_error", "mounting_moved", "misalignment_drift"
-# What turns DVL and reference against each other by the heading, by the recording or by the time
+# Effects that rotate DVL against reference by heading, recording or time
 BY_YAW = frozenset({HEADING, MOVED, DRIFT, "water_lock"})
 OF_DRIFT = "rad_per_hour"
-# Deviance that two cycles of a heading must promise to explain, as straight lines tell it, to be fitted
+# Deviance drop in the linearised model from which two heading cycles are fitted
 PROMISING = 20.0
 
 
 def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hypothesis]:
-    """What a fit holds that turns DVL and reference against each other, by a heading of two cycles instead: the same
-    in all recordings, and another in each. Where it holds no such thing, if that promises to explain something.
+    """Propose a heading error of two cycles in place of effects that rotate DVL against reference.
 
-    heading: with all that is rarer of it; None where it cannot be tested. None of it for a single recording.
+    Its parameters are shared or per recording. A fit without such effects gets only promising proposals, a single
+    recording none. heading: with all its parameters; None if untestable.
     """
     if heading is None or len(fit.seen) < 2:
         return []
@@ -354,8 +351,7 @@ def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hy
 
 
 def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit, dict[str, str]]:
-    """A fit in which a heading stands for a mounting that moves, if that explains the data as well, and by name what
-    may stand for what is in it."""
+    """Replace a moving mounting by an equally good heading error. Return the fit and equivalents by effect name."""
     if heading is None or len(fit.seen) < 2:
         return fit, {}
     alike: dict[str, str] = {}
@@ -378,7 +374,7 @@ def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit
 
 
 def _two_cycles(heading: Effect) -> tuple[Effect, Effect]:
-    """The same in all recordings, and another in each."""
+    """Return the heading error shared by all recordings and the one per recording."""
     of_day = heading.without({OF_DRIFT})
     return of_day.of_the_vehicle, of_day
 
@@ -388,7 +384,7 @@ def _names(effect: Effect) -> frozenset[str]:
 
 
 def _instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
-    """The hypothesis of a fit with a heading in place of effects by name."""
+    """Return the hypothesis of a fit with a heading error in place of the named effects."""
     n = len(fit.seen)
     none = {name: value for name, value in heading.defaults.items() if name in _names(heading)}
     own: tuple[Values, ...] = fit.values.get(HEADING, (none,) * n)
@@ -399,22 +395,22 @@ def _instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
     return fit.hypothesis.with_effects([*rest, heading], n, {HEADING: start})
 
 
-# Scatter about neighbours and about the other stream, beyond which both contradict
+# Robust standard deviations from neighbours and from the other stream; an outlier exceeds both
 FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0
-# Share of the one that the other must say, along it: an effect in a turn of two samples differs from both less alike
+# Bounds of the ratio of both deviations, projected: around a turn between samples they differ more
 ALIKE = (0.6, 1.7)
-# Samples of which a scatter is known
+# Fewest samples for a scatter
 FEWEST = 30
 _PASSES = 3
 
 
 def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
-    """The recordings without samples of slow streams that neighbours and the other stream contradict; None if none is.
+    """Return the recordings without outliers of slow streams. Return None if there are none.
 
     Parameters
     ----------
-    problem: Of the recordings.
-    hypothesis: Robustly fitted, so that lever arm and delays do not look like errors of single samples.
+    problem: The recordings.
+    hypothesis: Robust fit, so that lever arm and delays do not resemble outliers.
 
     """
     found = [_without(problem, hypothesis, index) for index in range(len(problem.recordings))]
@@ -436,7 +432,7 @@ def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedSt
 
 
 def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -> NDArray[np.bool_]:
-    """(N,) samples of one stream that are not contradicted."""
+    """Return (N,) whether each sample of one stream is no outlier."""
     recording = problem.recordings[index]
     of_dvl = clock is ActsOn.DVL_CLOCK
     curve, other = (recording.dvl, recording.reference) if of_dvl else (recording.reference, recording.dvl)
@@ -452,7 +448,7 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
     error = (seen.error if of_dvl else -seen.error) * measured
     suspicious = other.covers(seen.reference_stamps if of_dvl else seen.dvl_stamps)
     suspicious &= np.abs(error / _scatter(error)).max(axis=1) > FROM_OTHER
-    others = curve.part(~suspicious)  # two that are off side by side would bear each other out
+    others = curve.part(~suspicious)  # adjacent outliers would confirm each other
     if not suspicious.any() or len(others.time) < FEWEST:
         return kept
 
@@ -472,5 +468,5 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
 
 
 def _scatter(values: Array) -> Array:
-    """(3,) standard deviation of values (N, 3), robustly."""
+    """Return the robust standard deviation (3,) of values (N, 3)."""
     return np.maximum(robust_std(values), 1e-9)

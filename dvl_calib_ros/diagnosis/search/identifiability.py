@@ -1,4 +1,4 @@
-"""How sure each effect of a fit is, and which others could stand in for it."""
+"""Significance of each effect of a fit, and equivalent effects."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from .arm_clock_ambiguity import (
 from .candidates import combined, straight_lines
 from .initial_guess import FirstGuess
 
-# A clock is late for sure from so many σ of what registration leaves open
+# A clock offset is significant from this multiple of registration's standard deviation
 LATER = 2.0
 
 
 @dataclass(frozen=True)
 class Selected:
-    """An effect that the data calls for. log_p: with all others in; equivalent: names that could stand in for it;
-    rivals: with these in its place."""
+    """A significant effect. log_p: given all others; equivalent: names of possible substitutes; rivals: hypotheses with
+    them."""
 
     effect: Effect
     log_p: float
@@ -49,9 +49,9 @@ class Selected:
 
 @dataclass(frozen=True)
 class Identifiability:
-    """What is said of the effects of a fit: they, strongest first, and the fit with the clocks that are as likely.
+    """Selected effects, strongest first, and the fit with equally likely clocks.
 
-    opened, moved: as `EffectSelection` has them.
+    opened, moved: as in `EffectSelection`.
     """
 
     selected: tuple[Selected, ...]
@@ -63,7 +63,7 @@ class Identifiability:
 def identify_effects(
     fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], alike: Mapping[str, str]
 ) -> Identifiability:
-    """What is said of each effect of a fit. alike: by name of an effect, another that the fit has it as likely for."""
+    """Test each effect of a fit and its substitutes. alike: by effect name, a substitute that is equally likely."""
     called_for, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
     opened = opened_arm(guesses) if ARM in fit.values else None
@@ -78,8 +78,8 @@ def identify_effects(
     if clocks:
         selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
     if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
-        opened = replace(opened, late=IN_TIME_STD_S)  # only the two together are known
-    if opened is not None:  # what tells a lag from a delay is less than what lies between samples
+        opened = replace(opened, late=IN_TIME_STD_S)  # only their combination is observable
+    if opened is not None:  # a lag differs from a delay by less than interpolation errors
         selected = [
             _or_else(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
@@ -93,9 +93,8 @@ def identify_effects(
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
     """Test an effect given all others, and every other effect in its place.
 
-    One with more parameters that fits as well could be the cause, however much less likely its numbers make it; one
-    that fits worse could be if it needs fewer, or chooses no time: a leap at the best of nine times was known, where
-    the clock drifted.
+    An equally good substitute with more parameters could be the cause, even if less likely. A worse one could be if it
+    has fewer parameters, or chooses no time: a drifting clock was once named a clock jump at the best of nine times.
     """
     rest = fit_without(fitter, fit, effect)
     log_p = log_p_in_place(fitter, fit, rest, effect)
@@ -114,7 +113,7 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
             continue
         rival = fitter.fit_kept(combined(fitter, rest, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance
-        if behind < 0.5 * drop:  # what is much worse under one noise is under its own as well
+        if behind < 0.5 * drop:  # a fit much worse under one noise is so under its own
             behind = min(behind, predictive_gain_of(fitter.problem, rival, fit))
         fewer = n_amplitudes(effect, n) - n_amplitudes(effects[name], n)
         chosen = float(np.log(times_tried(effect) / times_tried(effects[name])))
@@ -133,11 +132,11 @@ def _clock_or_arm(
     opened: OpenArm | None,
     known: Collection[str] = (),
 ) -> list[Selected]:
-    """Lever arm and clock as one where each would do without the other.
+    """Merge lever arm and clock into one entry if each is insignificant given the other.
 
-    called_for: what the data calls for; a further clock that only stands beside the arm is named where it is shown.
-    opened: as `opened_arm` has it; a clock of the reference that is no later than that is not shown.
-    known: as `told_apart` has it; an insignificant arm cannot stand in for such a clock.
+    called_for: selected effects; a further clock is named only if significant. opened: from `opened_arm`; a reference
+    delay within that ambiguity is insignificant. known: from `told_apart`; an insignificant arm cannot stand in for
+    these clocks.
     """
     threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
 
@@ -169,6 +168,6 @@ def _clock_or_arm(
 
 
 def _or_else(selected: Selected, names: Sequence[str]) -> Selected:
-    """An effect for which others could stand in as well."""
+    """Add equivalent effects to an effect."""
     others = (name for name in (*names, *selected.equivalent) if name != selected.effect.name)
     return replace(selected, equivalent=tuple(dict.fromkeys(others)))

@@ -1,4 +1,4 @@
-"""What a diagnosis starts from: how the instruments of a recording stand to each other, as `register` finds it."""
+"""Initial guess of a diagnosis: clock offsets, lever arm and mounting from `register`."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from ..model.recorded_streams import RecordedStreams
 from ..model.stream_curve import Curve
 from ..model.time_grid import Offsets
 
-# Passes in which the true time of a late stamp is found
+# Fixed-point iterations for the true time of a delayed stamp
 _PASSES = 3
 
 
 @dataclass(frozen=True)
 class FirstGuess:
-    """Of one recording. offsets: of clocks. lever_arm: (3,) m, beyond what is known of it. phi: (3,) rad.
+    """Initial guess of one recording. offsets: of clocks. lever_arm: (3,) m, minus the known one. phi: (3,) rad.
 
-    registration: where these are from, None without one.
+    registration: source of these, None without one.
     """
 
     offsets: Offsets
@@ -38,16 +38,15 @@ class FirstGuess:
 
 
 def check_clocks(recording: RecordedStreams, rotation_dvl_from_body: Array) -> None:
-    """Raise InputError if stamps are too far apart for anything to be found.
+    """Raise InputError if clock offsets are too large for a diagnosis.
 
     Parameters
     ----------
-    recording: What is to be compared.
+    recording: The recording to compare.
     rotation_dvl_from_body: (3, 3), the nominal mounting.
-
     """
     if recording.registration is not None:
-        return  # they are not
+        return  # registration has succeeded
     motion = _motion(recording)
     far = None if motion is None else far_clocks(motion, rotation_dvl_from_body)
     if far is not None:
@@ -55,7 +54,7 @@ def check_clocks(recording: RecordedStreams, rotation_dvl_from_body: Array) -> N
 
 
 def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever_arm: Array) -> FirstGuess:
-    """Delays, lever arm and mounting of one recording; none where it cannot be registered."""
+    """Return delays, lever arm and mounting of one recording; zeros if it cannot be registered."""
     found = recording.registration
     if found is None and (motion := _motion(recording)) is not None:
         found = register(motion, rotation_dvl_from_body.T, lever_arm)
@@ -68,8 +67,8 @@ def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever
 def guess_beside(
     recording: RecordedStreams, moved: Sequence[Injection], rotation_dvl_from_body: Array, lever_arm: Array
 ) -> FirstGuess | None:
-    """The guess of a recording whose DVL's clock moves as was found: what is open about that clock as it moves is not
-    about one that stands. moved: leaps and drifts of it. None where its samples then are in no order."""
+    """Repeat the guess of a recording with the jumps and drifts (`moved`) of its DVL clock corrected. Return None if
+    the corrected samples are out of order."""
     curve = recording.dvl
     time = curve.time
     for _ in range(_PASSES):

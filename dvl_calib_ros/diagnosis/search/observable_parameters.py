@@ -1,4 +1,4 @@
-"""What of effects a reference that is horizontal shows, by the columns of their parameters."""
+"""Observable parameters of effects for a horizontal reference, by their columns."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from ..model.hypothesis import Values, amplitudes, is_time_of_run, no_effect
 from ..model.seen import Seen
 from .arm_clock_ambiguity import ARM
 
-# A parameter of its typical size that does less to what is compared than this share of what its effect's best-shown one
-# does, or of a usual bias (m/s), is left out, for what a model lacks does as much. A boat that rolls at 0.2°/s shows no
-# height of its DVL, an AUV at sea does at 1°/s; one that keeps level no bias upwards, nor roll and pitch of a mounting.
+# A parameter of typical size is excluded if its column is below this share of its effect's largest, or of a usual bias
+# (m/s): model errors are as large. A boat that rolls at 0.2°/s does not make the DVL's height observable, an AUV at
+# 1°/s does. A level vehicle makes neither the upward bias nor roll and pitch of the mounting observable.
 SHOWN_FROM, USUAL_MPS = 0.2, 0.02
-# A part of the lever arm is looked for where so much of it (m) would do as much, since metres left out turn all the
-# rest: an AUV that rolls at 0.5°/s. It stands if it is so many times what a model lacks makes of it
+# A part of the lever arm is kept if this length (m) is observable: metres left out would rotate the rest. An AUV that
+# rolls at 0.5°/s is such a case. It must be this multiple of the model error.
 ARM_FROM_M, FAINT = 0.6, 2.0
 
 
 def observable_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
-    """Effects without the parameters that references which do not measure the vertical do not show."""
+    """Return effects without parameters unobservable by a reference that does not measure the vertical."""
     if problem.measured[2]:
         return dict(effects)
     seen = problem.all_seen(no_effect())
@@ -32,7 +32,7 @@ def observable_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[st
 
 
 def unobservable_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect]) -> tuple[Effect, ...]:
-    """What is not shown of effects: who has what is shown of one has the other parts as well."""
+    """Return the unobservable parts of effects, which accompany the observable ones."""
     left_out = (effect.without({spec.name for spec in shown[name].parameters}) for name, effect in effects.items())
     return tuple(effect for effect in left_out if effect.parameters)
 
@@ -41,7 +41,7 @@ def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effec
     specs = amplitudes(effect)
     columns = problem.columns(no_effect(), seen, effect, somewhere(effect, problem))
     squares = (columns**2).sum(axis=1).mean(axis=0)
-    of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of days the one that shows most
+    of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of recordings the most informative
     sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
     least = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
     out = {spec.name for spec, size in zip(specs, sizes.tolist(), strict=True) if size < least}
@@ -52,7 +52,7 @@ def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effec
 
 
 def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
-    """The lever arm without what of it is no larger than what a model lacks makes (2 σ); None where all of it is."""
+    """Return the lever arm without parts below 2 σ of the model error. Return None if all are significant."""
     known = _known_to(problem, fit)
     faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < FAINT * std}
     (arm,) = (effect for effect in fit.effects if effect.name == ARM) if faint else (None,)
@@ -60,7 +60,7 @@ def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
 
 
 def with_observable(problem: Problem, fit: Fit, covariance: Array) -> Array:
-    """A covariance (6 + p, 6 + p) of a fit, its lever arm known no better than by what a model lacks."""
+    """Add the model error of the lever arm to a fit's covariance (6 + p, 6 + p)."""
     found, known = covariance.copy(), _known_to(problem, fit)
     for number, each in enumerate(fit.hypothesis.parameters(), start=6):
         if each.effect.name == ARM:
@@ -69,7 +69,7 @@ def with_observable(problem: Problem, fit: Fit, covariance: Array) -> Array:
 
 
 def _known_to(problem: Problem, fit: Fit) -> dict[str, float]:
-    """What a model lacks makes of a lever arm, m, by its parts of which a usual size would not be shown."""
+    """Return the model error, m, of lever arm parameters whose typical size is unobservable."""
     if problem.measured[2] or ARM not in fit.values:
         return {}
     sizes = np.sqrt((fit.columns[:, :, 6:] ** 2).sum(axis=1).mean(axis=0)).tolist()
@@ -83,7 +83,7 @@ def _known_to(problem: Problem, fit: Fit) -> dict[str, float]:
 
 
 def somewhere(effect: Effect, problem: Problem) -> list[Values]:
-    """Defaults, with what comes in the midst of the run where no time is given."""
+    """Return default values, with events at the middle of the run if no time is given."""
     values: list[Values] = []
     for recording in problem.recordings:
         times = {

@@ -1,7 +1,7 @@
-"""What is left after the best combination of effects: does it still follow the vehicle's motion, or time?
+"""Score tests of the residual of the best combination of effects against vehicle motion and time.
 
-A dictionary of what a vehicle's error could follow, each with a free vector in the body frame. Noise of the sky does
-not know the vehicle's motion, so what follows it is systematic, whatever its cause.
+The dictionary holds functions of motion or time, each with a free vector in the body frame. GNSS noise is independent
+of the vehicle's motion, so a residual that follows the motion is systematic.
 """
 
 from __future__ import annotations
@@ -28,30 +28,30 @@ from ..noise.noise_model import Noise
 from .alternative_regressors import ALTERNATIVES, dictionary
 
 LEVEL = 0.001
-# Of lines in the spectrum: longer than waves are, and more of them than the dictionary in time has
+# Spectral lines: longer than wave periods; more periods than the time dictionary resolves
 SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
-# The series whose spectrum is taken has so many steps for each bin at most: memory must not grow with pauses
+# Steps per bin of the series for the spectrum, at most: memory must not grow with pauses
 STEPS_OF_A_BIN = 16
-# Standard deviations that were taken off an outlier
+# Standard deviations of a subtracted outlier from which its bin is excluded
 OUTLYING = 5.0
-# Made-up recordings that tell what is chance, and degrees of freedom of the belief that this is as it should be
+# Simulated recordings for the null distribution, and degrees of freedom of the prior on its scale of 1
 MADE_UP, PRIOR_DOF = 12, 4.0
-# Of what explains the rest as well, but for a factor of 400 in p, the simplest is named: a step in time beside fifteen
-# functions of the turn rate, which turned otherwise after it
+# Among candidates within this log p of the best (a factor of 400), the simplest is named: a step in time rather than
+# fifteen functions of the turn rate.
 AS_LIKELY = 6.0
-# A column of which others leave less than this share of its squares is one of their functions
+# A column belongs to a group whose functions leave less than this share of its squares
 OF_GROUP = 0.02
-# Directions of the dictionary that hold less of their length than this beside the others are left out
+# Directions with less than this share of their length outside the others are excluded as collinear
 INDEPENDENT = 1e-3
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """log_p: of the best entry or of all together, adjusted for having looked at all. energy: in units of the noise
-    variance, beyond what chance brings. about: what the rest follows, by name, or a period (s). columns: (M, A, f), the
-    dictionary; empty if nothing is left, since it would only explain noise. clearest: (M, A, c), those of them that are
-    clearest; clear_energy: of these; price: what the best of as many would explain by chance, once in 1 / LEVEL
-    recordings.
+    """Result of the score tests. log_p: of the best entry or of all jointly, adjusted for multiple tests.
+
+    energy: excess over the null, in noise variances. about: name of the regressor, or a period (s). columns: (M, A, f),
+    the dictionary; empty if insignificant. clearest: (M, A, c), the most significant columns. clear_energy: explained
+    by these. price: quantile of the best test under the null at LEVEL.
     """
 
     log_p: float
@@ -64,28 +64,28 @@ class Unexplained:
 
     @property
     def found(self) -> bool:
-        """Whether something is left."""
+        """Return whether the residual is systematic."""
         return self.log_p < np.log(LEVEL)
 
     @property
     def follows(self) -> Reason:
-        """What the rest follows, as it is said."""
+        """Return the sentence that names the regressor."""
         if isinstance(self.about, float):
             return finding("REST_FOLLOWS_PERIOD", seconds=self.about)
         return finding("REST_FOLLOWS", about=self.about)
 
 
 def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
-    """Look for what the residual of a fit still follows.
+    """Test the residual of a fit against the dictionary.
 
-    What is found is held against made-up recordings: in these nothing but the fit is there. asked: by how much it has
-    to be clearer than its price to be of use; where that cannot be, nothing is found, and at once.
+    The null distribution is from recordings simulated from the fit (parametric bootstrap). asked: required excess over
+    the price; return early without a finding if no test can reach it.
     """
     problem, noise = fitter.problem, fit.noise
     looks, white, raw, basis = _looked(fitter, fit, problem, fit.seen, fit.residual)
     nothing = raw["time"][:, :, :0]
-    # Noise in the columns keeps a fit from standing where the residual is at right angles to them. Put there, it would
-    # follow the vehicle's speed, and have its periods
+    # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
+    # follow the vehicle's speed and have its periods.
     left = noise.whiten(fit.residual)
     left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
@@ -100,7 +100,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
         if max(each - prices[columns] for each, columns in most) < asked:
             return Unexplained(0.0, 0.0, "", nothing, nothing)
     recoloured: list[FollowTest] = []
-    if noise.is_coloured:  # what changes with time alone may as well be noise
+    if noise.is_coloured:  # a function of time alone may be coloured noise
         beside = NuisanceFit.of_fit(problem, fit)
         alone = _coloured_anew(noise, beside, nothing, fit.residual)
         for name, columns in raw.items():
@@ -127,7 +127,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
             recoloured[number] = each = replace(each, energy=each.energy / _chance(fitter, fit, each.name))
         others.append((each.log_p(), each.name, raw[each.name]))
     best = min(tests, key=_first)
-    if best[0] + looked_at > np.log(LEVEL):  # else what is left is told by what explains it under one noise
+    if best[0] + looked_at > np.log(LEVEL):  # otherwise the best test under one noise names the regressor
         tests += others
         best = min(tests, key=_first)
     about = _plainest(tests, best[0])
@@ -150,12 +150,12 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
 
 
 def _price(tested: int, columns: int) -> float:
-    """What the best of so many tests of so many columns explains by chance, once in 1 / LEVEL recordings."""
+    """Return the energy that the best of `tested` tests exceeds under the null with probability LEVEL."""
     return float(chi2_isf(LEVEL / tested, columns))
 
 
 def _plainest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
-    """Of those about as likely as the best, at log_p, the one with the fewest columns; -inf is as likely as itself."""
+    """Return the candidate with the fewest columns among those within `AS_LIKELY` of log_p."""
     likely = (each for each in tests if each[0] <= log_p + AS_LIKELY)
     return min(likely, key=lambda each: (each[2].shape[2], each[0]))
 
@@ -166,9 +166,7 @@ def _first(each: tuple[float, str | float, Array]) -> float:
 
 @dataclass(frozen=True)
 class FollowTest:
-    """One test. name: of the group of functions; at: which of its columns. energy: explained, chi-square of so many
-    dof; is_whole: of the whole group.
-    """
+    """Score test. name: of the group; at: columns under test; energy: chi-square of dof; is_whole: all columns."""
 
     name: str
     at: NDArray[np.intp]
@@ -177,15 +175,16 @@ class FollowTest:
     dof: int
 
     def log_p(self, grown: float = 1.0) -> float:
-        """Of the energy, which by chance is larger by a factor."""
+        """Return log p of the energy, divided by its inflation under the null."""
         return float(chi2_logsf(self.energy / grown, max(self.dof, 1))) if self.dof else 0.0
 
 
 def _looked(
     fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
 ) -> tuple[list[FollowTest], Array, dict[str, Array], Array]:
-    """All looks at a residual (M, A) of a problem seen through a fit; what it is whitened, of unit variance, beside
-    the fit's columns, with the rows of its prior; the columns of every group; and the basis of the fit's.
+    """Return tests of a residual (M, A), the whitened residual, each group's columns and the basis.
+
+    The whitened residual is of unit variance, orthogonal to the fit's columns, and ends with the rows of the prior.
     """
     noise = fit.noise
     own = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
@@ -206,17 +205,16 @@ def _looked(
 
 
 def _beside_prior(known: NuisanceFit, columns: Array, white: Array) -> tuple[Array, Array]:
-    """Orthonormal basis of the columns (M A, k) of what is known, whitened, and a whitened series (M A,), each with the
-    rows of the prior below: k more.
+    """Return an orthonormal basis of whitened nuisance columns (M A, k) and a series, each with k prior rows.
 
-    Without it the scale of a sway that is hardly there, which is noise, would explain that noise.
+    Without the prior, the scale of an insignificant sway, which is noise, would explain that noise.
     """
     basis = orthonormal(np.concatenate([columns, np.diag(1.0 / known.std)]))
     return basis, np.concatenate([white, known.centre / known.std])
 
 
 def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
-    """(M,) bins with an outlier in or beside them: it is in the motion as well that the error is held against."""
+    """Return (M,) bins with an outlier in or next to them: it affects the motion regressors as well."""
     if not isinstance(fitter.outliers, np.ndarray):
         return np.zeros(len(noise.level), dtype=bool)
     far = np.abs(noise.whiten(fitter.outliers)).reshape(noise.level.shape).max(axis=1) > OUTLYING
@@ -224,7 +222,7 @@ def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
 
 
 def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]:
-    """By what factor each look's energy is larger than chi-square in made-up recordings, at least 1."""
+    """Return the inflation of each test's energy over chi-square in simulated recordings, at least 1."""
     energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
     for other, seen, residual in simulated_recordings(fitter.problem, fit, MADE_UP):
         found, *_ = _looked(fitter, fit, other, seen, residual)
@@ -235,9 +233,8 @@ def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]
 
 @dataclass(frozen=True)
 class SpectralLine:
-    """The clearest line in the spectrum of one recording. log_p: adjusted for all frequencies looked at, up to a
-    factor. waves: (M, 2) cosine and sine, zero in other recordings.
-    """
+    """Most significant line of one recording. log_p: adjusted for the number of frequencies; waves: (M, 2) cosine and
+    sine."""
 
     period_s: float
     log_p: float
@@ -245,10 +242,10 @@ class SpectralLine:
 
 
 def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
-    """Lines in the innovations (M, A), of unit variance, of each recording that is long enough.
+    """Find a line in the spectrum of the innovations (M, A) of each recording that is long enough.
 
-    Noise of the sky has no period, coloured as it may be. Waves have: what is left of them at the pairing of two
-    sensors is no finding, so only periods longer than theirs count.
+    Coloured GNSS noise has no period. Only periods longer than waves count: pairing two sensors leaves a residual of
+    waves, which is no finding.
     """
     found = []
     for index, recording in enumerate(problem.recordings):
@@ -262,7 +259,7 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
             time[at] = time[at][0] + np.append(0.0, np.cumsum(shorter))
         position = ((time[at] - time[at][0]) / step).astype(int)
         sums = np.stack([np.bincount(position, series) for series in innovations[at].T])
-        n = 2 * sums.shape[1]  # twice as fine as independent frequencies are
+        n = 2 * sums.shape[1]  # twice the resolution of independent frequencies
         frequency = np.fft.rfftfreq(n, step)
         power = 2.0 * np.abs(np.fft.rfft(sums, n)) ** 2 / np.count_nonzero(at)  # chi-square of 2 degrees of freedom
         inside = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
@@ -278,31 +275,31 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
 
 
 def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
-    """Return whether what the residual follows predicts held-out data better than slow noise and chance do."""
+    """Return whether the regressor of the residual predicts held-out data better than slow noise and chance do."""
     return rest.found and holds_out(problem, fit, rest) > rest.price - rest.clearest.shape[2]
 
 
 def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
-    """Return the held-out deviance gain of what the residual of a fit follows most clearly."""
+    """Return the held-out deviance gain of the most significant columns."""
     known = NuisanceFit.of_fit(problem, fit)
     both = known.and_rest(rest.clearest, fit.residual)
     return predictive_gain(problem, fit.noise, (known, fit.residual), (both, fit.residual))
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
-    """(6 + p,) by how much the parameters of a fit move with what the rest follows most clearly fitted beside them."""
+    """Return the shift (6 + p,) of a fit's parameters with the most significant columns as nuisance."""
     noise, raw, known = fit.noise, rest.clearest, NuisanceFit.of_fit(problem, fit)
     if noise.is_coloured:
         noise = _coloured_anew(noise, known, raw, fit.residual).noise
     both = known.and_rest(raw, fit.residual)
-    stands = both._replace(centre=np.zeros_like(both.centre))  # about where the fit stands, whatever its prior
+    stands = both._replace(centre=np.zeros_like(both.centre))  # linearised at the fit, whatever its prior
     return stands.step(noise, fit.residual).solution()[: fit.columns.shape[2]]
 
 
 def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: str | float) -> bool:
-    """Whether what effects of a fit are to first order, beside its calibration, are functions of one group.
+    """Return whether the columns of some effects of a fit, without its calibration, lie in one group.
 
-    about: name of the group, or a period, which is none.
+    about: name of the group; a period (s) is no group.
     """
     if isinstance(about, float):
         return False
@@ -318,9 +315,7 @@ def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: st
 
 
 def _chance(fitter: Fitter, fit: Fit, name: str) -> float:
-    """By what factor a group of functions lowers the deviance more than chi-square in made-up recordings, as the noise
-    that is estimated anew bends to them; at least 1.
-    """
+    """Return the inflation, at least 1, of a group's deviance drop in simulated recordings by re-estimated noise."""
     lowered, dof, sound = PRIOR_DOF, PRIOR_DOF, ~_upset(fitter, fit.noise)[:, None]
     for other, seen, residual in simulated_recordings(fitter.problem, fit, MADE_UP // 2):
         columns = replace(fitter, problem=other).columns(fit.hypothesis, seen)
@@ -333,8 +328,9 @@ def _chance(fitter: Fitter, fit: Fit, name: str) -> float:
 
 
 class _Coloured(NamedTuple):
-    """deviance: of what columns leave of a residual under noise that is estimated anew from it, else it has their
-    colour. rank: of the columns.
+    """Deviance of a residual corrected by columns, under noise re-estimated from it. rank: of the columns.
+
+    Without re-estimation the noise would have the columns' colour.
     """
 
     deviance: float
@@ -342,12 +338,12 @@ class _Coloured(NamedTuple):
     noise: Noise
 
     def lowered_by(self, beside: _Coloured) -> tuple[float, int]:
-        """By how much further columns lower the deviance, and how many of them are independent."""
+        """Return the deviance drop by further columns and their rank, at least 1."""
         return max(self.deviance - beside.deviance, 0.0), max(beside.rank - self.rank, 1)
 
 
 def _coloured_anew(noise: Noise, known: NuisanceFit, raw: Array, residual: Array) -> _Coloured:
-    """A residual (M, A) under columns (M, A, c) beside known ones, and noise like the given one."""
+    """Fit columns (M, A, c) and nuisance columns to a residual (M, A); re-estimate the noise."""
     joined = np.concatenate([known.columns, raw], axis=2)
     size = np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
     joined = joined / size
@@ -364,13 +360,13 @@ def _coloured_anew(noise: Noise, known: NuisanceFit, raw: Array, residual: Array
 
 
 def _along_axes(functions: Array, axes: int) -> Array:
-    """(M, c) -> (M, A, A c): every function on every axis."""
+    """Return (M, A, A c): each function of (M, c) on each axis."""
     m, c = functions.shape
     return np.einsum("mc,ij->mijc", functions, np.eye(axes)).reshape(m, axes, axes * c)
 
 
 def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
-    """Columns of `_along_axes` that are tested together: all, each axis, and each of those that are alternatives."""
+    """Return columns of `_along_axes` per test: the group, each axis and each alternative."""
     index = np.arange(axes * c).reshape(axes, c)
     looks = [index.ravel(), *index]
     if name not in ALTERNATIVES:
@@ -380,7 +376,7 @@ def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
 
 
 def orthonormal(white: Array) -> Array:
-    """(m, r) basis of whitened columns (m, n), of which some may be zero or alike."""
+    """Return an orthonormal basis (m, r) of whitened columns (m, n), which may be zero or collinear."""
     lengths = np.linalg.norm(white, axis=0)
     white = white[:, lengths > 0.0] / lengths[lengths > 0.0]
     u, s, _ = np.linalg.svd(white, full_matrices=False)
@@ -388,7 +384,7 @@ def orthonormal(white: Array) -> Array:
 
 
 def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
-    """log p of what columns explain of a whitened series, and their energy beyond chance."""
+    """Return log p of the energy of a whitened series in some columns, and its excess over the null."""
     energy, dof = _Told.by(q, white_columns, white).energy(np.arange(white_columns.shape[1]))
     energy /= variance
     return (float(chi2_logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)
@@ -396,11 +392,10 @@ def explained(q: Array, white_columns: Array, white: Array, variance: float) -> 
 
 @dataclass(frozen=True)
 class _Told:
-    """What columns tell of a whitened series beside those of an orthonormal basis. Both may have further rows, of a
-    prior, which says nothing of these columns.
+    """Normal equations of columns for a whitened series, orthogonal to a basis.
 
-    gram: (c, c) of unit columns less what the basis tells of them. along: (c,) their products with the series. has:
-    (c,) whether there is more left of a column than its rounding.
+    Basis and series may end with prior rows, which the columns lack. gram: (c, c) of unit columns after projection.
+    along: (c,) products with the series. has: (c,) whether a column exceeds rounding after projection.
     """
 
     gram: Array
@@ -419,7 +414,7 @@ class _Told:
         return _Told(left / np.outer(size, size), along / size, has)
 
     def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
-        """Square of the series that columns `at` explain together, and of how many dimensions."""
+        """Return the energy that columns `at` explain jointly, and their rank."""
         at = at[self.has[at]]
         if not len(at):
             return 0.0, 0
