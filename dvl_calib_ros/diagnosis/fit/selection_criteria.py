@@ -80,7 +80,7 @@ def fit_without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
 
 
 def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
-    """Return log p of a drop in deviance, times the number of alternatives."""
+    """Return log p of a drop in deviance, adjusted for the number of alternatives."""
     return min(0.0, float(chi2_logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
 
 
