@@ -58,7 +58,7 @@ def criterion(fit: Fit, n_effects: int) -> float:
 
 
 def times_tried(effect: Effect) -> float:
-    """Return the number of alternatives of an effect: twice its times of the run, or one."""
+    """Return the number of alternatives of an effect: twice its windows, or one without times of the run."""
     return 2.0 * len(windows(effect, 1.0)) if any(is_time_of_run(s) for s in effect.parameters) else 1.0
 
 
