@@ -26,8 +26,8 @@ BODY_AXES = {"x": "ahead", "y": "to port", "z": "up"}
 class HeldOutTwin:
     """Recorded minus simulated DVL velocity of a recording, with parameters fitted to other data.
 
-    These are the gap's errors on the same samples. A slow reference's noise is unknown between its samples, so an error
-    elsewhere would not match the stated noise.
+    These are the gap's errors on the same samples. Interpolation between a slow reference's samples lacks its
+    noise, so an error there would not match the stated noise.
 
     Parameters
     ----------

@@ -58,7 +58,7 @@ def criterion(fit: Fit, n_effects: int) -> float:
 
 
 def times_tried(effect: Effect) -> float:
-    """Return the number of alternatives of an effect: twice its times of the run, or one."""
+    """Return the number of alternatives of an effect: twice its windows, or one without times of the run."""
     return 2.0 * len(windows(effect, 1.0)) if any(is_time_of_run(s) for s in effect.parameters) else 1.0
 
 
@@ -80,7 +80,7 @@ def fit_without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
 
 
 def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
-    """Return log p of a drop in deviance, times the number of alternatives."""
+    """Return log p of a drop in deviance, adjusted for the number of alternatives."""
     return min(0.0, float(chi2_logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
 
 

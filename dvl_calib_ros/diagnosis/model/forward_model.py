@@ -6,7 +6,7 @@ It inverts the physics of `effects.composition`. At a true time s, with the stam
 
 with D = (I + diag(δk)) Exp(φ + turns on MOUNTING(u)) T and g the reference velocity in the body frame. Exp(φ) is the
 finite rotation of which I + [φ×] is the first order. Streams are not paired: each is a curve of time, so a delay of
-seconds is a change of argument. e is averaged over bins of two intervals of the slower stream (`DiagnosisSettings`).
+seconds is a change of argument. e is averaged over bins of two intervals of the rougher stream (`DiagnosisSettings`).
 
 Regressors use the smoothed DVL velocity, whose noise is small. Regressors from the reference would bias estimates
 towards zero (errors in variables).

@@ -14,7 +14,7 @@ class DiagnosisSettings:
     of the attitude is better. unmeasured_std: standard deviation from which an axis is unmeasured (drivers write 1e3
     (m/s)² and more).
 
-    Comparing: the residual is averaged over bins_per_interval intervals of the slower stream, so that interpolation
+    Comparing: the residual is averaged over bins_per_interval intervals of the rougher stream, so that interpolation
     errors near its Nyquist frequency do not resemble a delay. Bins are at least shortest_bin long and at most max_bins
     in number. max_points: number of samples of a stream; longer recordings are averaged.
 

@@ -1,7 +1,7 @@
 """Noise of the residual: level, colour and frame, and whitening.
 
-Per axis, noise = level(t) · ARMA(p, 1): white noise of both sensors plus coloured noise of the receiver's filter and
-the sky in the reference. The level may grow with speed, turn rate and acceleration. All is estimated from the residual.
+Per axis, noise = level(t) · ARMA(1, 1) or less: white noise of both sensors plus coloured noise of the receiver's
+filter and the sky in the reference. The level may depend on reported covariances, speed and turn rate.
 """
 
 from __future__ import annotations

@@ -38,8 +38,7 @@ LATER = 2.0
 
 @dataclass(frozen=True)
 class Selected:
-    """A significant effect. log_p: given all others; equivalent: names of possible substitutes; rivals: hypotheses with
-    them."""
+    """Significant effect. log_p: given all others; equivalent: names of substitutes; rivals: hypotheses with them."""
 
     effect: Effect
     log_p: float

@@ -233,8 +233,7 @@ def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]
 
 @dataclass(frozen=True)
 class SpectralLine:
-    """Most significant line of one recording. log_p: adjusted for the number of frequencies; waves: (M, 2) cosine and
-    sine."""
+    """Most significant line of one recording. log_p: adjusted for all frequencies; waves: (M, 2) cosine and sine."""
 
     period_s: float
     log_p: float
