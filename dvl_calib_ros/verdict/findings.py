@@ -40,7 +40,7 @@ FINDINGS = (
         "DVL_NONE_USABLE",
         "none of {count} DVL messages can be used: {reasons}",
         "",
-        "look the reasons up in the table of drivers (docs/bags_and_drivers.md)",
+        "look the reasons up in docs/reference.md#drivers",
     ),
     # clocks and stamps
     Kind(
