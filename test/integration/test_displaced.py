@@ -107,7 +107,7 @@ def test_the_report_says_where_the_dvl_is_and_how_late(tmp_path, monkeypatch):
     calibration = dc.replay(recorded(tmp_path / "bag", (1.3, 0.2, 0.0), -2.2))
     page = calibration.report(tmp_path / "report.html").read_text().replace("\N{MINUS SIGN}", "-")
     ahead, to_port, late = (
-        float(re.search(rf"<span>{name}</span><b>([+-]?[\d.]+) ", page)[1])
+        float(re.search(rf"<span>{name}</span><b>([+-]?[\d.]+)&nbsp;", page)[1])
         for name in ("lever arm, ahead", "lever arm, to port", "stamps late")
     )
     np.testing.assert_allclose((ahead, to_port, late), (1.3, 0.2, -2.2), atol=0.05)

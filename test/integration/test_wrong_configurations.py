@@ -13,7 +13,6 @@ import pytest
 from conftest import few
 from io_fixtures import live, write_bag
 from scipy.spatial.transform import Rotation
-from yaml_text import written
 
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -230,7 +229,7 @@ def test_a_right_configuration_is_not_rejected_and_nothing_else_is_said_to_fit(s
 def test_what_the_node_saves_of_a_wrong_configuration_is_refused_too(tmp_path, capsys):
     document = result_document(live(write_bag(tmp_path / "bag", run(YAW[45])), Parameters()).result())
     saved, launch = tmp_path / "result.yaml", tmp_path / "tf.launch.xml"
-    saved.write_text(written(document))
+    saved.write_text(result_text(document))
     assert main(["apply", str(saved), "--launch", str(launch)]) == 2
     error = capsys.readouterr().err
     assert "the data fit mounting_rpy 0 0 0.785" in error and not launch.exists()
