@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 
+import numpy as np
+
 from ...effects.base import Effect
 from ..fit.cross_validation import surprise_elsewhere
 from ..fit.gauss_newton import Fit
@@ -98,7 +100,8 @@ def confirmed(selection: EffectSelection, rest: Unexplained, gap: Gap) -> tuple[
 
     An effect that one stretch alone determines, as a clock jump by one turn, is kept if no unknown cause replaces it.
     """
-    if not selection.selected or gap.interval[0] > 0.0:
+    shrinks = gap.interval[0] > 0.0 or (np.isnan(gap.interval[0]) and gap.after < gap.before)
+    if not selection.selected or shrinks:
         return selection, rest
     none = selection.withdrawn()
     left = unexplained(none.fitter, none.fit)

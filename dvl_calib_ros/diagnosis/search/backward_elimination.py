@@ -118,9 +118,18 @@ def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:
 
 
 def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
-    """Return a fit without effects that do not predict held-out data beyond chance, slow noise being an alternative."""
+    """Return a fit without effects that chance or slow noise explains as well.
+
+    An effect is kept if its sandwich p-value over blocks is significant and it predicts held-out data beyond its price.
+    """
     problem, n = fitter.problem, len(fit.seen)
+    block = blocks_of(problem)
     while fit.effects:
+        p_values = {effect.name: robust_p(fit, effect, block) for effect in fit.effects}
+        name = max(p_values, key=lambda each: p_values[each])
+        if p_values[name] >= SETTINGS.robust_level:
+            fit = fit_without(fitter, fit, next(effect for effect in fit.effects if effect.name == name))
+            continue
         spare = []
         for effect in fit.effects:
             rest = fit_without(fitter, fit, effect)
