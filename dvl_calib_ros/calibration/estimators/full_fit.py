@@ -46,7 +46,7 @@ OF_VEHICLE = np.delete(np.arange(N_STATE), OF_DAY)
 # The point of linearisation is renewed when an angle, scale, lever arm or delay has moved by this number of σ.
 FAR = 1.0
 # Gauss-Newton steps at a renewal: at most STEPS, or until a step is below LAST_STEP σ.
-STEPS, LAST_STEP = 8, 0.1
+STEPS, LAST_STEP = 8, 0.3
 # Blocks whose streams are kept (40 minutes); the contribution of older ones stays fixed.
 KEPT_BLOCKS = 240
 # Points of the slow errors' prior for the numerical integration.
@@ -140,6 +140,20 @@ class _Climb(NamedTuple):
     std: float
 
 
+class _Hypotheses(NamedTuple):
+    """A combinations of priors, at C points of the slow errors, over n states.
+
+    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C). log_odds: (A,).
+    climb_mps: (A,) m/s, σ of a day's mean climb.
+    """
+
+    information: Array
+    vector: Array
+    log_det: Array
+    log_odds: Array
+    climb_mps: Array
+
+
 class JointEstimate(NamedTuple):
     """Estimate from all blocks. state: x, P of [vehicle, each day]. weights: (C,) of the slow errors' prior points."""
 
@@ -165,6 +179,7 @@ class JointFit:
         self._linear = self._x.copy()  # the point of linearisation
         self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
         self._slow, self._deviation, self._log_prior = self._points()
+        self._known: dict[tuple[int | None, int | None, bool, int], _Hypotheses] = {}
         self.used = self._gated = self._left_out = 0
         self._misfit = 0.0
         self._fitted: JointEstimate | None = None
@@ -192,6 +207,7 @@ class JointFit:
                 return
             self._centre = self._centre + moved
             self._slow, self._deviation, self._log_prior = self._points()
+            self._known.clear()
             for day in self._days:
                 if day.sections:
                     day.chain = Chain.begun(self._slow)
@@ -489,21 +505,12 @@ class JointFit:
         return found
 
     def _mixture(self, ended: Sequence[Eliminated | None], points: slice, climbs: Sequence[_Climb]) -> JointEstimate:
-        """Return mean and covariance over points of the slow errors and over the hypotheses of the priors.
-
-        These are a right and a wrong configured lever arm, a small and a large vertical error of the reference, and a
-        level, a slowly sinking and a diving vehicle.
-        """
-        arms = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
-        offsets = {0.0: 1.0 - OFFSET, OFFSET_MPS: OFFSET} if climbs else {0.0: 1.0}
-        paths = {0.0: 1.0 - SLOWLY - CLIMBS, SLOW_MPS: SLOWLY, CLIMB_MPS: CLIMBS} if climbs else {0.0: 1.0}
-        cases = list(product(arms, offsets, paths))
-        likely = np.array([arms[arm] * offsets[offset] * paths[climb_mps] for arm, offset, climb_mps in cases])
-        priors = [self._by_prior(points, arm, offset) for arm, offset, _ in cases]
-        information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
+        """Return mean and covariance over points of the slow errors and over the hypotheses of the priors."""
+        known = self._hypotheses(points, bool(climbs))
+        information, vector, log_det = known.information.copy(), known.vector.copy(), known.log_det.copy()
         square = np.zeros(information.shape[:2])
         for climb in climbs:
-            variance = np.array([max(climb.std, climb_mps) for *_, climb_mps in cases])[:, None] ** 2
+            variance = np.maximum(climb.std, known.climb_mps)[:, None] ** 2
             h, at = climb.row[:-1], climb.at
             information[:, :, at[:, None], at] += np.outer(h, h) / variance[:, :, None, None]
             vector[:, :, at] -= climb.row[-1] * h / variance[:, :, None]
@@ -520,7 +527,7 @@ class JointFit:
         covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
         x = (covariance @ vector[..., None])[..., 0]
         left = square - (x * vector).sum(axis=-1)
-        odds = np.log(likely)[:, None] + self._log_prior[points]
+        odds = known.log_odds[:, None] + self._log_prior[points]
         evidence = odds - 0.5 * (left + log_det + np.linalg.slogdet(information)[1])
         weights = np.exp(evidence - evidence.max())
         weights /= weights.sum()
@@ -528,6 +535,29 @@ class JointFit:
         spread = x - mean
         p = np.tensordot(weights, covariance) + np.einsum("ac,aci,acj->ij", weights, spread, spread)
         return JointEstimate(GaussianState(mean, 0.5 * (p + p.T)), weights.sum(axis=0))
+
+    def _hypotheses(self, points: slice, seen_climbing: bool) -> _Hypotheses:
+        """Return the hypotheses of the priors, computed once per set of points and number of days.
+
+        These are a right and a wrong configured lever arm, a small and a large vertical error of the reference, and a
+        level, a slowly sinking and a diving vehicle. seen_climbing: whether any day shows its vertical velocity.
+        """
+        key = points.start, points.stop, seen_climbing, len(self._days)
+        if key not in self._known:
+            arms = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
+            offsets = {0.0: 1.0 - OFFSET, OFFSET_MPS: OFFSET} if seen_climbing else {0.0: 1.0}
+            paths = {0.0: 1.0 - SLOWLY - CLIMBS, SLOW_MPS: SLOWLY, CLIMB_MPS: CLIMBS} if seen_climbing else {0.0: 1.0}
+            cases = list(product(arms, offsets, paths))
+            priors = [self._by_prior(points, arm, offset) for arm, offset, _ in cases]
+            information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
+            self._known[key] = _Hypotheses(
+                information,
+                vector,
+                log_det,
+                np.log([arms[arm] * offsets[offset] * paths[path] for arm, offset, path in cases]),
+                np.array([path for *_, path in cases]),
+            )
+        return self._known[key]
 
     def _by_prior(self, points: slice, tape_std: float, offset_std: float) -> tuple[Array, Array, Array]:
         """Return the prior's information (C, n, n), its product with the state (C, n) and -log determinant (C,).

@@ -226,8 +226,9 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     if len(block.dvl.times) < 4 or len(block.imu.times) < 2 or not len(at):
         return None
     rotation, oriented, rates, turning_known = attitude_of(block, at, parameters.imu_timeout)
-    seen = dvl_at(block, at + x[DELAY])
-    use = seen.known & (oriented | reference.in_body) & turning_known
+    n_all, reach, stamps = len(at), block.slope_reach_s, at + x[DELAY]
+    velocity, known = dvl_at(block, np.concatenate([stamps, stamps - reach, stamps + reach]))
+    use = known[:n_all] & (oriented | reference.in_body) & turning_known
     use &= squared(np.where(block.measured, reference.velocity, 0.0)) >= parameters.min_speed**2
     if parameters.max_turn_rate > 0.0:
         use &= squared(rates) <= parameters.max_turn_rate**2
@@ -236,17 +237,15 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     at, rotation, rates, in_body = at[use], rotation[use], rates[use], reference.in_body[use]
     around = np.concatenate([at - TURNING_S, at + TURNING_S])
     turns = spline_at(block.imu.times, block.imu.angular_velocity, block.imu_slope[:, 4:], around, np.inf).value
-    before, after = np.split(turns, 2)
-    turning = (after - before) / (2.0 * TURNING_S)
+    turning = (turns[len(at) :] - turns[: len(at)]) / (2.0 * TURNING_S)
     t = parameters.rotation_dvl_from_body
     inverse = np.linalg.inv(np.eye(3) + skew(x[PHI]))
     gain = 1.0 / (1.0 + np.append(x[SCALE], 0.0))
     arm = np.array(parameters.lever_arm) + x[LEVER_ARM]
-    scaled = (seen.value[use] - x[BIAS]) * gain
+    own_velocity, earlier, later = velocity.reshape(3, n_all, 3)[:, use]
+    scaled = (own_velocity - x[BIAS]) * gain
     in_dvl = scaled @ inverse.T
     through = t.T @ inverse * gain
-    reach, stamps = block.slope_reach_s, at + x[DELAY]
-    later, earlier = np.split(dvl_at(block, np.concatenate([stamps + reach, stamps - reach])).value, 2)
     accelerating = (later - earlier) / (2.0 * reach) @ through.T
     body = in_dvl @ t - cross(rates, arm)
     n = len(at)
