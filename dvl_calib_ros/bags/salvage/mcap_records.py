@@ -271,6 +271,8 @@ def message_head(
 
     at: position of all records in the file. holds: function that returns the bytes at a position.
     """
+    if len(head) < RECORD_HEAD.size + _MESSAGE_HEAD.size:
+        raise DamagedError(f"at byte {at}: a message is cut off")
     _, length = RECORD_HEAD.unpack_from(head)
     channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(head, RECORD_HEAD.size)
     if length < _MESSAGE_HEAD.size or channel not in tables.channels:
