@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from ..verdict.reasons import Reason
-from .assessment.dead_reckoning import Navigation, dead_reckoned, doubts, objections
+from .assessment.dead_reckoning import Navigation, SlowNoise, dead_reckoned, doubts, objections
 from .assessment.manoeuvre_planner import drift_left_open
 from .estimators.estimator import NEVER, Estimator, Rest
 from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
@@ -151,7 +151,7 @@ class Assessor:
         n_days, p = len(terms[0]), self._estimates.parameters
         parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
         corrections = [each for of_days in terms for each in of_days]
-        return dead_reckoned(recording, parts, corrections, p, epoch_ns, deviation)
+        return dead_reckoned(recording, parts, corrections, p, epoch_ns, deviation, self._further.slow_noise)
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
         """Return, per fold and day, one model's corrections estimated without that fold.
@@ -358,6 +358,11 @@ class NonlinearEstimators:
     def recording(self) -> tuple[ThinnedRecording, int] | None:
         """Streams kept for verification, and the stamp (ns) of their time 0; None if nothing was kept."""
         return self._first(lambda each: each.recording)
+
+    @property
+    def slow_noise(self) -> SlowNoise | None:
+        """Slow errors of reference and attitude as estimated; None if not estimated."""
+        return self._first(lambda each: each.slow_noise)
 
     @property
     def n_days(self) -> int:

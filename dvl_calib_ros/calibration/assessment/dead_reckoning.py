@@ -69,6 +69,24 @@ class Drift:
         return 0.1 * self.per_km
 
 
+class SlowNoise(NamedTuple):
+    """Slow errors of reference and attitude, first-order Gauss-Markov (σ).
+
+    velocity: m/s, per horizontal axis. heading: rad. memory_s: time constant, s.
+    """
+
+    velocity: float
+    heading: float
+    memory_s: float
+
+    def squares(self, seconds: Array, metres: Array) -> Array:
+        """Return the mean square of the drift (K,) m² over stretches of these durations (K,) s and lengths (K,) m."""
+        passed = seconds / self.memory_s
+        spent = 2.0 * self.memory_s**2 * (passed - 1.0 + np.exp(-passed))
+        speed = metres / np.maximum(seconds, 1e-9)
+        return np.asarray((2.0 * self.velocity**2 + (self.heading * speed) ** 2) * spent)
+
+
 @dataclass(frozen=True)
 class Navigation:
     """Dead reckoning compared with the reference.
@@ -84,7 +102,7 @@ class Navigation:
     before, after
         Drift with the nominal mounting, and corrected by estimates that had not seen the data.
     noise_per_km
-        Drift that noise of reference and DVL may cause, m per km, estimated from the data.
+        Drift that noise of reference, attitude and DVL may cause, m per km, white and slow as estimated.
     on_a_map
         Whether headings are known: then positions are east and north, else forward and to port.
     stamps_ns, distances
@@ -138,11 +156,12 @@ def dead_reckoned(
     parameters: Parameters,
     epoch_ns: int = 0,
     heading: GaussianState | None = None,
+    slow: SlowNoise | None = None,
 ) -> Navigation | None:
     """Compare the track of the DVL, uncorrected and corrected, with the reference; None without reference or motion.
 
     folds: (N,) index into `terms` of each DVL sample's correction. epoch_ns: stamp of the recording's time 0. heading:
-    see `Estimate.heading_deviation`.
+    see `Estimate.heading_deviation`. slow: None if not estimated.
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
@@ -162,6 +181,8 @@ def dead_reckoned(
         return None
     errors = [each.error[use, axes] for each in (before, after)]
     astray = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
+    if slow is not None and recording.reference.in_body.all():
+        slow = slow._replace(heading=0.0)  # body velocities need no heading
     ends = ends_of_stretches(along)
     kept = np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
@@ -172,7 +193,7 @@ def dead_reckoned(
         stretches=len(ends) - 1,
         before=drift_over(astray[0], along, ends),
         after=drift_over(astray[1], along, ends),
-        noise_per_km=_noise(errors[1], step_s, along, ends),
+        noise_per_km=_noise(errors[1], step_s, along, ends, slow),
         on_a_map=on_a_map,
         stamps_ns=np.round(recording.dvl.times[use[kept]] * 1e9).astype(np.int64) + epoch_ns,
         distances=along[kept],
@@ -258,16 +279,20 @@ def drift_over(astray: Array, along: Array, ends: Index) -> Drift:
     return Drift(1000.0 * math.sqrt(float(np.mean(share**2))), float(np.linalg.norm(astray[-1])))
 
 
-def _noise(errors: Array, step_s: Array, along: Array, ends: Index) -> float:
-    """Return the drift that white noise of these errors (K, 2) causes, m per km, rms over stretches.
+def _noise(errors: Array, step_s: Array, along: Array, ends: Index, slow: SlowNoise | None) -> float:
+    """Return the drift that white noise of these errors (K, 2) and slow noise cause, m per km, rms over stretches.
 
-    Differences of neighbours give the noise without slow errors.
+    Differences of neighbours give the white noise.
     """
     if len(errors) < 3:
         return 0.0
     variance = median(np.diff(errors, axis=0) ** 2).sum() / (2.0 * MEDIAN_SQUARE)
     squares = np.concatenate([[0.0], np.cumsum(step_s[1:] ** 2)])
-    share = variance * np.diff(squares[ends]) / np.maximum(np.diff(along[ends]), 1e-9) ** 2
+    metres = np.maximum(np.diff(along[ends]), 1e-9)
+    off = variance * np.diff(squares[ends])
+    if slow is not None:
+        off = off + slow.squares(np.diff(np.cumsum(step_s)[ends]), metres)
+    share = off / metres**2
     return 1000.0 * math.sqrt(float(np.mean(share)))
 
 
@@ -310,7 +335,7 @@ def in_words(navigation: Navigation) -> list[str]:
     said = [
         f"Dead reckoning on data held out, {over}: {metres(before.per_km)} m of drift per km as mounted "
         f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %). "
-        f"Noise of reference and DVL alone may make {metres(n.noise_per_km)} m."
+        f"Noise of reference, attitude and DVL alone may make {metres(n.noise_per_km)} m."
     ]
     said.append(
         f"After {n.distance_m:.0f} m it is {metres(before.end)} m off as mounted, {metres(after.end)} m corrected"

@@ -17,6 +17,7 @@ from typing import ClassVar
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
+from ..assessment.dead_reckoning import SlowNoise
 from ..assessment.model_selection import Evidence
 from ..filters.cross_validation import FOLDS, HeldOutError, Moments
 from ..filters.filter_bank import ModelCounts
@@ -495,6 +496,11 @@ class FullEstimator(Estimator):
             return self._idle_solver().fit.held_out_error()
         except np.linalg.LinAlgError:
             return None
+
+    @property
+    def slow_noise(self) -> SlowNoise | None:
+        """See `Estimator`."""
+        return self._idle_solver().fit.slow_noise
 
     def _idle_solver(self) -> BlockSolver:
         self._newest()

@@ -15,7 +15,7 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from ...verdict.reasons import Reason
-from ..assessment.dead_reckoning import Navigation
+from ..assessment.dead_reckoning import Navigation, SlowNoise
 from ..assessment.model_selection import NO_EVIDENCE, Evidence
 from ..filters.cross_validation import HeldOutError, Moments, held_out_error
 from ..filters.filter_bank import Group, ModelCounts
@@ -119,6 +119,11 @@ class Estimator(ABC):
     @property
     def registration(self) -> Registration | None:
         """Registration of clocks and frames from the data alone; None if not computed."""
+        return None
+
+    @property
+    def slow_noise(self) -> SlowNoise | None:
+        """Slow errors of reference and attitude as estimated; None if not estimated."""
         return None
 
     def rest(self, *, fresh: bool) -> Rest | None:

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..assessment.dead_reckoning import SlowNoise
 from ..filters.cross_validation import FOLDS, HeldOutError
 from ..models.own import (
     BIAS,
@@ -279,6 +280,16 @@ class JointFit:
         if self._fitted is None or not self.has_data:
             return []
         return self._by_day(self._fitted.state)
+
+    @property
+    def slow_noise(self) -> SlowNoise | None:
+        """Slow errors as estimated, the mean of their posterior; None before the first block."""
+        if self._fitted is None or not self.has_data:
+            return None
+        east, north, *_, heading = np.sqrt(self._fitted.weights @ self._slow.std**2).tolist()
+        return SlowNoise(
+            math.hypot(east, north) / math.sqrt(2.0), heading, float(self._fitted.weights @ self._slow.memory_s[:, 0])
+        )
 
     def _by_day(self, state: GaussianState) -> list[GaussianState]:
         each = (self._of_day(number) for number in range(len(self._days)))

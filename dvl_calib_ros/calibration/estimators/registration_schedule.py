@@ -238,6 +238,8 @@ class KeptClocks:
             told.fit.held_out_error(),
             typical_error(recording, Terms.of_state(state.x), p),
             recording.judged(p),
-            dead_reckoned(recording, folds_of(stamps_ns, p), terms, p, told.epoch_ns, deviation_of(state)),
+            dead_reckoned(
+                recording, folds_of(stamps_ns, p), terms, p, told.epoch_ns, deviation_of(state), told.fit.slow_noise
+            ),
             not recording.reference.in_body.any(),
         )

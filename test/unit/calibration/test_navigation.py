@@ -9,7 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.assessment.dead_reckoning import Navigation, dead_reckoned, in_words, objections
+from dvl_calib_ros.calibration.assessment.dead_reckoning import (
+    Navigation,
+    SlowNoise,
+    dead_reckoned,
+    in_words,
+    objections,
+)
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
@@ -51,9 +57,9 @@ def recording(
     )  # fmt: skip
 
 
-def navigated(data: ThinnedRecording, terms: Terms = NO_TERMS) -> Navigation | None:
+def navigated(data: ThinnedRecording, terms: Terms = NO_TERMS, *, slow: SlowNoise | None = None) -> Navigation | None:
     folds = np.zeros(len(data.dvl.times), dtype=np.int64)
-    return dead_reckoned(data, folds, [terms], Parameters())
+    return dead_reckoned(data, folds, [terms], Parameters(), slow=slow)
 
 
 @pytest.mark.parametrize("attitude", [True, False])
@@ -139,3 +145,22 @@ def test_a_correction_that_makes_the_track_worse_is_rejected_where_velocities_do
     assert not objections(better) and not objections(navigated(data)) and not objections(None)
     too_short = navigated(recording(60.0), Terms(0.01 * np.ones(6), np.zeros(3), 0.0))
     assert too_short.after.per_km > 10.0 and not objections(too_short)
+
+
+@pytest.mark.parametrize(("std", "memory_s"), [(0.02, 40.0), (0.02, 400.0)])
+def test_slow_noise_of_the_reference_counts_as_noise_of_the_drift(std, memory_s):
+    rng = np.random.default_rng(8)
+    ratios = []
+    for _ in range(12):
+        data = recording(1000.0)
+        step_s = float(np.diff(data.reference.times).mean())
+        kept = np.exp(-step_s / memory_s)
+        slow = np.zeros((len(data.reference.times), 3))
+        slow[0] = rng.normal(size=3) * std
+        for k in range(1, len(slow)):
+            slow[k] = kept * slow[k - 1] + np.sqrt(1.0 - kept**2) * std * rng.normal(size=3)
+        reference = data.reference._replace(velocity=data.reference.velocity + slow)
+        found = navigated(data._replace(reference=reference), slow=SlowNoise(std, 0.0, memory_s))
+        assert found is not None
+        ratios.append(found.after.per_km / found.noise_per_km)
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.25)
