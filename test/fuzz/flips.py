@@ -190,7 +190,8 @@ def run_flips(data: bytes, path: Path) -> None:
     missing = MESSAGES - len(found)
     assert missing <= 0 or notes, f"{missing} messages lost, and nothing said"
     said = re.search(r"(\d+) messages? lost", " ".join(notes))
-    assert said is None or missing <= int(said[1]) <= missing + len(places), f"{missing} lost: {notes}"
+    # a message that came out as another one is lost as well, whether or not that is noticed
+    assert said is None or missing <= int(said[1]) <= missing + others + len(places), f"{missing} lost: {notes}"
     is_counted = options.get("use_statistics", True) and all(place < of.summary for place in places)
     assert said or missing <= 0 or not is_counted, f"{missing} lost: {notes}"
 
