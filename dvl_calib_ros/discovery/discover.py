@@ -41,14 +41,12 @@ from .discovery import (
     Given,
     as_option,
     clocks_of_recording,
-    in_degrees,
-    in_metres,
     in_time_of,
     mounting_guessed,
 )
 from .frame_choice import FrameChoice, FrameChooser, declared_reference
 from .gravity import Gravity, believed_heading
-from .transforms import FrameTree, Placed
+from .transforms import FrameTree, Placed, in_degrees, in_metres
 
 # a smaller rotation in the data is a misalignment to calibrate; a larger one is another mounting
 OTHER_MOUNTING = math.radians(12.0)

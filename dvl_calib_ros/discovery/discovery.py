@@ -16,6 +16,7 @@ from ..recordings.topic_preview import Look
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import FoundClocks, find_clocks
+from .transforms import in_degrees
 
 
 @dataclass(frozen=True)
@@ -92,16 +93,6 @@ def mounting_guessed(rpy: Sequence[float], why: str) -> Reason:
     # on a level vehicle, a heading with another zero looks the same
     also = "; or the heading counts from north" if abs(rpy[2]) > 0.99 * math.pi / 2.0 else ""
     return finding("MOUNTING_GUESSED", mounting=in_degrees(rpy), why=why, option=as_option(rpy), also=also)
-
-
-def in_degrees(rpy: Iterable[float]) -> str:
-    """Return roll, pitch, yaw (rad) as text in degrees."""
-    return " ".join(f"{round(math.degrees(angle), 2) + 0.0:g}°" for angle in rpy)
-
-
-def in_metres(position: Iterable[float]) -> str:
-    """Return a position (m) as text."""
-    return " ".join(f"{value + 0.0:.3g}" for value in position)
 
 
 def as_option(rpy: Iterable[float]) -> str:

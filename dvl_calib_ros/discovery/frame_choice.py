@@ -42,9 +42,9 @@ from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_preview import Look
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import imu_columns_of
-from .discovery import as_option, in_degrees
+from .discovery import as_option
 from .gravity import Gravity
-from .transforms import Placed
+from .transforms import Placed, in_degrees
 
 # Log prior odds of contradictions to declarations. The most common error is an IMU whose driver does not follow its
 # transform; the rarest is a whole vehicle that is z down without declaring it.

@@ -193,7 +193,7 @@ def placement(tree: FrameTree, frames: Frames, parameters: Parameters, given: Co
     parts = []
     if "mounting_rpy" not in given:
         values["mounting_rpy"] = _numbers(rpy_from_rotation(placed.rotation))
-        parts.append("mounting " + " ".join(f"{math.degrees(angle):.4g}°" for angle in values["mounting_rpy"]))
+        parts.append(f"mounting {in_degrees(values['mounting_rpy'])}")
         is_drivers = frames.points_down and placed.rotation[2, 2] < 0.0 and not parameters.is_z_down
         if is_drivers and parameters.dvl_axes == FROM_MESSAGE:
             values["dvl_axes"] = FLU  # the transform describes the driver's own axes, in which the data are
@@ -208,14 +208,24 @@ def placement(tree: FrameTree, frames: Frames, parameters: Parameters, given: Co
                 values["dvl_position"] = FROM_REFERENCE if known else TOLD
                 if "reference_position" not in given and at.any():
                     values["reference_position"] = _numbers(at)
-            parts.append("lever arm " + " ".join(f"{value:.3g}" for value in values["lever_arm"]) + " m")
+            parts.append(f"lever arm {in_metres(values['lever_arm'])} m")
     imu = tree.placed(frames.imu, parameters.base_frame) if frames.imu else None
     if imu is not None and imu.source and "imu_rpy" not in given and not np.allclose(imu.rotation, np.eye(3)):
         values["imu_rpy"] = _numbers(rpy_from_rotation(imu.rotation))
-        parts.append("imu_rpy " + " ".join(f"{math.degrees(angle):.4g}°" for angle in values["imu_rpy"]))
+        parts.append(f"imu_rpy {in_degrees(values['imu_rpy'])}")
     if "base_frame" not in given and placed.base != parameters.base_frame.strip("/"):
         values["base_frame"] = placed.base
     return Placement(values, f"{', '.join(parts)}: {placed.frame} in {placed.base}, from {placed.source}")
+
+
+def in_degrees(rpy: Iterable[float]) -> str:
+    """Return roll, pitch, yaw (rad) as text in degrees."""
+    return " ".join(f"{round(math.degrees(angle), 2) + 0.0:g}°" for angle in rpy)
+
+
+def in_metres(position: Iterable[float]) -> str:
+    """Return a position (m) as text."""
+    return " ".join(f"{value + 0.0:.3g}" for value in position)
 
 
 def _numbers(values: Array) -> tuple[float, ...]:
