@@ -12,8 +12,8 @@ from ..calibration.numerics.frames import Array, attitude_enu_flu_from_ned_frd, 
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from ..messages.encode import WaterReading
 
-# 2000 deg/s, the largest range of common gyros
-FASTEST_RADPS = 35.0
+# 2000 deg/s, the largest range of common gyros; longest gap that a curve through attitudes bridges, s
+FASTEST_RADPS, LONGEST_GAP_S = 35.0, 10.0
 
 
 def imu_samples(stamps_ns: Sequence[int], rpy: Array) -> list[ImuSample]:
@@ -40,7 +40,8 @@ def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
         return rates
     attitudes = Rotation.from_matrix(rotation_enu_from_body)
     turned = (attitudes[:-1].inv() * attitudes[1:]).magnitude()
-    cuts = np.flatnonzero(turned > FASTEST_RADPS * np.diff(time)) + 1  # the curve would swing to infinity there
+    step = np.diff(time)
+    cuts = np.flatnonzero((turned > FASTEST_RADPS * step) | (step > LONGEST_GAP_S)) + 1  # it would swing to infinity
     for part in np.split(np.arange(len(time)), cuts):
         if len(part) > 1:
             rates[part] = RotationSpline(time[part], attitudes[part])(time[part], 1)
