@@ -190,3 +190,12 @@ def test_an_empty_or_foreign_recording_is_refused_in_one_line(tmp_path):
 
     with pytest.raises(InputError, match="no topics"):
         discover([write_bag(tmp_path / "empty", [])], Parameters())
+
+
+def test_clocks_are_looked_for_with_the_imu_turned_as_its_transform_says(bags):
+    found = discover([bags["imu_on_its_side"]], Parameters())
+    assert found.clocks is not None
+    assert found.clocks.parameters.imu_rpy == found.parameters.imu_rpy != (0.0, 0.0, 0.0)
+    registered = found.clocks.registration
+    assert registered.left < 0.15
+    assert np.degrees(np.abs(Rotation.from_matrix(registered.rotation_body_from_dvl).as_rotvec())).max() < 5.0

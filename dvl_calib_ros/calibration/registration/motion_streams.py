@@ -13,7 +13,6 @@ from ..numerics.frames import ENU_FROM_NED, Array
 from ..numerics.robust import median
 from ..numerics.samples import FRAME_CODES, Index, Mask, SampleBlock, Streams, VelocityFrame
 from ..streams.clock_correction import Clocks
-from ..streams.imu_frame import ImuAlignment
 from ..streams.interpolation import (
     LEAST_SLOPE_REACH_S,
     MOST_REACH_S,
@@ -67,11 +66,14 @@ class MotionStreams:
 
 
 def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
-    """Return the motion in samples after the configured clock corrections, or None if there are too few samples."""
+    """Return the motion in samples after the configured clock corrections, or None if there are too few samples.
+
+    streams: as decoded, the IMU's data in the body's axes.
+    """
     jump_ns = round(parameters.max_time_jump * 1e9)
     streams = Streams(*(block.part(~strays(block.stamps_ns, jump_ns)) for block in streams))
     dvl, reference = (_valid(block, parameters) for block in (streams.dvl, streams.reference))
-    imu = ImuAlignment(parameters).block(streams.imu.part(streams.imu.refused == 0))
+    imu = streams.imu.part(streams.imu.refused == 0)
     if len(dvl) < 2 or len(reference) < 2:
         return None
     clocks = Clocks.of(parameters)
