@@ -70,7 +70,7 @@ def test_yaw_is_within_its_sigma(legs, every):
         calibrator, *_ = recorded(seed, deviates, legs=legs, every=every)
         estimate = calibrator.estimate("full")
         off.append((estimate.state[2] - YAW) / estimate.recording_std[2])
-        assert estimate.recording_std[2] < math.radians(0.35 + 0.5 * size)
+        assert estimate.recording_std[2] < math.radians(1.35)
     assert np.abs(off).max() < 3.0, off
 
 
