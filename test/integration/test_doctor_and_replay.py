@@ -18,10 +18,12 @@ from dvl_calib_ros.errors import InputError
 from validation.stacks import shared_folder
 
 CASES = shared_folder() / "cases"
-# The recordings of these are made and judged by this rule in test_situations.py and test_stacks.py.
+# Faults that test_situations.py and test_stacks.py judge by this rule, or that another case here has, and formats.
 ELSEWHERE = {
     "covariance_not_meant", "driver_signs", "dvl_clock_far", "imu_orientation_wrong", "instrument_text_logs",
     "moving_bed", "pd0_alignment", "reference_fused_from_dvl", "wrong_transform_without_reference",
+    "beams_rotated", "yaw_sign_135", "z_flipped", "noref_swapped", "ros1_recordings", "simulated_time",
+    "team_dvl_types",
 }  # fmt: skip
 SCRIPTS = [*sorted(CASES.glob("axes/*.py")), *sorted(CASES.glob("public/*.py"))]
 SCRIPTS = [each for each in SCRIPTS if each.stem not in ELSEWHERE]
