@@ -204,8 +204,7 @@ def test_a_late_reference_that_only_the_usual_tells_from_a_late_dvl_is_calibrate
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [37116, 37248])
 def test_a_reference_that_is_late_by_little_is_taken_off_or_in_sigma_and_no_reason_to_reject(tmp_path, seed):
-    """0.09 and 0.14 s. Of all rows it was not told apart, or not seen in a few of them; in what the calibration keeps
-    it was, and it was named and rejected."""
+    """0.09 and 0.14 s."""
     truth = write_survey(draw(seed), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     assert run.verdict != "reject", run.reasons

@@ -146,8 +146,7 @@ def test_a_mounting_that_moved_is_named_in_yaw_alone_where_the_same_headings_con
 
 
 def test_what_a_mounting_that_moved_turned_in_pitch_as_well_is_known_beside_it():
-    """A horizontal reference does not show the pitch. Its cosine makes all velocities of the day slower, which was an
-    unknown cause in a case of the trial."""
+    """A horizontal reference does not show the pitch."""
     recordings = [boat(day, 0.3, name=f"day{day}") for day in range(2)]
     usual = {name: EFFECTS[name].usual for name in ("lever_arm", "velocity_bias", "mounting_moved")}
     problem, _, _, shown = started(recordings, Parameters().rotation_dvl_from_body, np.zeros(3), usual)

@@ -593,9 +593,7 @@ def test_a_clock_that_is_late_throughout_does_not_choose_a_time_from_which_on_it
 def test_a_lag_that_a_clock_takes_back_only_smooths_unless_it_explains_more(
     lag, clock, before, late, drop, of_clock, rougher, is_wanted
 ):
-    """The three false alarms of 726: messages claimed a half or less of the noise of a DVL at 2 Hz. A clock that is
-    late itself takes a lag back by how much earlier it becomes: 1.5 s were 2.2 beside a lag of 0.7. But not where it
-    explains less than the lag, which is late as a clock is."""
+    """The three false alarms of 726: messages claimed a half or less of the noise of a DVL at 2 Hz."""
     effect = EFFECTS["reference_lag"]
     of_rest = {clock: ({"seconds": before},)} if before else {}
     values = {effect.name: ({"time_constant_s": lag},), clock: ({"seconds": late},)}
