@@ -205,6 +205,11 @@ def told_by(tell: Callable[[Told, bool], None], of: Callable[[], Motion] = motio
     return write
 
 
+def contradicts(doctor: str, replay: str) -> bool:
+    """Return whether doctor says yes where replay rejects, or no where replay is usable."""
+    return doctor == ("yes" if replay == "reject" else "no")
+
+
 NOISY = "accept", "marginal"  # speed over ground is noisy, and without a reference nothing is verified
 SITUATIONS = {
     "meaningless covariances": Situation(told_by(meaningless_covariances)),

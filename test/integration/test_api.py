@@ -30,6 +30,19 @@ def bag(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def later(tmp_path_factory) -> Path:
+    return dc.simulate(tmp_path_factory.mktemp("later") / "later", seconds=90.0, seed=7)
+
+
+@pytest.fixture(scope="module")
+def ahead(tmp_path_factory) -> dc.Calibration:
+    """Of a DVL that is 0.8 m ahead of the reference."""
+    place = tmp_path_factory.mktemp("ahead") / "ahead"
+    made = dc.simulate(place, seconds=240.0, effects={"lever_arm": {"x_m": 0.8}})
+    return dc.replay(made, model="full", history=False)
+
+
+@pytest.fixture(scope="module")
 def calibration(bag) -> dc.Calibration:
     return dc.replay(bag)
 
@@ -72,14 +85,10 @@ def test_a_corrected_velocity_is_in_the_body(calibration):
     np.testing.assert_allclose(calibration.correct([1.0, 0.0, 0.0]), rotation[:, 0], atol=0.02)
 
 
-def test_a_corrected_velocity_of_a_turning_vehicle_is_that_of_the_reference_point(tmp_path):
-    bag = tmp_path / "ahead"
-    assert main(["simulate", str(bag), "--duration", "240", "--effect", "lever_arm:x_m=0.8"]) == 0
-    run = dc.replay(bag, model="full")
-    assert run.mounting.xyz_m[0] == pytest.approx(0.8, abs=0.1)
+def test_a_corrected_velocity_of_a_turning_vehicle_is_that_of_the_reference_point(ahead):
     velocity = [[1.0, 0.0, 0.0], [0.5, 0.1, 0.0]]
-    turning = run.correct(velocity, [[0.0, 0.0, 0.2], [0.0, 0.0, -0.1]]) - run.correct(velocity)
-    x, y, _ = run.mounting.xyz_m
+    turning = ahead.correct(velocity, [[0.0, 0.0, 0.2], [0.0, 0.0, -0.1]]) - ahead.correct(velocity)
+    x, y, _ = ahead.mounting.xyz_m
     np.testing.assert_allclose(turning, [[0.2 * y, -0.2 * x, 0.0], [-0.1 * y, 0.1 * x, 0.0]], atol=1e-12)
 
 
@@ -144,12 +153,14 @@ def test_without_history_what_needs_it_says_so(bag):
 def test_the_other_functions_give_dataclasses(tmp_path, bag):
     made = dc.simulate(tmp_path / "made", seconds=60.0, trajectory="figure8")
     assert dc.doctor(made).verdict == "yes"
-    checked = dc.evaluate([bag, made], models=["M3"])
+    checked = dc.evaluate([bag, made], models=["M3"], dvl_topic="dvl/twist", gnss_topic="gnss/twist")
     assert checked.models == ("M3",)
     assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on M3 leaves ")
     assert dc.replay([made], gnss_topic="none").model == "F1"
     with pytest.raises(dc.InputError, match="none of"):
         dc.evaluate(models=["M9"])
+    with pytest.raises(dc.InputError, match="no topic 'nowhere'"):
+        dc.evaluate([bag, made], models=["M3"], gnss_topic="nowhere")
     with pytest.raises(dc.ParameterError, match="did you mean"):
         dc.replay(bag, min_spede=1.0)
     for nothing in (lambda: dc.replay([]), lambda: dc.salvage([], tmp_path / "none"), lambda: dc.doctor([])):
@@ -157,9 +168,8 @@ def test_the_other_functions_give_dataclasses(tmp_path, bag):
             nothing()
 
 
-def test_bags_are_compared_as_result_files_are(calibration, bag, tmp_path):
+def test_bags_are_compared_as_result_files_are(calibration, later, tmp_path):
     saved = calibration.save(tmp_path / "before.yaml")
-    later = dc.simulate(tmp_path / "later", seconds=90.0, seed=7)
     found = dc.compare(saved, later)
     assert [each.name for each in found.calibrations] == ["before.yaml", "later"]
     (tmp_path / "again").mkdir()
@@ -176,20 +186,18 @@ def test_the_picture_states_the_sigma_of_the_mounting():
         assert said.startswith(name) and said.endswith(f"± {std:.2f}°")
 
 
-def test_results_print_as_their_answer_and_in_a_notebook_with_tables(bag, calibration, tmp_path):
+def test_results_print_as_their_answer_and_in_a_notebook_with_tables(bag, calibration, later, tmp_path):
     examined = dc.doctor(bag)
     assert str(examined).startswith(f"{examined.verdict}: ") and "yaw" in str(examined)
-    later = dc.simulate(tmp_path / "later", seconds=90.0, seed=7)
-    compared = dc.compare(bag, later)
+    compared = dc.compare(calibration.save(tmp_path / "saved.yaml"), later)
     assert str(compared).startswith(f"{compared.word}: ") and len(str(compared)) < 5000
     for each in (examined, compared, calibration):
         html = each._repr_html_()
         assert html.startswith("<div") and "<table" in html and "yaw" in html and "<script" not in html
 
 
-def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(tmp_path):
-    made = dc.simulate(tmp_path / "ahead", seconds=240.0, effects={"lever_arm": {"x_m": 0.5}})
-    assert dc.replay(made, model="full", history=False).mounting.xyz_m[0] == pytest.approx(0.5, abs=0.1)
+def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(ahead, tmp_path):
+    assert ahead.mounting.xyz_m[0] == pytest.approx(0.8, abs=0.1)
     for wrong, message in (
         ({"lever_rm": {"x_m": 0.5}}, "did you mean 'lever_arm'"),
         ({"lever_arm": {"xm": 0.5}}, "did you mean 'x_m'"),
@@ -208,15 +216,6 @@ def test_a_vehicle_is_diagnosed_against_a_simulator(tmp_path):
     made = dc.simulate(tmp_path / "made", seconds=200.0, seed=2, trajectory="figure8")
     found = dc.diagnose(real, simulator=made)
     assert "lever_arm" in [each.name for each in found.effects] and found.verdict.value == "different"
-
-
-def test_topics_are_named_for_an_evaluation_as_for_a_replay(bag, tmp_path):
-    other = dc.simulate(tmp_path / "other", seconds=60.0, seed=3)
-    checked = dc.evaluate([bag, other], models=["M3"], dvl_topic="dvl/twist", gnss_topic="gnss/twist")
-    assert checked.models == ("M3",)
-    assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on M3 leaves ")
-    with pytest.raises(dc.InputError, match="no topic 'nowhere'"):
-        dc.evaluate([bag, other], models=["M3"], gnss_topic="nowhere")
 
 
 def test_a_damaged_recording_is_salvaged_as_by_the_command(bag, tmp_path):

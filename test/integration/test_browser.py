@@ -243,7 +243,6 @@ def test_without_scripts_and_on_paper_the_pictures_are_shown(browser, reports):
 
 def test_nothing_is_cut_off_when_a_report_is_printed(browser, report):
     page, _ = opened(browser, report, DESKTOP)
-    assert page.pdf(format="A4").startswith(b"%PDF")
     page.emulate_media(media="print")
     page.set_viewport_size({"width": A4_WIDTH, "height": 1000})
     right = page.evaluate("[...document.querySelectorAll('table, img, pre')].map(e => e.getBoundingClientRect().right)")

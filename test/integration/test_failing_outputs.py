@@ -39,7 +39,7 @@ def shell(redirected: str, *arguments, before: str = "", module: str = "cli.main
     )
 
 
-CLOSED = ["<&- ", ">&- ", "2>&- ", ">&- 2>&- ", "<&- >&- 2>&- "]
+CLOSED = ["<&- ", ">&- ", "<&- >&- 2>&- "]
 
 
 @pytest.mark.spread(2)
@@ -62,7 +62,7 @@ def warned_of(tmp_path_factory) -> Path:
 
 
 @pytest.mark.spread(1)
-@pytest.mark.parametrize("stream", ["2>&-", "2>/dev/full", "2</dev/null", "2> >(true)"])
+@pytest.mark.parametrize("stream", ["2>&-", "2>/dev/full"])
 def test_warnings_that_nobody_can_read_cost_no_result(warned_of, tmp_path, stream):
     done = shell(stream, "replay", warned_of, "--json", tmp_path / "o.json")
     assert done.returncode == 0 and "\nnext  dvl-calib" in done.stdout
@@ -125,10 +125,17 @@ def test_a_link_that_leads_nowhere_is_refused_before_any_work(bag, tmp_path, mon
     assert sorted(os.listdir(tmp_path)) == before
 
 
-@pytest.mark.spread(6)
-@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-@pytest.mark.parametrize("compression", ["none", "message", "file"])
-@pytest.mark.parametrize("command", ["salvage", "simulate", "import"])
+@pytest.mark.parametrize(
+    ("command", "storage", "compression"),
+    [
+        ("salvage", "mcap", "file"),
+        ("salvage", "sqlite3", "message"),
+        ("simulate", "mcap", "none"),
+        ("simulate", "sqlite3", "file"),
+        ("import", "mcap", "message"),
+        ("import", "sqlite3", "none"),
+    ],
+)
 def test_a_bag_that_a_full_disk_stops_is_said_and_leaves_nothing(
     bag, tmp_path, monkeypatch, capsys, command, storage, compression
 ):

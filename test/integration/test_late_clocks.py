@@ -47,11 +47,9 @@ def said(command, bag, tmp_path, capsys, *options):
 @pytest.mark.parametrize(
     "late",
     [
-        pytest.param({"reference_time_offset": 5.0}, marks=pytest.mark.slow),
-        pytest.param({"reference_time_offset": 0.8}, marks=pytest.mark.slow),
-        pytest.param({"reference_time_offset": 30.0}, marks=pytest.mark.slow),
-        pytest.param({"dvl_time_offset": 7.5}, marks=pytest.mark.slow),
-        pytest.param({"attitude_time_offset": 2.0}, marks=pytest.mark.slow),
+        {"reference_time_offset": 30.0},
+        {"dvl_time_offset": 7.5},
+        {"attitude_time_offset": 2.0},
         {"dvl_time_offset": 5.0, "reference_time_offset": 2.5},
     ],
     ids=lambda late: ", ".join(f"{name[:3]} {seconds}" for name, seconds in late.items()),
@@ -77,15 +75,6 @@ def test_doctor_replay_and_diagnose_name_the_same_clock(late, tmp_path, capsys):
     verification = replayed.result.verifications[replayed.result.selected]
     assert verification.verdict.value == "accept", verification.reasons
     assert replayed.result.estimate.state[5] == pytest.approx(ARM, abs=0.15)
-
-
-@pytest.mark.slow
-def test_the_function_names_the_clock_that_the_command_names(tmp_path):
-    """It took the clock off, and said nothing of it."""
-    effects = {
-        each.name: each.parameters for each in dc.diagnose(bag_of(tmp_path, {"reference_time_offset": 5})).effects
-    }
-    assert effects["reference_time_offset"]["seconds"][0] == pytest.approx(5.0, abs=0.2)
 
 
 def test_a_reference_in_the_body_is_calibrated_with_and_the_other_reading_is_said(tmp_path):

@@ -49,9 +49,7 @@ def bag_of(folder, reference_s=0.0, dvl_s=0.0, arm_m=0.0, hz=5):
     return write_bag(folder / "late", heapq.merge(imu, gnss, dvl, key=lambda sample: sample.stamp_ns))
 
 
-@pytest.mark.parametrize(
-    "seconds", [pytest.param(0.8, marks=pytest.mark.slow), 2.5, pytest.param(5.0, marks=pytest.mark.slow), 7.5]
-)
+@pytest.mark.parametrize("seconds", [0.8, 7.5])
 def test_doctor_replay_and_diagnose_agree_on_how_late_a_reference_is(seconds, tmp_path, capsys):
     """Diagnose could not tell the clock from a lever arm, which registration rules out by a chi-square of 300."""
     bag = bag_of(tmp_path, reference_s=seconds)
@@ -68,18 +66,6 @@ def test_doctor_replay_and_diagnose_agree_on_how_late_a_reference_is(seconds, tm
     assert effect.name == "reference_time_offset" and effect.equivalent_to == ()
     _, low, high = effect.parameters["seconds"]
     assert low < seconds < high and high - low < 0.1
-
-
-def test_a_dvl_that_is_late_is_no_other_cause(tmp_path):
-    (effect,) = dc.diagnose(bag_of(tmp_path, dvl_s=0.8)).effects
-    _, low, high = effect.parameters["seconds"]
-    assert effect.name == "dvl_time_offset" and low < 0.8 < high
-
-
-def test_a_lever_arm_is_no_clock(tmp_path):
-    (effect,) = dc.diagnose(bag_of(tmp_path, arm_m=1.0)).effects
-    _, low, high = effect.parameters["x_m"]
-    assert effect.name == "lever_arm" and low < 1.0 < high
 
 
 def test_an_arm_that_one_sample_a_second_hardly_shows_is_not_ruled_out_by_the_clock(tmp_path):

@@ -64,7 +64,7 @@ def test_live_says_what_a_replay_says_and_what_it_saves_is_refused_as_well(effec
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [36001, 36008, 36367, 34246])
+@pytest.mark.parametrize("seed", [36001, 34246])
 def test_of_random_surveys_what_a_replay_rejects_live_does_not_call_usable(seed, tmp_path):
     write_survey(draw(seed), tmp_path / "bag")
     recording = open_recording([tmp_path / "bag"])

@@ -128,13 +128,13 @@ def test_names_of_topics_and_of_what_is_not_there(bag, tmp_path, capsys):
 @pytest.mark.parametrize("command", ["apply", "compare", "export"])
 def test_texts_of_a_result_file(result, command, tmp_path, capsys):
     content = load_yaml(result, "result file")
-    path, n = tmp_path / f"{FILE}.yaml", 0
+    path = tmp_path / f"{FILE}.yaml"
     more = {"apply": (), "compare": (result,), "export": ("-o", tmp_path / f"{FILE}.sdf")}[command]
-    for changed in with_each_text({name: each for name, each in content.items() if name != "models"}):
+    texts = [*with_each_text({name: each for name, each in content.items() if name != "models"})]
+    assert len(texts) > 30
+    for changed in texts[:: 1 if command == "apply" else 4]:  # one function prints for all commands
         path.write_text(result_text({**changed, "models": content["models"]}))
         said(capsys, command, *(["gazebo"] if command == "export" else []), path, *more)
-        n += 1
-    assert n > 30
 
 
 def test_texts_that_apply_shows(result, tmp_path, capsys):

@@ -50,8 +50,8 @@ def passes(monkeypatch) -> Counter[str]:
 @pytest.mark.parametrize(
     "words",
     [
-        "doctor BAG", "doctor CUT", "doctor BAG OTHER", "replay BAG", "replay BAG OTHER", "replay CUT",
-        "replay BAG -p prior_source:=reference", "replay BAG --report REPORT", "diagnose BAG", "diagnose BAG OTHER",
+        "doctor CUT", "doctor BAG OTHER", "replay BAG OTHER", "replay CUT",
+        "replay BAG -p prior_source:=reference", "replay BAG --report REPORT", "diagnose BAG OTHER",
         "diagnose BAG --simulator OTHER", "compare BAG OTHER", "evaluate BAG OTHER --models M3 --jobs 1",
         "simulate NEW --duration 20 --motion-of BAG",
     ],
@@ -85,8 +85,7 @@ def test_what_is_wrong_with_the_last_is_said_before_the_first_is_read(bags, pass
 @pytest.mark.parametrize(
     ("words", "expected", "calibrated"),
     [
-        ("doctor BAG", 1, 1), ("replay BAG", 1, 1), ("replay BAG OTHER", 2, 4), ("compare BAG OTHER", 2, 2),
-        ("diagnose BAG", 1, 0), ("diagnose BAG OTHER", 2, 0),
+        ("doctor BAG", 1, 1), ("replay BAG OTHER", 2, 4), ("compare BAG OTHER", 2, 2), ("diagnose BAG OTHER", 2, 0),
     ],
 )  # fmt: skip
 def test_a_command_registers_each_recording_once(words, expected, calibrated, bags, monkeypatch, capsys):

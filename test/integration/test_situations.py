@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from situations import SITUATIONS
+from situations import SITUATIONS, contradicts
 from stacks import true_mounting
 
 import dvl_calib_ros as dc
@@ -32,6 +32,7 @@ def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_t
     situation = SITUATIONS[name]
     bag = situation.write(tmp_path / "bag", True)
     calibration = dc.replay(bag, history=False)
+    assert not contradicts(dc.doctor(bag).verdict, calibration.verdict)
     if situation.cause:
         assert calibration.verdict == "reject"
         first, *_ = calibration.replayed.result.verifications[calibration.model].reasons

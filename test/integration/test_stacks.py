@@ -11,8 +11,10 @@ import pytest
 from command_line import fail, succeed
 from conftest import few, made_once
 from scipy.spatial.transform import Rotation
+from situations import contradicts
 from stacks import A50, LEVER_ARM, STACKS, TWIST, YAW_45, Stack, Told, true_mounting
 
+import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.replay import Replayed, replay
 from dvl_calib_ros.calibration.filters.observability import body_angle_std
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -71,6 +73,8 @@ def test_a_bag_as_it_is_gives_the_right_mounting_or_says_what_is_missing(bags, n
         assert_mounting_and_lever_arm_are_those_of_the_transforms(found, STACKS[name])
     says_what_is_missing = any(UNPLACED in sentence for sentence in found.found)
     assert (errors_in_sigmas(found, replayed, STACKS[name]) < 3.0).all() or says_what_is_missing
+    verdict = replayed.result.verifications[replayed.result.selected].verdict.value
+    assert not contradicts(dc.doctor(bags[name]).verdict, verdict)
     # without a lever arm it is nearly right all the same
     corrected = replayed.result.estimate.rotation_body_from_dvl(found.parameters.rotation_dvl_from_body)
     truth = true_mounting(STACKS[name].mounting_rpy)

@@ -381,19 +381,19 @@ def test_thousands_of_channels_are_opened_in_a_time_that_goes_with_their_number(
     writer = McapWriter(output)
     writer.start("ros2")
     schema = writer.register_schema(msgtype, "ros2msg", text.encode())
-    channels_ = [writer.register_channel(f"t{number}", "cdr", schema) for number in range(60_000)]
+    channels_ = [writer.register_channel(f"t{number}", "cdr", schema) for number in range(20_000)]
     for _, log_ns, data in raw_twists():
         writer.add_message(channels_[7], log_ns, data, log_ns)
     writer.finish()
     (tmp_path / "many.mcap").write_bytes(output.getvalue())
     began = time.process_time()
     with open_bags([tmp_path / "many.mcap"]) as bag:
-        assert len(bag.topics) == 60_000
+        assert len(bag.topics) == 20_000
         assert all(len(bag.types_of(topic)) == 1 and not bag.lacks_definition(topic) for topic in bag.topics)
         assert len(list(bag.messages(bag.topics))) == 4
     recording = open_recording([tmp_path / "many.mcap"])
-    assert len(recording.types) == 60_000
-    assert time.process_time() - began < 20.0  # it was minutes; 2 to 6 s are usual
+    assert len(recording.types) == 20_000
+    assert time.process_time() - began < 7.0  # without an index it grows with the square
 
 
 # ---------------------------------------------------------------------- what is no damage
@@ -453,9 +453,17 @@ def test_log_times_beyond_all_reason_are_no_reason_to_stop(tmp_path, log_times, 
         assert main(["doctor", str(tmp_path / kind)]) == 1  # four messages are too few
 
 
-@pytest.mark.parametrize("wild_ns", [0, 10**18, 2**62, 2**63 - 1, 2**63, 2**64 - 1])
-@pytest.mark.parametrize("topic", ["chatter", "imu/data"])
-@pytest.mark.parametrize("kind", ["index", "flat", "sqlite3"])
+@pytest.mark.parametrize(
+    ("kind", "topic", "wild_ns"),
+    [
+        ("index", "chatter", 2**64 - 1),
+        ("index", "imu/data", 10**18),
+        ("flat", "chatter", 0),
+        ("flat", "imu/data", 2**63),
+        ("sqlite3", "chatter", 2**62),
+        ("sqlite3", "imu/data", 2**63 - 1),
+    ],
+)
 def test_a_wild_log_time_costs_no_more_than_its_message(tmp_path, capsys, kind, topic, wild_ns):
     """One message of another topic, or one of the IMU: rates were 1e-7 Hz, and pauses centuries long."""
     samples = raw(write_bag(tmp_path / "bag", run(60.0)))

@@ -164,10 +164,7 @@ def test_noise_that_lasts_longer_than_the_longest_blocks_is_in_sigma(lasts, numb
 
 @pytest.mark.parametrize(("count", "told"), [(12, 1.0), (24, 1.0), (24, 9.0)])
 def test_sigma_of_few_blocks_is_wrong_by_three_of_it_no_more_often_than_that_of_many(count, told):
-    """Surveys 34211, 38246: pitch was off by 3.1 and 3.3 σ of 24 blocks. Of 12, 3 σ were exceeded in 1.2 % of runs.
-
-    told: every third block tells so many times as much as the others.
-    """
+    """Surveys 34211, 38246: pitch was off by 3.1 and 3.3 σ of 24 blocks."""
     rng, off = np.random.default_rng(5), []
     share = np.where(np.arange(count) % 3 == 0, told, 1.0)
     for _ in range(4000):

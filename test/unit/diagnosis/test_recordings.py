@@ -29,8 +29,7 @@ def test_every_recording_has_a_name_of_its_own(paths, names):
 
 
 def test_turn_rates_are_without_the_noise_of_frequencies_that_hold_no_motion():
-    """Rates of an attitude that is read to 0.05°, 20 times a second: noise of 1.4°/s over waves of 1°/s. Noise in a
-    regressor makes a lever arm of 2 m one of 0.7 m."""
+    """Rates of an attitude that is read to 0.05°, 20 times a second: noise of 1.4°/s over waves of 1°/s."""
     rng = np.random.default_rng(1)
     time = np.arange(0.0, 400.0, 0.05)
     waves = np.cumsum([0.02 * np.sin(2.0 * np.pi * f * time + f) for f in (0.13, 0.21, 0.34)], axis=0)[-1]

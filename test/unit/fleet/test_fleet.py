@@ -468,13 +468,13 @@ def test_workers_end_with_a_parent_that_is_killed():
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_at_any_moment_is_gone_on_with(dives, tmp_path):
-    """SIGKILL at ten moments, each run going on with the one before; no row is lost, none is there twice."""
-    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 20), tmp_path / "out"
+    """SIGKILL at six moments, each run going on with the one before; no row is lost, none is there twice."""
+    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 10), tmp_path / "out"
     command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "fleet", str(place), "--out", str(out), "--jobs", "2"]
     rng, seen = np.random.default_rng(4), 0
-    for _ in range(10):
+    for _ in range(6):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(rng.uniform(0.5, 6.0))
+        time.sleep(rng.uniform(0.5, 5.0))
         ended = process.poll() is not None
         process.kill()
         process.wait()
@@ -482,19 +482,19 @@ def test_a_run_that_is_killed_at_any_moment_is_gone_on_with(dives, tmp_path):
             whole = [parquet.read_table(path).num_rows for path in (out / "rows").glob("*.parquet")]
             assert all(rows > 1 for rows in whole) and len(whole) >= seen
             seen = len(whole)
-        if ended and seen == 20:
+        if ended and seen == 10:
             break
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     rows = table(out)
-    assert rows.recording.nunique() == 20 and not rows.duplicated(["recording", "parameter"]).any()
+    assert rows.recording.nunique() == 10 and not rows.duplicated(["recording", "parameter"]).any()
     assert rows.groupby("recording").size().nunique() == 1
-    assert list((out / "rows").glob("*.parquet")) and len(list((out / "rows").iterdir())) == 20
+    assert list((out / "rows").glob("*.parquet")) and len(list((out / "rows").iterdir())) == 10
 
 
 @pytest.mark.slow
 def test_workers_of_a_cluster_that_are_killed_cost_no_row(dives, tmp_path):
     distributed = pytest.importorskip("distributed")
-    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 30), tmp_path / "out"
+    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 15), tmp_path / "out"
     (place / "auv0" / "no.mcap").write_text("no bag")
     killed: list[int] = []
     with (
@@ -511,22 +511,22 @@ def test_workers_of_a_cluster_that_are_killed_cost_no_row(dives, tmp_path):
 
         workers = Workers(dask=cluster.scheduler_address)
         result = running.run_fleet([str(place)], out, dc.Parameters(), running.Given(), workers, None, kill)
-    assert len(killed) == 3 and result.calibrated == 31
+    assert len(killed) == 3 and result.calibrated == 16
     rows = table(out)
-    assert rows.recording.nunique() == 31 and not rows.duplicated(["recording", "parameter"]).any()
+    assert rows.recording.nunique() == 16 and not rows.duplicated(["recording", "parameter"]).any()
     assert rows.error.notna().sum() == 1
 
 
 @pytest.mark.slow
 def test_six_times_the_recordings_take_no_more_memory(dives, tmp_path):
-    """Neither here nor in a worker, of which two have 18 each: what one keeps for itself shows in its own largest."""
+    """Neither here nor in a worker, of which two have 12 each: what one keeps for itself shows in its own largest."""
     script = (
         "import resource, json, sys; from dvl_calib_ros.cli.main import main; "
         "code = main(['fleet', *sys.argv[1:], '--jobs', '2']); u = [resource.getrusage(who) for who in "
         "(resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]; print(json.dumps([code, u[0].ru_maxrss, u[1].ru_maxrss]))"
     )
     largest = {}
-    for name, count in (("few", 6), ("many", 36)):
+    for name, count in (("few", 4), ("many", 24)):
         place = copies(tmp_path / f"dives_{name}", dives / "auv1" / "dive0", count)
         done = subprocess.run(
             [sys.executable, "-c", script, str(place), "--out", str(tmp_path / name)],
@@ -534,6 +534,6 @@ def test_six_times_the_recordings_take_no_more_memory(dives, tmp_path):
         )  # fmt: skip
         code, *largest[name] = json.loads(done.stdout.splitlines()[-1])
         assert code == 0
-    assert table(tmp_path / "many").recording.nunique() == 36
+    assert table(tmp_path / "many").recording.nunique() == 24
     for few, many in zip(largest["few"], largest["many"], strict=True):
         assert many < 1.08 * few

@@ -63,10 +63,10 @@ def test_sixty_pairs_hold_every_row_of_the_table_and_every_kind_of_truth():
 
 @pytest.mark.slow
 def test_a_short_part_of_the_trial_names_what_is_missing_and_claims_nothing_else(tmp_path):
-    found = run_pairs(tmp_path, seed=1, numbers=(3, 5, 8, 12, 14))
+    found = run_pairs(tmp_path, seed=1, numbers=(3, 8, 14))
     scores = [score_pair(*each) for each in found]
-    assert [score.first for score in scores] == [True, True, None, None, None]
+    assert [score.first for score in scores] == [True, None, None]
     assert not any(score.wrong or score.noise_wrong or score.failed for score in scores)
-    assert np.mean([score.held / max(score.intervals, 1) for score in scores[:3]]) > 0.8
+    assert np.mean([score.held / max(score.intervals, 1) for score in scores[:2]]) > 0.8
     again = run_pairs(tmp_path, seed=1, numbers=(3,))
     assert again[0][1]["cpu_s"] == found[0][1]["cpu_s"]  # what is there is not done again
