@@ -41,7 +41,7 @@ CONFIGURATIONS = (
     ),
     _Said(
         "DVL_LEFT_HANDED",
-        "the DVL's axes look left-handed: {axis} points the other way",
+        "the DVL's axes look left-handed: {axis} points the other way{alike}",
         "",
         "negate this axis in the DVL's driver; of z, check the sign of the reference's vertical velocity as well",
     ),
