@@ -125,9 +125,16 @@ def checked_replay(
 
 
 def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
-    """Add ambiguous frames to the verdict and, if the calibration is rejected anyway, their likely cause."""
+    """Add ambiguous frames to the verdict and, if the calibration is rejected anyway, their likely cause.
+
+    Nothing else rejects an inverted sway, because there is no reference.
+    """
     is_rejected = verification.verdict is Severity.REJECT
-    kept = [each for each in contradictions if each.severity is Severity.MARGINAL or (is_rejected and is_cause(each))]
+    kept = [
+        each
+        for each in contradictions
+        if each.severity is Severity.MARGINAL or each.code == "DVL_SIDE_INVERTED" or (is_rejected and is_cause(each))
+    ]
     return verification.with_objections(kept) if kept else verification
 
 

@@ -35,6 +35,7 @@ from ..recordings.topic_preview import Look, Survey
 from ..recordings.topics import ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
+from .axis_signs import sign_findings
 from .clock_offsets import compared_motion, difference_of, in_time
 from .discovery import (
     Discovery,
@@ -75,6 +76,9 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         raise InputError(f"{recording.where}: the bag is empty, it has no topics; record it again")
     named = given or Given()
     found = _Search(recording.survey, parameters, named, recording.where).run()
+    if found.topics.gnss not in recording.types and not found.contradictions:
+        signs = sign_findings([one.whole(found.topics) for one in recording.each], found.topics, found.parameters)
+        return replace(found, contradictions=tuple(signs))
     clocks = clocks_of_recording(recording, found, named)
     if clocks is None:
         return found

@@ -321,6 +321,10 @@ class FrameChooser:
             + readings.log_likelihood_registered(fit.left)
             for each, fit in fits.items()
         }
+        if math.inf in (fit.left for fit in fits.values()):  # a failed registration is no evidence against a reading
+            odds = first
+            turns = {each: each.agreement.rotation_dvl_from_body for each in fits}
+            fits = {each: fit._replace(rotation_dvl_from_body=turns[each]) for each, fit in fits.items()}
         best, *others = sorted(likely, key=lambda each: -odds[each])
         alike = [each for each in others if odds[each] > odds[best] - AS_LIKELY]
         for rival in alike:

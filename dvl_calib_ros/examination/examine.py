@@ -167,6 +167,8 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     verification = None if replayed is None else replayed.result.verifications[replayed.result.selected]
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
+    reasons = () if verification is None else tuple(verification.reasons)
+    findings = [each for each in findings if each.numbers.get("says") not in reasons]  # said once
     judged = Severity.REJECT if verification is None else verification.verdict
     if judged is not Severity.REJECT:  # the replay is usable, so no finding prevents a calibration
         findings = [each.weighed(Severity.WARNING) if _has_error([each]) else each for each in findings]
@@ -183,7 +185,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         () if replayed is None or "reference" not in streams else _shown(replayed),
         recording.notes,
         judged,
-        () if verification is None else tuple(verification.reasons),
+        reasons,
         cannot,
     )
 

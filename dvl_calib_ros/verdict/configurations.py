@@ -41,9 +41,24 @@ CONFIGURATIONS = (
     ),
     _Said(
         "DVL_LEFT_HANDED",
-        "the DVL's axes look left-handed: {axis} points the other way",
+        "the DVL's axes look left-handed: {axis} points the other way{alike}",
         "",
         "negate this axis in the DVL's driver; of z, check the sign of the reference's vertical velocity as well",
+    ),
+    _Said(
+        "DVL_SIDE_INVERTED",
+        "the DVL's y points the other way: in turns the speed ahead changes by {slope:.1f} ± {std:.1f} times what the "
+        "current in the sway predicts",
+        "Left-handed axes of the DVL, forward-right-down for forward-left-up, or a heading that counts the other way.",
+        "negate y in the DVL's driver; if z points the other way as well, set dvl_axes to {axes}",
+    ),
+    _Said(
+        "DVL_SIGN_OPEN",
+        "without a reference the sign of the DVL's {axis} is not observable: negated, the {angle} changes by "
+        "{degrees:.1f}°",
+        "",
+        "is the DVL's {axis} positive when the vehicle moves {way}? If not, negate it in the DVL's driver",
+        severity=Severity.MARGINAL,
     ),
     _Said(
         "DVL_AXIS_SCALED",

@@ -325,6 +325,13 @@ FINDINGS = (
         "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
     ),
     Kind(
+        "HEADING_DRIFTS",
+        "the heading error changes by {degrees:+.1f}° ± {std:.1f}° from start to end, so the yaw is uncertain by "
+        "{off:.1f}°",
+        "A gyro or a heading without a compass drifts.",
+        "let the heading settle, or aid it with a compass or GNSS",
+    ),
+    Kind(
         "IMU_LEVEL",
         "the IMU's orientation is a heading alone (roll and pitch are 0 in every message), so the DVL's roll and pitch "
         "are not known",

@@ -113,7 +113,14 @@ def finding(code: str, **numbers: object) -> Reason:
     return found
 
 
-_CAUSES = ("FRAMES_AMBIGUOUS", "MOUNTING_CONTRADICTED", "TRAVELS_SIDEWAYS", "CONFIGURATION_WRONG", "GRAVITY_")
+_CAUSES = (
+    "FRAMES_AMBIGUOUS",
+    "DVL_SIDE_INVERTED",
+    "MOUNTING_CONTRADICTED",
+    "TRAVELS_SIDEWAYS",
+    "CONFIGURATION_WRONG",
+    "GRAVITY_",
+)
 
 
 def _clock_cost(numbers: Mapping[str, Any]) -> float:

@@ -10,6 +10,7 @@ from stacks import LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, 
 from dvl_calib_ros import doctor, replay
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NWU, FLU_FROM_FRD, rpy_from_rotation
+from dvl_calib_ros.calibration.registration.frame_hypotheses import NOT_REGISTERED, Readings
 from dvl_calib_ros.discovery.discover import discover
 
 ODOMETRY_FRAMES = {"as its child frame says": np.eye(3), "forward-right-down": FLU_FROM_FRD}
@@ -129,3 +130,19 @@ def test_a_yaw_of_the_wrong_sign_in_a_transform_is_named_and_its_remedy_works(tm
     mended = replay(bag, mounting_rpy=(0.0, 0.0, -quarter))
     assert mended.verdict != "reject"
     assert is_right(mended, truth_deg((0.0, 0.0, -quarter)), (2.0, 2.0, 0.5))
+
+
+def test_a_reading_that_cannot_be_registered_is_judged_by_its_agreement(tmp_path, monkeypatch):
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link")
+    told.imu("/imu", "base_link")
+    told.reference("/gps/velocity", TWIST, "map", "enu", std=0.2)
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
+    bag, registered = told.write(tmp_path / "bag"), Readings.registered
+
+    def fails_as_declared(self, reading, rotation):
+        return registered(self, reading, rotation) if reading.turned else NOT_REGISTERED
+
+    monkeypatch.setattr(Readings, "registered", fails_as_declared)
+    found = discover([bag], Parameters())
+    assert "dvl_axes" not in found.values and not found.contradictions

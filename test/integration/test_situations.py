@@ -21,13 +21,10 @@ YAW_STD_DEG = 2.5
 UNDER_2_S = "wrong transform without reference", "text of a DVL"
 
 
-def marks(name):
-    reason = SITUATIONS[name].unseen
-    slow = [] if name in UNDER_2_S else [pytest.mark.slow]
-    return [*slow, *([pytest.mark.xfail(strict=False, raises=AssertionError, reason=reason)] if reason else [])]
+SLOW = set(SITUATIONS).difference(UNDER_2_S)
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=marks(name)) for name in SITUATIONS])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n in SLOW)) for n in SITUATIONS])
 def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_that_works(name, tmp_path):
     situation = SITUATIONS[name]
     bag = situation.write(tmp_path / "bag", True)

@@ -44,9 +44,9 @@ QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 SURELY, SURELY_SMOOTHED, SURELY_BIASED, NAMED_FROM = 6.0, 5.0, 4.2, 3.7
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
 # about the earth's vertical (rad), which differs from yaw when the vehicle tilts. BY_HEADING: heading errors with one
-# and two cycles of the heading (rad), similar to a bias but not to fast signals.
+# and two cycles of the heading, and with a drift over the recording (rad), similar to a bias but not to fast signals.
 KNOWN: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
-BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2)
+BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2 + [0.1])
 # Prior σ of the tested signals: shares of tilt, and second derivative (s²); DVL bias (m/s), tested on means over MEAN_S
 # (s).
 QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
@@ -107,7 +107,8 @@ class ResidualTrend(NamedTuple):
     circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: memory, s, the most
     significant of `FORGOTTEN_S`. beam, beam_std: share by which one beam reads low; beam_deg: its azimuth in the DVL;
     beam_off: error of the mean velocity by it, as a share of the speed. over_ground, over_ground_std: (2,) m/s,
-    reference minus DVL, east and north, on every heading; 0 if the residual holds less than half of it.
+    reference minus DVL, east and north, on every heading; 0 if the residual holds less than half of it. turned,
+    turned_std: rad, change of the heading error from start to end.
     """
 
     tilt: Array
@@ -127,6 +128,8 @@ class ResidualTrend(NamedTuple):
     beam_std: float
     beam_deg: float
     beam_off: float
+    turned: float
+    turned_std: float
 
 
 class _Fit(NamedTuple):
@@ -180,7 +183,8 @@ def residual_trend(
     moving, slope = _turned(body_from_enu, earth), _turned(body_from_enu, (after - before) / (2.0 * BEND_S))
     n = len(time)
     yaw = np.arctan2(rotation_enu_from_body[:, 1, 0], rotation_enu_from_body[:, 0, 0])
-    around = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)])
+    passed = (time - time.mean()) / (time[-1] - time[0])
+    around = np.column_stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw), passed])
     quick = np.zeros((n, 3, 3))
     for axis in range(2):
         about = np.zeros((n, 3))
@@ -230,6 +234,7 @@ def residual_trend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
         *_circular(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
         *_beam(fast, both, moving, np.eye(3) if rotation_dvl_from_body is None else rotation_dvl_from_body),
+        float(slow.x[-4]), float(slow.std[-4]),
     )  # fmt: skip
 
 
@@ -378,6 +383,12 @@ def residual_warnings(
         word = Severity.REJECT if is_clear and found.beam_off > BEAM_WRONG_FROM else Severity.MARGINAL
         percent, std = 100.0 * found.beam, 100.0 * found.beam_std
         said.append(finding("BEAM_OFF", percent=percent, std=std, azimuth=found.beam_deg).weighed(word))
+    # the heading at either end, relative to its mean
+    off = 0.5 * abs(found.turned)
+    if off > SAID_FROM and off > 0.5 * SURELY * found.turned_std:
+        word = Severity.MARGINAL if off > max(WRONG_FROM, WITHIN * along[1]) else Severity.WARNING
+        degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
+        said.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(word))
     size = np.abs(found.bias)
     shown = (size > NAMED_FROM * found.bias_std) & (size > SAID_FROM * found.speed)
     if shown.any():

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..models.parameters import FRD
+from ..models.parameters import FLU, FRD
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
 from ..streams.interpolation import attitude_at
@@ -45,6 +45,7 @@ BY_CHANCE = 3.0
 LATE_S = (-2.4, -1.2, 0.0, 1.2, 2.4)
 # Constraints of alternative configurations: synchronised reference, configured lever arm.
 WITHOUT_ARM: Sequence[Array] = (REFERENCE, *np.eye(N)[ARM])
+_OTHER_AXES = {FRD: FLU, FLU: FRD}
 _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 
@@ -176,8 +177,11 @@ def _wrong_axes(
     is_shown, is_turned = factors > SIGNIFICANT * std, signs < 0.0
     if (is_shown & is_turned).any():
         if is_turned.sum() == 1 and (is_shown & ~is_turned)[1:].any():
-            return finding("DVL_LEFT_HANDED", axis="xyz"[int(np.argmax(is_turned))])
-        return finding("DVL_AXES_TURNED", axes={FRD: "flu", "flu": FRD}.get(dvl_axes, "the other of flu and frd"))
+            axis, other = ("y", "z") if is_turned[1] else ("z", "y")
+            instead = _OTHER_AXES.get(dvl_axes)  # in which the other axis of the same data is inverted
+            alike = f" (read as {dvl_axes}; read as {instead}, {other} does)" if instead else ""
+            return finding("DVL_LEFT_HANDED", axis=axis, alike=alike)
+        return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
     too_small = np.where(is_shown, factors / factors[0] - SCALED_ALONE - SIGNIFICANT * std, 0.0)
     if not is_turned.any() and too_small.max() > 1.0:
         at = int(np.argmax(too_small))

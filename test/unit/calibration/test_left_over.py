@@ -99,6 +99,21 @@ def test_a_pitch_of_the_other_sign_is_no_answer_whatever_the_trim(rng):
     assert said.severity is Severity.REJECT and said.code == "TILT_NOT_FOLLOWED"
 
 
+@pytest.mark.parametrize(
+    ("drift_deg", "word"), [(4.0, Severity.MARGINAL), (0.7, Severity.WARNING), (-3.0, Severity.MARGINAL)]
+)
+def test_a_heading_that_drifts_leaves_the_yaw_open(rng, drift_deg, word):
+    vehicle = Vehicle(rng)
+    drift = np.radians(drift_deg) * vehicle.time / vehicle.time[-1]
+    turns = [rotation_from_rpy((0.0, 0.0, each)) for each in drift] @ vehicle.turns
+    found = vehicle.found(turns=turns)
+    assert math.degrees(found.turned) == pytest.approx(drift_deg, abs=0.4)
+    (said,) = residual_warnings(found)
+    assert said.code == "HEADING_DRIFTS" and said.severity is word
+    covered = residual_warnings(found, along=(0.0, math.radians(2.0), 0.0))
+    assert [each.severity for each in covered] == [Severity.WARNING]
+
+
 def test_a_bias_shows_at_several_speeds(rng):
     vehicle = Vehicle(rng)
     found = vehicle.found(dvl=vehicle.body + np.array([0.02, -0.025, 0.0]))

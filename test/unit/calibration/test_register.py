@@ -314,7 +314,9 @@ def test_a_left_handed_driver_is_named_with_its_axis(trajectory, signs, axis):
     made = make_motion((td, v * signs), (tg, g + heave), True, (True,) * 3, ImuColumns(*imu))
     found = register(made, np.eye(3), np.zeros(3))
     said = fitting_configuration(made, VelocityFrame.ENU, np.eye(3), np.zeros(3), found)
-    assert (said and (said.code, said.numbers)) == (axis and ("DVL_LEFT_HANDED", {"axis": axis}))
+    assert (said and (said.code, said.numbers)) == (axis and ("DVL_LEFT_HANDED", {"axis": axis, "alike": ""}))
+    said = fitting_configuration(made, VelocityFrame.ENU, np.eye(3), np.zeros(3), found, "frd")
+    assert axis is None or f"(read as frd; read as flu, {'zy'['yz'.index(axis)]} does)" in said.sentence
 
 
 @pytest.mark.parametrize("late", [0.0, 0.06, 0.1])

@@ -1,0 +1,139 @@
+"""Signs of the DVL's axes without a reference velocity.
+
+A current c adds c·ahead to the speed ahead and c·left to the sway. So the current by the sway over all headings
+predicts how the speed ahead changes in turns. A mirrored y inverts the prediction. Nothing predicts the sign of z.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..calibration.models.parameters import FLU, FRD, Parameters
+from ..calibration.numerics.block_covariance import of_few
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
+from ..calibration.numerics.robust import robust_std
+from ..calibration.registration.frame_hypotheses import ImuFrame
+from ..calibration.streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
+from ..messages.decode import turns_dvl
+from ..messages.drivers import VELOCITY_TYPES
+from ..recordings.topic_preview import Survey
+from ..recordings.topics import Topics
+from ..verdict.reasons import Reason, finding
+from .clock_offsets import imu_columns_of
+from .discovery import in_time_of
+from .frame_choice import SAME_ANSWER
+
+# Interval over which the speed ahead changes in a turn, s: longer than waves, shorter than a change of throttle.
+OVER_S = 4.0
+# Longest interpolated gap of an IMU, s; smallest change of the heading in a turn, rad.
+GAP_S, TURNED_FROM = 1.0, 0.2
+# Fewest turns, and significance of the sign (σ, two-sided p = 0.003), corrected for few turns by Student's t.
+FEWEST_TURNS, SIGNIFICANT = 5, 3.0
+# Scale of the Cauchy weights, in σ (95 % efficiency), and number of reweighted fits.
+CAUCHY, PASSES = 2.385, 10
+# Largest misalignment of a mounting that a mirrored axis leaves likely, rad.
+LIKELY = math.radians(12.0)
+# Words for a motion along the body's y and z, against them and along them, forward-left-up.
+WAYS = {1: ("to starboard", "to port"), 2: ("down", "up")}
+
+
+class SwaySign(NamedTuple):
+    """Change of the speed ahead in turns, relative to the prediction by the sway: 1 expected, -1 with y mirrored."""
+
+    slope: float
+    std: float
+    turns: int
+
+    @property
+    def sign(self) -> int:
+        """1 or -1 if significant, else 0."""
+        if self.turns < FEWEST_TURNS:
+            return 0
+        least = SIGNIFICANT * float(of_few(np.array(self.turns - 1.0))) * self.std
+        return int(np.sign(self.slope)) if abs(self.slope) > least else 0
+
+
+def sway_sign(times: Array, velocity: Array, imu: ImuColumns) -> SwaySign | None:
+    """Compare sway and speed ahead in turns; None without turns.
+
+    times: (N,) s. velocity: (N, 3) m/s in the body by the nominal mounting.
+    """
+    rotation, known = attitude_at(imu, times, GAP_S)
+    rates = angular_velocity_at(TurnRates.of(imu), times, GAP_S)
+    known = known & np.isfinite(rates).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    times, velocity, rate, rotation = times[known], velocity[known], rates[known, 2], rotation[known]
+    ahead, up = rotation[:, :2, 0], float(np.sign(rotation[:, 2, 2].mean()))
+    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
+    after = np.searchsorted(times, times + OVER_S - 1e-6)
+    before = np.flatnonzero(after < len(times))
+    after = after[before]
+    turns = (times[after] - times[before] < 1.5 * OVER_S) & (
+        np.linalg.norm(ahead[after] - ahead[before], axis=1) > TURNED_FROM
+    )
+    before, after = before[turns], after[turns]
+    if len(before) < FEWEST_TURNS:
+        return None
+    left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
+    # nuisance: misalignment, lever arm, skid
+    of_sway = np.column_stack([left, velocity[:, 0], rate, rate * velocity[:, 0]])
+    current = np.linalg.lstsq(of_sway, up * velocity[:, 1], rcond=None)[0][:2]
+    # nuisance: speed lost in turns, lever arm
+    columns = np.column_stack([ahead @ current, np.abs(rate), rate])
+    x, y = columns[after] - columns[before], velocity[after, 0] - velocity[before, 0]
+    weight = np.ones(len(y))
+    for _ in range(PASSES):
+        covariance = np.linalg.pinv((x * weight[:, None]).T @ x)
+        left_over = y - x @ (slopes := covariance @ (x.T @ (weight * y)))
+        weight = 1.0 / (1.0 + (left_over / max(CAUCHY * float(robust_std(left_over)), 1e-9)) ** 2)
+    turn = np.cumsum(np.diff(times[before], prepend=times[before[0]]) > 2.0 * OVER_S)
+    number = int(turn[-1]) + 1
+    scores = np.bincount(turn, weight * left_over * (x @ covariance[0]), number)
+    std = math.sqrt(float((scores**2).sum()) * number / max(number - 1, 1))
+    return SwaySign(float(slopes[0]), std, number)
+
+
+def sign_findings(recordings: Sequence[Survey], topics: Topics, parameters: Parameters) -> Iterator[Reason]:
+    """Yield the finding of an inverted sway, else of each axis whose sign is open and changes the mounting."""
+    seen = [(one.looks[topics.dvl], one.looks.get(topics.imu)) for one in recordings if topics.dvl in one.looks]
+    if not seen:
+        return
+    first = seen[0][0]
+    is_turned = turns_dvl(VELOCITY_TYPES[first.msgtype], first.frame_id, parameters)
+    body_from_message = parameters.rotation_dvl_from_body.T @ (FLU_FROM_FRD if is_turned else np.eye(3))
+    mean = np.concatenate([dvl.values[np.isfinite(dvl.values).all(axis=1)] for dvl, _ in seen]).mean(axis=0)
+    given = body_from_message @ mean
+    straight = np.array([given[0], 0.0, 0.0])
+    if _angle(given, straight) > LIKELY:
+        return  # no vehicle that travels ahead
+    frame = ImuFrame(rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, "")
+    each = []
+    for dvl, imu in seen:
+        imu = in_time_of(dvl, imu, parameters)
+        if imu is not None and imu.has_orientation:
+            each.append(sway_sign(dvl.stamps_s, dvl.values @ body_from_message.T, frame.read(imu_columns_of(imu))))
+    signs = [one for one in each if one is not None and one.sign]
+    if signs and all(one.sign < 0 for one in signs):
+        axes = FLU if is_turned != parameters.is_z_down else FRD
+        yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=axes)
+        return
+    for axis in range(3):
+        other = body_from_message @ (mean * np.where(np.arange(3) == axis, -1.0, 1.0))
+        change = _angle(given, other)
+        if change < SAME_ANSWER or _angle(other, straight) > LIKELY:
+            continue
+        row = 1 + int(np.argmax(np.abs(given - other)[1:]))
+        if row == 1 and signs:
+            continue
+        is_positive = bool(body_from_message[row, axis] > 0.0) != parameters.is_z_down
+        fields = {"axis": "xyz"[axis], "angle": ("", "yaw", "pitch")[row], "degrees": math.degrees(change)}
+        yield finding("DVL_SIGN_OPEN", **fields, way=WAYS[row][is_positive])
+
+
+def _angle(a: Array, b: Array) -> float:
+    """Return the angle between two directions (3,), rad; π for none."""
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return math.acos(min(1.0, max(-1.0, float(a @ b) / size))) if size > 0.0 else math.pi

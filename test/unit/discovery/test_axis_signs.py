@@ -1,0 +1,69 @@
+"""Without a reference a current tells the sign of the DVL's y; the sign of z is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from stacks import LEVER_ARM, TWIST, Told
+
+import dvl_calib_ros as dc
+from dvl_calib_ros.simulation.trajectories import make_motion
+
+CURRENT_MPS = (0.2, 0.1, 0.0)
+ASTERN = (0.0, 0.0, np.pi)
+
+
+def recording(path, signs, current=CURRENT_MPS, mounting=(0.0, 0.0, 0.0), z_down=False, seed=3):
+    """Write a DVL, with signs wrong, and an IMU of a vehicle that steers random courses through a current."""
+    m = make_motion("free", 600.0, 100.0, np.random.default_rng(seed))
+    drift = np.einsum("nji,j->ni", m.rotation_enu_from_body, np.array(current))
+    told = Told(motion=replace(m, velocity_body=m.velocity_body + drift))
+    told.dvl("/dvl/velocity", TWIST, "dvl_link", mounting)
+    for _, _, _, message in told.rows:
+        v = message.twist.twist.linear
+        v.x, v.y, v.z = np.array([v.x, v.y, v.z]) * signs
+    told.imu("/imu/data", "base_link")
+    told.tf_static(told.transform("base_link", "dvl_link", mounting, LEVER_ARM))
+    return told.write(path)
+
+
+def codes(reasons):
+    return [each.code for each in reasons]
+
+
+def reasons_of(calibration):
+    return calibration.replayed.result.verifications[calibration.model].reasons
+
+
+@pytest.mark.parametrize("mounting", [(0.0, 0.0, 0.0), ASTERN])
+@pytest.mark.parametrize("signs", [(1.0, -1.0, 1.0), (1.0, -1.0, -1.0)])
+def test_a_sway_that_a_current_contradicts_is_rejected_and_its_remedy_works(tmp_path, signs, mounting):
+    wrong = recording(tmp_path / "wrong", signs, mounting=mounting)
+    examined, calibration = dc.doctor(wrong), dc.replay(wrong, history=False)
+    assert examined.verdict == "no" and calibration.verdict == "reject"
+    assert codes(examined.reasons)[0] == codes(reasons_of(calibration))[0] == "DVL_SIDE_INVERTED"
+    assert "set dvl_axes to frd" in reasons_of(calibration)[0].sentence
+    if signs[2] < 0.0:
+        mended = dc.replay(wrong, history=False, dvl_axes="frd")
+    else:
+        mended = dc.replay(recording(tmp_path / "mended", (1.0, 1.0, 1.0), mounting=mounting), history=False)
+    assert mended.verdict != "reject" and "DVL_SIDE_INVERTED" not in codes(reasons_of(mended))
+
+
+@pytest.mark.parametrize("seed", [4, 5, 6])
+def test_a_current_confirms_the_sign_of_y_and_that_of_z_is_asked(tmp_path, seed):
+    examined = dc.doctor(recording(tmp_path / "bag", (1.0, 1.0, 1.0), seed=seed))
+    (question,) = [each for each in examined.reasons if each.code.startswith("DVL_SI")]
+    assert question.code == "DVL_SIGN_OPEN" and question.numbers["axis"] == "z" and question.numbers["angle"] == "pitch"
+    assert question.numbers["degrees"] == pytest.approx(2.0, abs=0.3)
+    assert "positive when the vehicle moves up?" in question.sentence
+
+
+def test_without_a_current_both_signs_are_asked_and_the_answer_is_marginal(tmp_path):
+    bag = recording(tmp_path / "bag", (1.0, 1.0, -1.0), current=(0.0, 0.0, 0.0))
+    calibration = dc.replay(bag, history=False)
+    assert calibration.verdict == "marginal"
+    assert codes(reasons_of(calibration)).count("DVL_SIGN_OPEN") == 2
+    assert not any(each.code == "DOCTOR_FRAMES" for each in dc.doctor(bag).findings)
