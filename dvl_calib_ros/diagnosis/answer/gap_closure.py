@@ -19,8 +19,6 @@ from ..search.effect_selection import EffectSelection
 from ..search.unexplained import Unexplained, matters
 
 RESAMPLES = 1000
-# High-frequency variation above this multiple of the reported noise is error, not noise
-WORSE_THAN_CLAIMED = 3.0
 Integers = NDArray[np.intp]
 
 
@@ -251,34 +249,32 @@ def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
 def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
-    Noise has a white part, from high frequencies, and a slow part, by likelihood. If the residual is no larger than
-    both, it is the noise, per sample: before and after share it, and their difference has the precision of the gap
-    rather than of the noise. The part of the residual that an unknown cause explains is no noise.
+    The residual is the noise, per sample: before and after share it, and their difference has the precision of the gap
+    rather than of the noise. Two parts of it are not: what an unknown cause explains, and what exceeds the fitted
+    noise, since it is slower. The part of the noise that the parameters have absorbed is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
     known = NuisanceFit.of_fit(problem, fit)
-    if matters(problem, fit, rest):
-        known = known.and_rest(rest.clearest, fit.residual)
     noise, unfollowed = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)
-    followed = (fit.residual**2 - unfollowed**2).sum(axis=1)
-    variance, slow_error = noise.slow_part
-    slow, absorbed, floor = np.zeros_like(left), np.zeros_like(left), np.zeros_like(left)
-    slow[:, measured] = variance[problem.bin_of]
-    absorbed[:, measured] = _error_variance(fit, np.arange(fit.columns.shape[2]))[problem.bin_of]
-    claimed, of_sample = claimed_std(problem), problem.recording_of[problem.bin_of]
+    followed = np.zeros(len(unfollowed))
+    if matters(problem, fit, rest):
+        both = known.and_rest(rest.clearest, fit.residual)
+        noise, without = coloured_anew(noise, both, fit.residual)
+        followed, unfollowed = (unfollowed**2 - without**2).sum(axis=1), without
+    usual = noise.energy
+    slower = (unfollowed**2).sum(axis=1) - usual
+    floor, of_sample = left**2, problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
-        at = of_sample == recording
-        high, error = high_frequency_variance(problem.sample_time[at], left[at])
-        if claimed is not None:
-            high = np.minimum(high, WORSE_THAN_CLAIMED**2 * claimed[recording] ** 2)
-        own, usual = left[at] ** 2, high + slow[at]
-        energy, of_slow = float(own.sum(axis=1).mean()), float(slow[at].sum(axis=1).mean())
-        of_noise = energy - max(0.0, float(followed[problem.recording_of == recording].mean()))
-        tolerance = SETTINGS.noise_tolerance * np.hypot(high.sum() * error, of_slow * slow_error)
-        is_noise = 0.0 < of_noise <= usual.sum(axis=1).mean() + tolerance
-        floor[at] = own * of_noise / energy if is_noise else usual
-    return floor + absorbed
+        of_bin, at = problem.recording_of == recording, of_sample == recording
+        error = noise.energy_error / np.sqrt(of_bin.mean())
+        excess = float(slower[of_bin].mean())
+        systematic = max(0.0, float(followed[of_bin].mean()))
+        if excess > SETTINGS.noise_tolerance * error * float(usual[of_bin].mean()):
+            systematic += excess
+        floor[at] *= max(0.0, 1.0 - systematic / max(float(floor[at].sum(axis=1).mean()), 1e-300))
+    floor[:, measured] += _error_variance(fit, np.arange(fit.columns.shape[2]))[problem.bin_of]
+    return floor
 
 
 def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:

@@ -60,15 +60,6 @@ class Arma:
         white[starts] *= self.ratio
         return self._recursion(self._after(white, starts, self.ma), starts, self.ar[0] if len(self.ar) else 0.0)
 
-    @property
-    def slow_variance(self) -> float:
-        """Return the variance of the autoregressive part: the noise is the sum of this and of white noise."""
-        a = float(self.ar[0]) if len(self.ar) else 0.0
-        if a <= 0.0:
-            return 0.0
-        autocovariance = self.std**2 * (1.0 + a * self.ma) * (a + self.ma) / (1.0 - a * a)  # of neighbours
-        return min(autocovariance / a, (self.std * self.ratio) ** 2)
-
     @staticmethod
     def _after(series: Array, starts: Integers, share: float) -> Array:
         """Return the series plus a share of the previous sample, except at starts."""
@@ -181,19 +172,23 @@ class Noise:
         return any(arma.ratio > 1.0 for arma in self.axes)
 
     @property
-    def slow_part(self) -> tuple[Array, float]:
-        """Return the variance (M, A) of the slow part in the residual's frame, and the relative error of its mean.
+    def energy(self) -> Array:
+        """Return the variance (M,) of all axes together."""
+        return np.asarray(self.level**2 @ self._variances)
+
+    @property
+    def energy_error(self) -> float:
+        """Return the relative standard error of the mean energy.
 
         M samples of an autoregression hold M (1 - ar²) / (1 + ar²) independent squares.
         """
-        each = np.array([arma.slow_variance for arma in self.axes])
-        variance = self.level**2 * each
         squares = np.array([float(arma.ar[0]) ** 2 if len(arma.ar) else 0.0 for arma in self.axes])
-        errors = each * np.sqrt(2.0 * (1.0 + squares) / (1.0 - squares) / len(variance))
-        error = float(np.linalg.norm(errors)) / max(float(each.sum()), LEAST_MPS**2)
-        if self.rotation is not None:
-            variance = np.einsum("mij,mi->mj", self.rotation**2, variance)
-        return variance, error
+        errors = self._variances * np.sqrt(2.0 * (1.0 + squares) / (1.0 - squares) / len(self.level))
+        return float(np.linalg.norm(errors) / self._variances.sum())
+
+    @property
+    def _variances(self) -> Array:
+        return np.array([(arma.std * arma.ratio) ** 2 for arma in self.axes])
 
     @property
     def white(self) -> Noise:
