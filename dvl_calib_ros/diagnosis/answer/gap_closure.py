@@ -19,6 +19,8 @@ from ..search.effect_selection import EffectSelection
 from ..search.unexplained import Unexplained, matters
 
 RESAMPLES = 1000
+# Noise above this multiple of the reported noise is an error of the instruments, not noise
+WORSE_THAN_CLAIMED = 3.0
 Integers = NDArray[np.intp]
 
 
@@ -250,8 +252,8 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
     The residual is the noise, per sample: before and after share it, and their difference has the precision of the gap
-    rather than of the noise. Two parts of it are not: what an unknown cause explains, and what exceeds the fitted
-    noise, since it is slower. The part of the noise that the parameters have absorbed is added.
+    rather than of the noise. Three parts of it are not: what an unknown cause explains, what exceeds the fitted noise,
+    since it is slower, and what exceeds the reported noise by far. The part that the parameters have absorbed is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
@@ -262,7 +264,7 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
         both = known.and_rest(rest.clearest, fit.residual)
         noise, without = coloured_anew(noise, both, fit.residual)
         followed, unfollowed = (unfollowed**2 - without**2).sum(axis=1), without
-    usual = noise.energy
+    usual, claimed = noise.energy, claimed_std(problem)
     slower = (unfollowed**2).sum(axis=1) - usual
     floor, of_sample = left**2, problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
@@ -272,7 +274,9 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
         systematic = max(0.0, float(followed[of_bin].mean()))
         if excess > SETTINGS.noise_tolerance * error * float(usual[of_bin].mean()):
             systematic += excess
-        floor[at] *= max(0.0, 1.0 - systematic / max(float(floor[at].sum(axis=1).mean()), 1e-300))
+        energy = float(floor[at].sum(axis=1).mean())
+        most = np.inf if claimed is None else WORSE_THAN_CLAIMED**2 * float((claimed[recording] ** 2).sum())
+        floor[at] *= max(0.0, min(energy - systematic, most)) / max(energy, 1e-300)
     floor[:, measured] += _error_variance(fit, np.arange(fit.columns.shape[2]))[problem.bin_of]
     return floor
 
