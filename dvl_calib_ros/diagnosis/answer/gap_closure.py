@@ -177,7 +177,7 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     """Return a gap with its closure, by the distribution of the true parameters about the estimated ones.
 
     covariance: (6 + p, 6 + p) of the parameters. The noise-free error is the estimated effects' and the error's of
-    their parameters, both after a calibration. Equivalent effects are as true as they are likely.
+    their parameters, both after a calibration. Equivalent effects are equally likely.
     """
     fit, fitter = selection.fit, selection.fitter
     if not fit.effects:
@@ -194,24 +194,20 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     spread = np.sqrt(blocks / rng.chisquare(blocks, (RESAMPLES, 1)))  # the scatter of blocks is itself estimated
     moved = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
     columns = beside_calibration(fit.columns[:, :, 6:])
-    corrected = beside_calibration(selection.base.residual - fit.residual)[:, 0]
-    alternatives = [each for selected in selection.selected for each in selected.rivals]
-    evaluated = [fitter.evaluated(each)[1] for each in alternatives]
-    truths = [corrected, *(beside_calibration(selection.base.residual - each)[:, 0] for each in evaluated)]
-    misfits = [fitter.misfit(fit.noise, fit.residual, fit.hypothesis),
-               *(fitter.misfit(fit.noise, *each) for each in zip(evaluated, alternatives, strict=True))]  # fmt: skip
-    likely = np.exp(-0.5 * (np.array(misfits) - min(misfits)))
+    rivals = [fitter.evaluated(each)[1] for selected in selection.selected for each in selected.rivals]
+    truths = [beside_calibration(selection.base.residual - each)[:, 0] for each in (fit.residual, *rivals)]
+    corrected = truths[0]
     of_cause = rows * remainder(selection, residuals)
     gram = columns.T @ columns
     shares = []
-    for true, count in zip(truths, rng.multinomial(RESAMPLES, likely / likely.sum()).tolist(), strict=True):
-        step = moved[:count]
+    for true, step in zip(truths, np.array_split(moved, len(truths)), strict=True):
         around = np.einsum("ri,ij,rj->r", step, gram, step)
         left, whole = true - corrected, true
         of_left, of_whole = (each @ each - 2.0 * step @ (columns.T @ each) + around for each in (left, whole))
-        shares.append(1.0 - (of_left + of_cause) / np.maximum(of_whole + of_cause, 1e-300))
-    low, closure, high = np.percentile(np.clip(np.concatenate(shares), -1.0, 1.0), [2.5, 50.0, 97.5]).tolist()
-    return replace(gap, closure=closure, interval=(low, high))
+        share = 1.0 - (of_left + of_cause) / np.maximum(of_whole + of_cause, 1e-300)
+        shares.append(np.clip(share, -1.0, 1.0))
+    low, high = np.percentile(np.concatenate(shares), [2.5, 97.5]).tolist()
+    return replace(gap, closure=float(np.median(shares[0])), interval=(low, high))
 
 
 def remainder(selection: EffectSelection, residuals: HeldOutResiduals) -> float:

@@ -185,8 +185,7 @@ class Fitter:
             white = white[np.repeat(~self.held, self.problem.axes)]
         return white
 
-    def misfit(self, noise: Noise, residual: Array, hypothesis: Hypothesis) -> float:
-        """Return the whitened squares of a residual (M, A) and the prior's of its hypothesis."""
+    def _misfit(self, noise: Noise, residual: Array, hypothesis: Hypothesis) -> float:
         white = self._white(noise, residual)
         return float(white @ white + np.sum((hypothesis.vector() / prior_std(hypothesis)) ** 2))
 
@@ -214,7 +213,7 @@ class Fitter:
         if looked is not None:
             evaluated = looked.seen, looked.residual
         seen, residual = evaluated or self.evaluated(hypothesis)
-        misfit = self.misfit(noise, residual, hypothesis)
+        misfit = self._misfit(noise, residual, hypothesis)
         length, before, moved = 1.0, np.zeros(len(kept)), True
         for _ in range(max_steps):
             looked = looked or self._looked(hypothesis, noise, seen, residual)
@@ -227,7 +226,7 @@ class Fitter:
             for _ in range(HALVINGS):
                 trial = hypothesis.moved(tried)
                 trial_seen, trial_residual = self.evaluated(trial)
-                trial_misfit = self.misfit(noise, trial_residual, trial)
+                trial_misfit = self._misfit(noise, trial_residual, trial)
                 if trial_misfit <= misfit:
                     moved = True
                     break
@@ -250,7 +249,7 @@ class Fitter:
                 step[free] -= plain.part(free).solution()
             last = hypothesis.moved(step)
             last_seen, last_residual = self.evaluated(last)
-            last_misfit = self.misfit(noise, last_residual, last)
+            last_misfit = self._misfit(noise, last_residual, last)
             if last_misfit < ASTRAY * misfit:
                 hypothesis, seen, residual, misfit = last, last_seen, last_residual, last_misfit
                 made = partial(self.problem.all_columns, hypothesis, seen)
@@ -316,7 +315,7 @@ class Fitter:
             nearest, evaluated = start, self.evaluated(start)
             for each in self.problem.fitted.get(what, []):  # optima under other noise are near
                 at_end = self.evaluated(each)
-                if self.misfit(noise, at_end[1], each) < self.misfit(noise, evaluated[1], nearest):
+                if self._misfit(noise, at_end[1], each) < self._misfit(noise, evaluated[1], nearest):
                     nearest, evaluated = each, at_end
             found = self.fit(nearest, noise, evaluated=evaluated)
             seen = SeenAgain(self.problem, found.hypothesis)
@@ -371,7 +370,7 @@ class Fitter:
     def _promised(self, fit: Fit) -> float:
         """Return the predicted gain of a linear step from a converged fit, which is not attainable."""
         system = self._system(fit.noise, fit.columns, fit.residual, fit.hypothesis)
-        return self.misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
+        return self._misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
 
     def _is_surely_worse(
         self, hypothesis: Hypothesis, looked: _Looked, noise: Noise, deviance: float, promised: float = 0.0
@@ -383,7 +382,7 @@ class Fitter:
         """
         own_noise = self._own_noise(hypothesis, noise, looked.residual + self.outliers)
         least = looked.system.misfit(looked.system.solution())
-        gained = self.misfit(noise, looked.residual, hypothesis) - least
+        gained = self._misfit(noise, looked.residual, hypothesis) - least
         least -= float(own_noise @ own_noise)
         if least > deviance + SURELY + BENT * gained:
             return True
