@@ -56,6 +56,8 @@ MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
 # Least share of the gap's energy, on held-out data, that effects must close to explain it
 MATERIAL = 0.2
+# Least closure of an explanation; less is a part of one (issue 46)
+EXPLAINS = 0.8
 # Least ratio of the unexplained error to the noise for a mention in the sentence
 WORTH_TELLING = 0.3
 
@@ -374,6 +376,7 @@ def _reasons(
     """Return the verdict and the unexplained error as reasons."""
     numbers = {
         "names": " and ".join(" or ".join((effect.name, *effect.equivalent_to)) for effect in found),
+        "explained": "explained" if gap.closure >= EXPLAINS else f"partly ({100.0 * gap.closure:.0f} %) explained",
         "before": 1e3 * gap.before,
         "after": 1e3 * gap.after,
         "noise": 1e3 * gap.noise_floor,

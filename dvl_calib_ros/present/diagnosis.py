@@ -14,7 +14,6 @@ from ..diagnosis.answer.gap_location import GapPlace
 from ..diagnosis.answer.noise_findings import NoiseFinding
 from ..diagnosis.answer.plotted_series import BODY_AXES, DiagnosisSeries, HeldOutTwin
 from ..diagnosis.answer.results import Diagnosis, FoundEffect
-from ..diagnosis.search.arm_clock_ambiguity import LAG
 from ..effects.base import EffectParameter
 from ..effects.registry import EFFECTS
 from .document import (
@@ -128,7 +127,7 @@ def diagnosis(d: Diagnosis) -> Document:
     found = [
         f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, EFFECTS.get(e.name))}." for e in d.effects
     ]
-    known = [(each.name, EFFECTS[each.name].remedy) for each in d.effects if each.name in EFFECTS]
+    known = [(each.name, EFFECTS[each.name].remedy) for each in d.effects if each.name in EFFECTS and each.is_certain]
     to_do = [f"To do for {name}: {remedy}." for name, remedy in known if remedy]
     more = [f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all."] if len(d.where) > MAX_PLACES else []
     of_each = [
@@ -145,7 +144,7 @@ def diagnosis(d: Diagnosis) -> Document:
         [effect.name for effect in d.effects],
         np.array([effect.closure for effect in d.effects]),
         (d.gap.closure, *d.gap.interval),
-        caption="Line: 95 % interval, by a bootstrap over blocks of time.",
+        caption="Line: 95 % interval, from the uncertainty of the parameters.",
     )
     return Document(
         title=f"DVL against the reference: {', '.join(name for name, _ in d.recordings)}",
@@ -221,8 +220,7 @@ def _numbers(d: Diagnosis) -> list[Number]:
         note = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=note))
     claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
-    slow = ", and slow noise due to the lag" if any(each.name == LAG for each in d.effects) else ""
-    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"estimated from high frequencies{slow}{claimed}"))
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white and slow, by likelihood{claimed}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="beyond the noise")]
 
 

@@ -1314,6 +1314,18 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
     effect = FoundEffect("scale_drift", (), {}, 0.7, 1e-9)
     reasons = _reasons(found, gap, [effect], nothing_left, [], 1)
     assert ("REST_FOLLOWS_NOTHING" in {each.code for each in reasons}) == (verdict is DiagnosisVerdict.UNKNOWN)
+    assert f"is partly ({100 * closure:.0f} %) explained by scale_drift" in reasons[0].sentence
+    explained = _reasons(found, replace(gap, closure=0.8), [effect], nothing_left, [], 1)
+    assert "is explained by scale_drift" in explained[0].sentence
+
+
+def test_what_exceeds_the_noise_by_as_much_is_unknown_and_no_sound_bag():
+    """94.4 mm/s were not explained beside `no_gap`."""
+    selection: Any = SimpleNamespace(selected=[], fit=None, fitter=Mock())
+    nothing_left = Unexplained(0.0, 0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
+    for not_explained, verdict in ((0.99, DiagnosisVerdict.NO_GAP), (1.01, DiagnosisVerdict.UNKNOWN)):
+        gap = Gap(1.4, 1.4, 1.0, np.nan, (np.nan, np.nan), not_explained)
+        assert _verdict(selection, nothing_left, gap, 1.0) is verdict
 
 
 def test_what_the_very_stretch_that_is_held_out_tells_is_no_unknown_cause():

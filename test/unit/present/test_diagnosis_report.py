@@ -63,13 +63,13 @@ def test_held_out_gap_before_and_after_and_the_closure_stand_large(page):
         assert shown in start
 
 
-def test_beside_a_lag_the_noise_is_not_only_what_high_frequencies_show(page, tmp_path):
-    assert "estimated from high frequencies; the messages claim" in page.text
-    lag = FoundEffect("reference_lag", (), {"time_constant_s": (1.3, 1.2, 1.4)}, 0.85, 1e-20)
-    series = diagnosis().series
-    traced = replace(series, traces={lag.name: series.traces["lever_arm"]})
-    lagging = page_of(tmp_path, diagnosis(effects=(lag,), series=traced))
-    assert "estimated from high frequencies, and slow noise due to the lag; the messages claim" in lagging.text
+def test_an_effect_whose_sizes_may_be_zero_is_not_offered_for_applying(tmp_path):
+    for low, is_offered in ((0.1, True), (-0.1, False)):
+        arm = FoundEffect("lever_arm", (), {"x_m": (0.5, low, 0.9)}, 0.85, 1e-9)
+        series = diagnosis().series
+        traced = replace(series, traces={"lever_arm": series.traces["lever_arm"]})
+        offered = page_of(tmp_path, diagnosis(effects=(arm,), series=traced))
+        assert ("To do for lever_arm" in offered.text) == is_offered
 
 
 def test_effects_that_cannot_be_told_apart_are_named_together_and_none_is_preferred(page):
