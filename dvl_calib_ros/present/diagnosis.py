@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..calibration.assessment.dead_reckoning import metres
 from ..calibration.numerics.frames import Array
 from ..diagnosis.answer.gap_location import GapPlace
 from ..diagnosis.answer.noise_findings import NoiseFinding
@@ -117,6 +118,7 @@ def first_screen(d: Diagnosis) -> Document:
     if math.isfinite(gap.before):
         cost = mm(math.sqrt(max(gap.before**2 - gap.noise_floor**2, 0.0)))
         further.append(f"Cost: {cost} mm/s beyond the noise; {mm(gap.not_explained)} mm/s of it are not explained.")
+        further += _drift_sentences(d)
     further += [f"Next: {d.next_manoeuvre}.", "Details: --verbose, or --report FILE."]
     return replace(whole, sections=[section("", *map(Sentence, further))])
 
@@ -153,6 +155,7 @@ def diagnosis(d: Diagnosis) -> Document:
         warnings=d.notes,
         sections=[
             section("", Numbers(_numbers(d)) if math.isfinite(d.gap.before) else None),
+            section("", *map(Sentence, _drift_sentences(d)), where=Where.PAGE),
             section("", None if series is None else facts_by(FACTS, series), where=Where.PAGE),
             section("", Warned(), where=Where.PAGE),
             section("Which effects make it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
@@ -209,6 +212,14 @@ def _equivalence_sentences(d: Diagnosis) -> Iterator[Sentence]:
                 f"Known of both is lever_arm {known.parameter} {sign} {abs(known.speed):.2f} m/s · {known.clock} = "
                 f"{value:.2f} m ({low:.2f} to {high:.2f})."
             )
+
+
+def _drift_sentences(d: Diagnosis) -> list[str]:
+    """Return the drift that the errors cause on a straight kilometre, without and with the effects."""
+    if d.gap.drift is None:
+        return []
+    before, after = (f"{metres(each.per_km)} m ({each.percent:.2g} %)" for each in d.gap.drift)
+    return [f"Drift per straight km, noise included: {before}" + (f", {after} with the effects." if d.effects else ".")]
 
 
 def _numbers(d: Diagnosis) -> list[Number]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_over, ends_of_stretches
 from ...calibration.numerics.frames import Array
 from ..fit.cross_validation import coloured_anew, fitted_without, folds_of, stretch_of, with_slow_noise
 from ..fit.gauss_newton import Fit, Fitter
@@ -33,7 +34,8 @@ class Gap:
     not_explained: part of `after` above the noise. reported: noise reported by the messages, None if missing.
     by_recording: before and after per recording, if several. left_open: predicted part of `not_explained`, in stretches
     that alone determine parts of the effects. falls_from: lower 95 per cent bound of the held-out fall, as a share of
-    the gap; shown_from: the same without left_open.
+    the gap; shown_from: the same without left_open. drift: of straight dead reckoning with errors before and after,
+    None for a vehicle at rest.
     """
 
     before: float
@@ -47,6 +49,7 @@ class Gap:
     left_open: float = 0.0
     falls_from: float = np.nan
     shown_from: float = np.nan
+    drift: tuple[Drift, Drift] | None = None
 
     @property
     def not_expected(self) -> float:
@@ -170,7 +173,24 @@ def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
         left_open=float(np.sqrt(left_open.sum() / n)),
         falls_from=falls_from(after) if is_gap else np.nan,
         shown_from=falls_from(after - left_open) if is_gap else np.nan,
+        drift=_drift(selection, residuals),
     )
+
+
+def _drift(selection: EffectSelection, residuals: HeldOutResiduals) -> tuple[Drift, Drift] | None:
+    """Return the drift of dead reckoning on one course with the errors before and after, None for a short track."""
+    problem = selection.fitter.problem
+    interval = np.diff(problem.sample_time, prepend=problem.sample_time[0])
+    usual = float(np.median(interval))
+    step_s = np.where((interval < 0.0) | (interval > SETTINGS.max_gap_intervals * usual), 0.0, interval)
+    speed = problem.sampled(selection.fit.seen, lambda motion: motion.speed)[problem.bin_of]
+    along = np.cumsum(speed * step_s)
+    if along[-1] < SHORTEST_M:
+        return None
+    ends = ends_of_stretches(along)
+    astray = (np.cumsum(each[:, :2] * step_s[:, None], axis=0) for each in (residuals.before, residuals.after))
+    before, after = (drift_over(each, along, ends) for each in astray)
+    return before, after
 
 
 def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residuals: HeldOutResiduals) -> Gap:

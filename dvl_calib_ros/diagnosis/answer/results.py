@@ -111,6 +111,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
             "closure": gap.closure,
             "closure_ci95": list(gap.interval),
             "held_out": True,
+            "drift_m_per_km": dict(zip(("before", "after"), (each.per_km for each in gap.drift or ()), strict=False)),
             **(
                 {"by_recording": {n: {"before_mps": b, "after_mps": a} for n, (b, a) in gap.by_recording.items()}}
                 if gap.by_recording

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dvl_calib_ros.diagnosis.answer.gap_closure import held_out, measure_gap, with_closure
+from dvl_calib_ros.diagnosis.answer.gap_closure import _drift, held_out, measure_gap, with_closure
 from dvl_calib_ros.diagnosis.fit.gauss_newton import Fitter
 from dvl_calib_ros.diagnosis.fit.selection_criteria import blocks_of
 from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
@@ -83,3 +84,16 @@ def _true_closure(clean: Fitter, found) -> float:
         series = residual.ravel()
         left.append(np.sum((series - columns @ np.linalg.lstsq(columns, series)[0]) ** 2))
     return float(1.0 - left[1] / left[0])
+
+
+def test_a_constant_bias_drifts_by_its_share_of_the_speed_and_not_after_its_correction():
+    """Dead reckoning on one course: 3.6 cm/s ahead and 2.7 to port, at 1.2 m/s."""
+    selection, residuals = Mock(), Mock()
+    n = 2000
+    problem = Mock(sample_time=np.arange(float(n)), bin_of=np.arange(n), sampled=lambda *_: np.full(n, 1.2))
+    selection.fitter.problem = problem
+    residuals.before, residuals.after = np.tile([0.036, -0.027, 0.5], (n, 1)), np.zeros((n, 3))
+    before, after = _drift(selection, residuals)
+    assert before.per_km == pytest.approx(1000.0 * 0.045 / 1.2, rel=1e-3) and after.per_km == 0.0
+    problem.sampled = lambda *_: np.zeros(n)
+    assert _drift(selection, residuals) is None
