@@ -194,7 +194,11 @@ def diagnosis(**changes: Any) -> Diagnosis:
     )  # fmt: skip
     values: dict[str, Any] = {
         "verdict": DiagnosisVerdict.AMBIGUOUS,
-        "reasons": (finding("GAP_AMBIGUOUS", names="<i>two</i> effects", before=42.1, after=35.3, noise=34.6),),
+        "reasons": (
+            finding(
+                "GAP_AMBIGUOUS", names="<i>two</i> effects", explained="explained", before=42.1, after=35.3, noise=34.6
+            ),
+        ),
         "gap": Gap(0.0421, 0.0353, 0.0346, 0.982, (0.91, 1.0), 0.007, 0.03),
         "effects": (
             FoundEffect("lever_arm", ("sideslip",), {"x_m": (0.3, 0.25, 0.35), "z_m": (-0.1, -0.3, 0.1)}, 0.85, 1e-20),

@@ -19,7 +19,7 @@ from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from .answer.confidence_intervals import Times, Triple, covariance_of
 from .answer.dvl_description import dvl_seen
-from .answer.gap_closure import Gap, closure_alone, held_out, measure_gap
+from .answer.gap_closure import Gap, closure_alone, held_out, measure_gap, with_closure
 from .answer.gap_location import places
 from .answer.held_out_validation import confirmed, settled
 from .answer.noise_findings import noise_findings
@@ -56,8 +56,8 @@ MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
 # Least share of the gap's energy, on held-out data, that effects must close to explain it
 MATERIAL = 0.2
-# Largest ratio of slow to high-frequency instrument noise; more is an unknown cause
-MOST_SLOW = 1.5
+# Least closure of an explanation; less is a part of one (issue 46)
+EXPLAINS = 0.8
 # Least ratio of the unexplained error to the noise for a mention in the sentence
 WORTH_TELLING = 0.3
 
@@ -110,17 +110,18 @@ def diagnose_recordings(
     testable = selection.testable
     _check_bounds(selection)
     selection, rest = settled(selection, len(testable))
-    residuals = held_out(selection)
+    residuals = held_out(selection, rest)
     gap = measure_gap(selection, residuals)
     stands, rest = confirmed(selection, rest, gap)
     if stands is not selection:
         selection = stands
-        residuals = held_out(selection)
+        residuals = held_out(selection, rest)
         gap = measure_gap(selection, residuals)
+    covariance, times = covariance_of(selection)
+    gap = with_closure(gap, selection, covariance, residuals)
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
     verdict = _verdict(selection, rest, gap, len(visible) / len(testable))
-    covariance, times = covariance_of(selection)
     if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # the unknown cause may contribute
         moved = moved_by(selection.fitter.problem, selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
@@ -234,9 +235,9 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
     if matters(selection.fitter.problem, selection.fit, rest):
         return DiagnosisVerdict.UNKNOWN
     # effects that leave more than the noise on held-out data explain it no better than their equivalents
-    if gap.not_expected > (1.0 if selection.selected else MOST_SLOW) * gap.noise_floor:
+    if gap.not_expected > gap.noise_floor:
         return DiagnosisVerdict.UNKNOWN
-    if selection.selected and gap.shown < MATERIAL:
+    if selection.selected and gap.closure < MATERIAL:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)
@@ -375,6 +376,7 @@ def _reasons(
     """Return the verdict and the unexplained error as reasons."""
     numbers = {
         "names": " and ".join(" or ".join((effect.name, *effect.equivalent_to)) for effect in found),
+        "explained": "explained" if gap.closure >= EXPLAINS else f"partly ({100.0 * gap.closure:.0f} %) explained",
         "before": 1e3 * gap.before,
         "after": 1e3 * gap.after,
         "noise": 1e3 * gap.noise_floor,

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..calibration.assessment.dead_reckoning import metres
 from ..calibration.numerics.frames import Array
 from ..diagnosis.answer.gap_location import GapPlace
 from ..diagnosis.answer.noise_findings import NoiseFinding
 from ..diagnosis.answer.plotted_series import BODY_AXES, DiagnosisSeries, HeldOutTwin
 from ..diagnosis.answer.results import Diagnosis, FoundEffect
-from ..diagnosis.search.arm_clock_ambiguity import LAG
 from ..effects.base import EffectParameter
 from ..effects.registry import EFFECTS
 from .document import (
@@ -118,6 +118,7 @@ def first_screen(d: Diagnosis) -> Document:
     if math.isfinite(gap.before):
         cost = mm(math.sqrt(max(gap.before**2 - gap.noise_floor**2, 0.0)))
         further.append(f"Cost: {cost} mm/s beyond the noise; {mm(gap.not_explained)} mm/s of it are not explained.")
+        further += _drift_sentences(d)
     further += [f"Next: {d.next_manoeuvre}.", "Details: --verbose, or --report FILE."]
     return replace(whole, sections=[section("", *map(Sentence, further))])
 
@@ -128,7 +129,7 @@ def diagnosis(d: Diagnosis) -> Document:
     found = [
         f"{' or '.join((e.name, *e.equivalent_to))}: {intervals(e.parameters, EFFECTS.get(e.name))}." for e in d.effects
     ]
-    known = [(each.name, EFFECTS[each.name].remedy) for each in d.effects if each.name in EFFECTS]
+    known = [(each.name, EFFECTS[each.name].remedy) for each in d.effects if each.name in EFFECTS and each.is_certain]
     to_do = [f"To do for {name}: {remedy}." for name, remedy in known if remedy]
     more = [f"The first {MAX_PLACES} of {len(d.where)} places; --json holds all."] if len(d.where) > MAX_PLACES else []
     of_each = [
@@ -145,7 +146,7 @@ def diagnosis(d: Diagnosis) -> Document:
         [effect.name for effect in d.effects],
         np.array([effect.closure for effect in d.effects]),
         (d.gap.closure, *d.gap.interval),
-        caption="Line: 95 % interval, by a bootstrap over blocks of time.",
+        caption="Line: 95 % interval, from the uncertainty of the parameters.",
     )
     return Document(
         title=f"DVL against the reference: {', '.join(name for name, _ in d.recordings)}",
@@ -154,6 +155,7 @@ def diagnosis(d: Diagnosis) -> Document:
         warnings=d.notes,
         sections=[
             section("", Numbers(_numbers(d)) if math.isfinite(d.gap.before) else None),
+            section("", *map(Sentence, _drift_sentences(d)), where=Where.PAGE),
             section("", None if series is None else facts_by(FACTS, series), where=Where.PAGE),
             section("", Warned(), where=Where.PAGE),
             section("Which effects make it", table_by(FOUND, d.effects, (EFFECTS_NOTE,))),
@@ -212,6 +214,14 @@ def _equivalence_sentences(d: Diagnosis) -> Iterator[Sentence]:
             )
 
 
+def _drift_sentences(d: Diagnosis) -> list[str]:
+    """Return the drift that the errors cause on a straight kilometre, without and with the effects."""
+    if d.gap.drift is None:
+        return []
+    before, after = (f"{metres(each.per_km)} m ({each.percent:.2g} %)" for each in d.gap.drift)
+    return [f"Drift per straight km, noise included: {before}" + (f", {after} with the effects." if d.effects else ".")]
+
+
 def _numbers(d: Diagnosis) -> list[Number]:
     gap = d.gap
     found = [Number("error", f"{mm(gap.before)} mm/s", note="held-out rms, noise included")]
@@ -221,8 +231,7 @@ def _numbers(d: Diagnosis) -> list[Number]:
         note = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=note))
     claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
-    slow = ", and slow noise due to the lag" if any(each.name == LAG for each in d.effects) else ""
-    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"estimated from high frequencies{slow}{claimed}"))
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white and slow, by likelihood{claimed}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="beyond the noise")]
 
 

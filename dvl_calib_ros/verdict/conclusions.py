@@ -101,21 +101,21 @@ _FALLS = "the error falls from {before:.1f} to {after:.1f} mm/s on held-out data
 _DIAGNOSES = (
     Kind(
         "GAP_EXPLAINED",
-        "the gap is explained by {names}: " + _FALLS,
+        "the gap is {explained} by {names}: " + _FALLS,
         "",
         "",
         Severity.ACCEPT,
     ),
     Kind(
         "GAP_AMBIGUOUS",
-        "the gap is explained by {names}: " + _FALLS + "; this data cannot tell which it is",
+        "the gap is {explained} by {names}: " + _FALLS + "; this data cannot tell which it is",
         "",
         "",
         Severity.MARGINAL,
     ),
     Kind(
         "GAP_PARTLY_UNKNOWN",
-        "{names} explain only part of the gap, and no effect of the library explains the rest: " + _FALLS,
+        "the gap is {explained} by {names}, and no effect of the library explains the rest: " + _FALLS,
         "",
         "",
         Severity.REJECT,

@@ -17,7 +17,7 @@ from ...errors import InputError
 from ..fit.cross_validation import fitted_without, folds_of
 from ..model.hypothesis import Hypothesis, is_time_of_run
 from ..search.arm_clock_ambiguity import ARM, ARM_PARAMETERS, CLOCKS, TWO_CLOCKS
-from .results import Diagnosis, FoundEffect
+from .results import Diagnosis, FoundEffect, certain_sizes
 
 OFFSETS = {
     "dvl_time_offset": "dvl_time_offset",
@@ -117,7 +117,7 @@ def corrections(diagnosis: Diagnosis, recording: int | None = None) -> dict[str,
         if effect.name not in CORRECTED or (effect.name != ARM and not _is_one_correction(diagnosis, effect)):
             continue
         times = {spec.name for spec in EFFECTS[effect.name].parameters if is_time_of_run(spec)}
-        sizes = {name: value for name, (value, low, high) in parameters.items() if name not in times and low * high > 0}
+        sizes = certain_sizes(effect.name, parameters)
         begin_end = {name: value for name, (value, _, _) in parameters.items() if name in times}
         if effect.name == "water_lock":
             if begin_end["from_s"] >= WHOLE_RUN_S or np.isfinite(begin_end["to_s"]):

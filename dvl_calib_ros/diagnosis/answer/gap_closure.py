@@ -8,16 +8,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_over, ends_of_stretches
 from ...calibration.numerics.frames import Array
-from ..fit.cross_validation import fitted_without, folds_of, stretch_of
+from ..fit.cross_validation import coloured_anew, fitted_without, folds_of, stretch_of, with_slow_noise
 from ..fit.gauss_newton import Fit, Fitter
+from ..fit.selection_criteria import NuisanceFit, blocks_of
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
+from ..search.unexplained import Unexplained, matters
 
 RESAMPLES = 1000
-# High-frequency variation above this multiple of the reported noise is error, not noise
+# Noise above this multiple of the reported noise is an error of the instruments, not noise
 WORSE_THAN_CLAIMED = 3.0
 Integers = NDArray[np.intp]
 
@@ -26,11 +29,13 @@ Integers = NDArray[np.intp]
 class Gap:
     """Vector RMS, m/s, per sample, on held-out data. before, after: errors without and with effects, noise included.
 
-    noise_floor: from the residual and high frequencies. closure: explained share of the energy above it, nan without a
-    gap; interval: its 95 per cent. not_explained: part of `after` above the noise. reported: noise reported by the
-    messages, None if missing. by_recording: before and after per recording, if several. left_open: predicted part of
-    `not_explained`, in stretches that alone determine parts of the effects. shown_from: lower end of `interval` without
-    left_open.
+    noise_floor: from the residual, white and slow. closure: share of the noise-free error's energy that a correction
+    with the estimated effects closes, nan without a gap; interval: its 95 per cent, given the parameters' covariance.
+    not_explained: part of `after` above the noise. reported: noise reported by the messages, None if missing.
+    by_recording: before and after per recording, if several. left_open: predicted part of `not_explained`, in stretches
+    that alone determine parts of the effects. falls_from: lower 95 per cent bound of the held-out fall, as a share of
+    the gap; shown_from: the same without left_open. drift: of straight dead reckoning with errors before and after,
+    None for a vehicle at rest.
     """
 
     before: float
@@ -42,12 +47,9 @@ class Gap:
     reported: float | None = None
     by_recording: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     left_open: float = 0.0
+    falls_from: float = np.nan
     shown_from: float = np.nan
-
-    @property
-    def shown(self) -> float:
-        """Return the closure with the part left open counted as closed."""
-        return float(self.closure + (self.not_explained**2 - self.not_expected**2) / max(self.beyond_noise**2, 1e-300))
+    drift: tuple[Drift, Drift] | None = None
 
     @property
     def not_expected(self) -> float:
@@ -86,7 +88,7 @@ class HeldOutResiduals:
         return np.asarray(np.bincount(self.block, squares.sum(axis=1)), dtype=float)
 
 
-def held_out(selection: EffectSelection) -> HeldOutResiduals:
+def held_out(selection: EffectSelection, rest: Unexplained) -> HeldOutResiduals:
     """Return the errors before and after the effects of a selection on held-out data.
 
     One recording is split into alternating stretches. Of several, each is held out, and parameters per recording
@@ -110,7 +112,7 @@ def held_out(selection: EffectSelection) -> HeldOutResiduals:
     return HeldOutResiduals(
         before,
         after,
-        noise_floor(selection),
+        noise_floor(selection, rest),
         np.asarray(block, dtype=np.intp),
         left_open,
     )
@@ -120,9 +122,13 @@ def _left_open(fit: Fit) -> Array:
     """Return the predicted error variance (M,), (m/s)², of a fit per bin. Parameters per recording do not contribute:
     they are fitted to the held-out recording."""
     of_day = [each.effect.of_the_day and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
-    own = np.flatnonzero(~np.array([False] * 6 + of_day))
-    columns, covariance = fit.columns[:, :, own], fit.system.covariance()[np.ix_(own, own)]
-    return np.asarray(np.einsum("map,map->m", columns @ covariance, columns))
+    return np.asarray(_error_variance(fit, np.flatnonzero(~np.array([False] * 6 + of_day))).sum(axis=1))
+
+
+def _error_variance(fit: Fit, at: Integers) -> Array:
+    """Return the error variance (M, A), (m/s)², that a fit's parameters `at` cause."""
+    columns, covariance = fit.columns[:, :, at], fit.system.covariance()[np.ix_(at, at)]
+    return np.asarray(np.einsum("map,map->ma", columns @ covariance, columns))
 
 
 def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
@@ -146,29 +152,88 @@ def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
     """Return held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
     before, after, floor = residuals.squares()
     left_open, n = residuals.open_of_blocks(), len(residuals.before)
-
-    def closure(at: Integers, left: Array) -> Array:
-        gap = np.maximum((before - floor)[at].sum(axis=-1), 1e-300)
-        return np.asarray(1.0 - np.maximum((left - floor)[at].sum(axis=-1), 0.0) / gap)
-
     drawn = np.random.default_rng(0).integers(0, len(before), (RESAMPLES, len(before)))
-    low, high = np.percentile(np.clip(closure(drawn, after), -1.0, 1.0), [2.5, 97.5]).tolist()
-    shown_from = float(np.percentile(np.clip(closure(drawn, after - left_open), -1.0, 1.0), 2.5))
+
+    def falls_from(left: Array) -> float:
+        gap = np.maximum((before - floor)[drawn].sum(axis=-1), 1e-300)
+        share = 1.0 - np.maximum((left - floor)[drawn].sum(axis=-1), 0.0) / gap
+        return float(np.percentile(np.clip(share, -1.0, 1.0), 2.5))
+
     squares = [float(part.sum()) / n for part in (before, after, floor)]
     is_gap = bool(selection.fit.effects) and squares[0] > squares[2]
-    value = min(1.0, float(closure(np.arange(len(before)), after))) if is_gap else np.nan
     return Gap(
         before=float(np.sqrt(squares[0])),
         after=float(np.sqrt(squares[1])),
         noise_floor=float(np.sqrt(squares[2])),
-        closure=max(-1.0, value) if is_gap else np.nan,
-        interval=(low, high) if is_gap else (np.nan, np.nan),
+        closure=np.nan,
+        interval=(np.nan, np.nan),
         not_explained=float(np.sqrt(max(0.0, squares[1] - squares[2]))),
         reported=_reported(selection.fitter.problem),
         by_recording=_by_recording(selection.fitter.problem, residuals),
         left_open=float(np.sqrt(left_open.sum() / n)),
-        shown_from=shown_from if is_gap else np.nan,
+        falls_from=falls_from(after) if is_gap else np.nan,
+        shown_from=falls_from(after - left_open) if is_gap else np.nan,
+        drift=_drift(selection, residuals),
     )
+
+
+def _drift(selection: EffectSelection, residuals: HeldOutResiduals) -> tuple[Drift, Drift] | None:
+    """Return the drift of dead reckoning on one course with the errors before and after, None for a short track."""
+    problem = selection.fitter.problem
+    interval = np.diff(problem.sample_time, prepend=problem.sample_time[0])
+    usual = float(np.median(interval))
+    step_s = np.where((interval < 0.0) | (interval > SETTINGS.max_gap_intervals * usual), 0.0, interval)
+    speed = problem.sampled(selection.fit.seen, lambda motion: motion.speed)[problem.bin_of]
+    along = np.cumsum(speed * step_s)
+    if along[-1] < SHORTEST_M:
+        return None
+    ends = ends_of_stretches(along)
+    astray = (np.cumsum(each[:, :2] * step_s[:, None], axis=0) for each in (residuals.before, residuals.after))
+    before, after = (drift_over(each, along, ends) for each in astray)
+    return before, after
+
+
+def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residuals: HeldOutResiduals) -> Gap:
+    """Return a gap with its closure, by the distribution of the true parameters about the estimated ones.
+
+    covariance: (6 + p, 6 + p) of the parameters. The noise-free error is the estimated effects' and the error's of
+    their parameters, both after a calibration. Equivalent effects are equally likely.
+    """
+    fit, fitter = selection.fit, selection.fitter
+    if not fit.effects:
+        return gap
+    p, blocks = fit.columns.shape[2] - 6, int(blocks_of(fitter.problem).max()) + 1
+    rows = len(fit.residual)
+    calibration = np.linalg.qr(fit.columns[:, :, :6].reshape(-1, 6))[0]
+
+    def beside_calibration(values: Array) -> Array:
+        flat = values.reshape(calibration.shape[0], -1)
+        return np.asarray(flat - calibration @ (calibration.T @ flat))
+
+    rng = np.random.default_rng(0)
+    spread = np.sqrt(blocks / rng.chisquare(blocks, (RESAMPLES, 1)))  # the scatter of blocks is itself estimated
+    moved = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
+    columns = beside_calibration(fit.columns[:, :, 6:])
+    rivals = [fitter.evaluated(each)[1] for selected in selection.selected for each in selected.rivals]
+    truths = [beside_calibration(selection.base.residual - each)[:, 0] for each in (fit.residual, *rivals)]
+    corrected = truths[0]
+    of_cause = rows * remainder(selection, residuals)
+    gram = columns.T @ columns
+    shares = []
+    for true, step in zip(truths, np.array_split(moved, len(truths)), strict=True):
+        around = np.einsum("ri,ij,rj->r", step, gram, step)
+        left, whole = true - corrected, true
+        of_left, of_whole = (each @ each - 2.0 * step @ (columns.T @ each) + around for each in (left, whole))
+        share = 1.0 - (of_left + of_cause) / np.maximum(of_whole + of_cause, 1e-300)
+        shares.append(np.clip(share, -1.0, 1.0))
+    low, high = np.percentile(np.concatenate(shares), [2.5, 97.5]).tolist()
+    return replace(gap, closure=float(np.median(shares[0])), interval=(low, high))
+
+
+def remainder(selection: EffectSelection, residuals: HeldOutResiduals) -> float:
+    """Return the energy per sample, (m/s)², of the residual of all data beyond the noise."""
+    left = selection.fitter.problem.errors(selection.fit.seen)
+    return max(0.0, float(((left**2).sum() - residuals.floor.sum()) / len(left)))
 
 
 def _by_recording(problem: Problem, residuals: HeldOutResiduals) -> dict[str, tuple[float, float]]:
@@ -199,47 +264,37 @@ def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
 # ------------------------------------------------------------------ noise
 
 
-def noise_floor(selection: EffectSelection) -> Array:
+def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
-    If the residual is as small as the high-frequency noise, it is the noise, per sample: before and after share it, and
-    their difference has the precision of the gap rather than of the noise. A larger residual is slow and no noise; then
-    the high-frequency variance is used.
+    The residual is the noise, per sample: before and after share it, and their difference has the precision of the gap
+    rather than of the noise. Three parts of it are not: what an unknown cause explains, what exceeds the fitted noise,
+    since it is slower, and what exceeds the reported noise by far. The part that the parameters have absorbed is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
-    left = problem.errors(fit.seen)
-    floor = np.zeros_like(left)
-    claimed, slow = claimed_std(problem), _made_slow(problem, fit)
-    parameters = fit.columns.shape[2]
-    of_sample = problem.recording_of[problem.bin_of]
+    left, measured = problem.errors(fit.seen), np.array(problem.measured)
+    known = NuisanceFit.of_fit(problem, fit)
+    noise, unfollowed = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)
+    followed = np.zeros(len(unfollowed))
+    if matters(problem, fit, rest):
+        both = known.and_rest(rest.clearest, fit.residual)
+        noise, without = coloured_anew(noise, both, fit.residual)
+        followed, unfollowed = (unfollowed**2 - without**2).sum(axis=1), without
+    usual, claimed = noise.energy, claimed_std(problem)
+    slower = (unfollowed**2).sum(axis=1) - usual
+    floor, of_sample = left**2, problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
-        at = of_sample == recording
-        high, error = high_frequency_variance(problem.sample_time[at], left[at])
-        if claimed is not None:
-            high = np.minimum(high, WORSE_THAN_CLAIMED**2 * claimed[recording] ** 2)
-        high = high + slow[recording]
-        n = int(at.sum())
-        own = left[at] ** 2 * (1.0 + 2.0 * parameters / (3.0 * max(n, 1)))
-        is_noise = own.mean(axis=0).sum() <= high.sum() * (1.0 + SETTINGS.noise_tolerance * error)
-        floor[at] = own if is_noise else high
+        of_bin, at = problem.recording_of == recording, of_sample == recording
+        error = noise.energy_error / np.sqrt(of_bin.mean())
+        excess = float(slower[of_bin].mean())
+        systematic = max(0.0, float(followed[of_bin].mean()))
+        if excess > SETTINGS.noise_tolerance * error * float(usual[of_bin].mean()):
+            systematic += excess
+        energy = float(floor[at].sum(axis=1).mean())
+        most = np.inf if claimed is None else WORSE_THAN_CLAIMED**2 * float((claimed[recording] ** 2).sum())
+        floor[at] *= max(0.0, min(energy - systematic, most)) / max(energy, 1e-300)
+    floor[:, measured] += _error_variance(fit, np.arange(fit.columns.shape[2]))[problem.bin_of]
     return floor
-
-
-def _made_slow(problem: Problem, fit: Fit) -> list[Array]:
-    """Return velocity noise variance (3,), (m/s)², per recording that a lag makes slow, from simulated noise. High
-    frequencies do not contain it."""
-    slow: list[Array] = [np.zeros(3)] * len(problem.recordings)
-    if not fit.hypothesis.lags(0):
-        return slow
-    left = problem.errors(fit.seen)
-    of_sample = problem.recording_of[problem.bin_of]
-    for shaken in problem.shaken:
-        own = shaken.errors(shaken.all_seen(fit.hypothesis)) - left
-        for recording, before in enumerate(slow):
-            at = of_sample == recording
-            high, _ = high_frequency_variance(problem.sample_time[at], own[at])
-            slow[recording] = before + np.maximum((own[at] ** 2).mean(axis=0) - high, 0.0)
-    return slow
 
 
 def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:

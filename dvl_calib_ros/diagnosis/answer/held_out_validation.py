@@ -100,7 +100,7 @@ def confirmed(selection: EffectSelection, rest: Unexplained, gap: Gap) -> tuple[
 
     An effect that one stretch alone determines, as a clock jump by one turn, is kept if no unknown cause replaces it.
     """
-    shrinks = gap.interval[0] > 0.0 or (np.isnan(gap.interval[0]) and gap.after < gap.before)
+    shrinks = gap.falls_from > 0.0 or (np.isnan(gap.falls_from) and gap.after < gap.before)
     if not selection.selected or shrinks:
         return selection, rest
     none = selection.withdrawn()

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from ...effects.registry import EFFECTS
 from ...verdict.answering import Answering
 from ...verdict.reasons import Reason
+from ..model.hypothesis import is_time_of_run
 from ..search.arm_clock_ambiguity import Combination
 from ..search.effect_selection import EffectSelection
 from .dvl_description import DvlSeen
@@ -44,6 +46,18 @@ class FoundEffect:
     p: float
     by_recording: Mapping[str, Mapping[str, tuple[float, float, float]]] = field(default_factory=dict)
     combination: Combination | None = None
+
+    @property
+    def is_certain(self) -> bool:
+        """Return whether the interval of any size excludes zero, in any recording."""
+        each = self.by_recording.values() or (self.parameters,)
+        return any(certain_sizes(self.name, parameters) for parameters in each)
+
+
+def certain_sizes(name: str, parameters: Mapping[str, tuple[float, float, float]]) -> dict[str, float]:
+    """Return the sizes of an effect whose intervals exclude zero."""
+    times = {spec.name for spec in EFFECTS[name].parameters if is_time_of_run(spec)}
+    return {each: value for each, (value, low, high) in parameters.items() if each not in times and low * high > 0.0}
 
 
 @dataclass(frozen=True, repr=False)
@@ -97,6 +111,7 @@ def diagnosis_document(diagnosis: Diagnosis) -> dict[str, Any]:
             "closure": gap.closure,
             "closure_ci95": list(gap.interval),
             "held_out": True,
+            "drift_m_per_km": dict(zip(("before", "after"), (each.per_km for each in gap.drift or ()), strict=False)),
             **(
                 {"by_recording": {n: {"before_mps": b, "after_mps": a} for n, (b, a) in gap.by_recording.items()}}
                 if gap.by_recording

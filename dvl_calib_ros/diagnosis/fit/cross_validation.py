@@ -85,8 +85,8 @@ def predictive_gain(problem: Problem, noise: Noise, simpler: Predictor, richer: 
     The noise is re-estimated with either, so that slow noise is an alternative explanation. Each takes the noise with
     the better prediction. noise: its level and frame.
     """
-    noise = replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
-    colours = [_coloured_anew(noise, *each) for each in (simpler, richer)]
+    noise = with_slow_noise(problem, noise)
+    colours = [coloured_anew(noise, *each)[0] for each in (simpler, richer)]
     worse, better = (
         min(surprise_elsewhere(problem, colour, *each) + colour.log_size for colour in colours)
         for each in (simpler, richer)
@@ -101,9 +101,15 @@ def predictive_gain_of(problem: Problem, simpler: Fit, richer: Fit) -> float:
     return predictive_gain(problem, richer.noise, own, other) + max(-smoothed, 0.0)
 
 
-def _coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> Noise:
-    """Return the noise re-estimated from a residual (M, A) with fitted columns subtracted."""
+def with_slow_noise(problem: Problem, noise: Noise) -> Noise:
+    """Return a noise whose memory may be as long as that of multipath."""
+    return replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
+
+
+def coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> tuple[Noise, Array]:
+    """Return the noise re-estimated from a residual (M, A) with fitted columns subtracted, and the difference."""
+    left = residual
     for _ in range(2):
         left = residual + fitted.columns @ fitted.step(noise, residual).solution()
         noise = noise.refitted(left, taken=noise.taken_by(fitted.columns, fitted.std))
-    return noise
+    return noise, left

@@ -18,6 +18,7 @@ from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise.noise_model import white_noise
 from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import moved_lag, with_moved
 from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection
+from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
 
 LAG, LAGS_S = EFFECTS["reference_lag"], 1.2
@@ -147,4 +148,5 @@ def test_noise_that_a_lag_has_made_slow_is_noise(noise_mps):
     selection = Mock(spec=EffectSelection, fitter=fitter, fit=fit)
     squares = (left**2).sum(axis=1).mean()
     assert high.sum() < 0.5 * squares
-    assert noise_floor(selection).sum(axis=1).mean() == pytest.approx(squares, rel=0.2)
+    nothing = Unexplained(0.0, 0.0, "", fit.columns[:, :, :0], fit.columns[:, :, :0])
+    assert noise_floor(selection, nothing).sum(axis=1).mean() == pytest.approx(squares, rel=0.2)

@@ -11,11 +11,12 @@ from command_line import fail, succeed
 from io_fixtures import run, write_bag
 from report_fixtures import OWN_EFFECT, Page, assert_described, diagnosis, drawn
 
+from dvl_calib_ros.calibration.assessment.dead_reckoning import Drift
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap
 from dvl_calib_ros.diagnosis.answer.plotted_series import Followed
-from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict, FoundEffect
+from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.present import diagnosis_pictures
 from dvl_calib_ros.present.diagnosis import rms
@@ -63,13 +64,21 @@ def test_held_out_gap_before_and_after_and_the_closure_stand_large(page):
         assert shown in start
 
 
-def test_beside_a_lag_the_noise_is_not_only_what_high_frequencies_show(page, tmp_path):
-    assert "estimated from high frequencies; the messages claim" in page.text
-    lag = FoundEffect("reference_lag", (), {"time_constant_s": (1.3, 1.2, 1.4)}, 0.85, 1e-20)
-    series = diagnosis().series
-    traced = replace(series, traces={lag.name: series.traces["lever_arm"]})
-    lagging = page_of(tmp_path, diagnosis(effects=(lag,), series=traced))
-    assert "estimated from high frequencies, and slow noise due to the lag; the messages claim" in lagging.text
+def test_an_effect_whose_sizes_may_be_zero_is_not_offered_for_applying(tmp_path):
+    for low, is_offered in ((0.1, True), (-0.1, False)):
+        arm = FoundEffect("lever_arm", (), {"x_m": (0.5, low, 0.9)}, 0.85, 1e-9)
+        series = diagnosis().series
+        traced = replace(series, traces={"lever_arm": series.traces["lever_arm"]})
+        offered = page_of(tmp_path, diagnosis(effects=(arm,), series=traced))
+        assert ("To do for lever_arm" in offered.text) == is_offered
+
+
+def test_what_the_gap_costs_is_said_in_metres_per_kilometre(tmp_path):
+    found = diagnosis()
+    costly = replace(found, gap=replace(found.gap, drift=(Drift(21.4, 0.0), Drift(3.26, 0.0))))
+    said = "Drift per straight km, noise included: 21 m (2.1 %), 3.3 m (0.33 %) with the effects."
+    assert said in page_of(tmp_path, costly).text
+    assert diagnosis_document(costly)["gap"]["drift_m_per_km"] == {"before": 21.4, "after": 3.26}
 
 
 def test_effects_that_cannot_be_told_apart_are_named_together_and_none_is_preferred(page):
