@@ -31,7 +31,6 @@ from dvl_calib_ros.evaluation.results import (
     CalibrationSet,
     Coverage,
     EachStudy,
-    ErrorsInVariables,
     Evaluation,
     HeldOut,
     Trace,
@@ -131,7 +130,6 @@ def evaluation(**changes: Any) -> Evaluation:
     avg_vrmse[1, -1] = np.nan
     time = np.linspace(0.0, 100.0, 900)
     truth = np.stack([1.5 + 0 * time, 0.2 * np.sin(time / 9), 0 * time], axis=1)
-    n_aided = sum(model.aided for model in MODELS.values())
     runs = (CalibrationRun("T01", 0.0, 400.0, 1.9), CalibrationRun("T$1$<b>", 10.0, 80.0, 0.05))
     coverage = tuple(
         Coverage(
@@ -154,10 +152,6 @@ def evaluation(**changes: Any) -> Evaluation:
         "avg_vrmse_by_time": np.tile(avg_vrmse[:, None], (1, len(windows), 1, 1)),
         "published": {"E1": {UNCALIBRATED: 0.121, "M1": 0.0301, "M2": 0.10}},
         "coverage": coverage,
-        "errors_in_variables": ErrorsInVariables(
-            models[:n_aided], np.array([0.05, 0.1, 0.2]), -0.01 * np.ones((n_aided, 3)), -0.011 * np.ones((n_aided, 3)),
-            0.001 * np.ones((n_aided, 3)), np.ones(n_aided), "-a σ²/‖v‖²",
-        ),
         "each": EachStudy(runs, np.tile(level[None, :, None], (2, 1, 2)), np.ones((2, len(models))), coverage),
         "single_heading": None,
         "traces": (

@@ -37,7 +37,6 @@ def evaluation_document(evaluation: Evaluation) -> dict[str, Any]:
         },
         "coverage": _coverage(e.coverage),
         "coverage_of_all": _coverage(e.coverage_of_all),
-        "errors_in_variables": _errors_in_variables(e),
         "each": _each(e.each, e.columns),
         "single_heading": _each(e.single_heading, e.columns),
         "held_out": [vars(each) for each in e.held_out],
@@ -113,27 +112,6 @@ def _coverage(coverage: Sequence[Coverage]) -> dict[str, Any]:
             "mean_std": _row(each.state_names, each.mean_std),
         }
         for each in coverage
-    }
-
-
-def _errors_in_variables(e: Evaluation) -> dict[str, Any] | None:
-    study = e.errors_in_variables
-    if study is None:
-        return None
-    return {
-        "formula": study.formula,
-        "gnss_std": study.gnss_std.tolist(),
-        "models": {
-            name: {
-                "noisy_axes": float(axes),
-                "predicted": predicted.tolist(),
-                "measured": measured.tolist(),
-                "standard_error": error.tolist(),
-            }
-            for name, axes, predicted, measured, error in zip(
-                study.models, study.noisy_axes, study.predicted, study.measured, study.standard_error, strict=True
-            )
-        },
     }
 
 

@@ -23,13 +23,6 @@ from .results import CalibrationRun, CalibrationSet, Failure, mean_of_known
 # largest heading range of a leg of a single heading, and smallest length for a calibration
 LEG_HEADING_RANGE = np.deg2rad(25.0)
 LEG_SAMPLES = 60
-# Noise of the reference in the errors-in-variables study, m/s per axis, and its set: one with constant speed, because
-# the formula has a single ‖v‖.
-NOISE_STUDY_STD = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
-NOISE_STUDY_SET = "E2"
-# a wide prior, so that the bias comes from the data; a filter with the true noise
-NOISE_STUDY_PRIOR_STD_SCALE = 0.1
-NOISE_STUDY_SMALLEST_STD = 0.01
 
 
 @dataclass(frozen=True)
@@ -74,16 +67,14 @@ class RunOutcome:
 class SeedOutcome:
     """Result of one seed. by_set: one per set, E are the windows of `protocol.WINDOWS_S`.
 
-    each, single_heading: one per run of `each_runs` and `single_headings`. pull: (G, V, B) change of the first scale
-    state by noise in the reference. baselines: (S, K) Avg.VRMSE of `baselines.BASELINES`. convergence: (L, curves, T,
-    3) squared errors of the misalignment over time on each run, see `convergence`. failures: exceptions, whose results
-    are nan.
+    each, single_heading: one per run of `each_runs` and `single_headings`. baselines: (S, K) Avg.VRMSE of
+    `baselines.BASELINES`. convergence: (L, curves, T, 3) squared errors of the misalignment over time on each run, see
+    `convergence`. failures: exceptions, whose results are nan.
     """
 
     by_set: tuple[RunOutcome, ...]
     each: tuple[RunOutcome, ...]
     single_heading: tuple[RunOutcome, ...]
-    pull: Array
     baselines: Array
     convergence: Array
     failures: tuple[Failure, ...] = ()
@@ -120,8 +111,7 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     )
     if not procedure.studies:
         none = np.empty((0, len(curve_keys(procedure.studied)), len(TIMES_S), 3))
-        no_pull = np.empty((0, len(NOISE_STUDY_STD), 0))
-        return SeedOutcome(by_set, (), (), no_pull, baselines, none, _of_seed(failures, seed))
+        return SeedOutcome(by_set, (), (), baselines, none, _of_seed(failures, seed))
     with_attitude = runs_with_attitude(procedure.runs)
     legs = [leg for name in with_attitude for leg in _legs(procedure.runs[name])]
     outcome_of_seed = SeedOutcome(
@@ -130,7 +120,6 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
         single_heading=tuple(
             outcome(procedure.studied, _part(data(name), start, end), [None], None) for name, start, end in legs
         ),
-        pull=_noise_study(procedure, data(noise_study_run(procedure).name), seed, failures),
         baselines=baselines,
         convergence=np.stack(
             [
@@ -290,32 +279,3 @@ def _legs(run: Trajectory) -> list[tuple[str, int, int]]:
         else:
             start += 1
     return legs
-
-
-def models_in_noise_study(models: Sequence[str]) -> tuple[str, ...]:
-    """Return the models with a reference velocity that estimate a scale."""
-    return tuple(name for name in models if MODELS[name].aided and MODELS[name].scale_axes)
-
-
-def _noise_study(procedure: Procedure, data: SensorData, seed: int, failures: list[Failure]) -> Array:
-    """Return the change of the first scale state by noise of each level in the reference (G, V, B)."""
-    models = models_in_noise_study(procedure.studied)
-    if not models:
-        return np.empty((0, len(NOISE_STUDY_STD), len(protocol.COMBINATIONS)))
-
-    def scales(std: float) -> Array:  # (G, B)
-        parameters = procedure.parameters.replace(
-            gnss_aided_std=max(std, NOISE_STUDY_SMALLEST_STD), initial_std_scale=NOISE_STUDY_PRIOR_STD_SCALE
-        )
-        noisy = replace(data, reference=references(data.run, seed, std))
-        states = estimate(models, noisy, parameters, [len(data.run.time)], failures)
-        return np.stack([states[name].x[0, :, 3] for name in models])
-
-    without_noise = scales(0.0)
-    return np.stack([scales(std) - without_noise for std in NOISE_STUDY_STD], axis=1)
-
-
-def noise_study_run(procedure: Procedure) -> Trajectory:
-    """Return the run of the errors-in-variables study: constant speed, because the formula has a single ‖v‖."""
-    names = {each.name: each.calibration_run for each in protocol.SETS}
-    return procedure.runs[names[NOISE_STUDY_SET]]

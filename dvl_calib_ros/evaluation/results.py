@@ -128,24 +128,6 @@ class Coverage:
 
 
 @dataclass(frozen=True)
-class ErrorsInVariables:
-    """Bias of the scale estimate by noise in the reference (errors in variables).
-
-    models: the G models with GNSS that estimate scale. gnss_std: (V,) m/s. predicted, measured: (G, V) bias of the
-    model's first scale state, dimensionless; measured is a mean over combinations and seeds, standard_error (G, V) its
-    standard error. noisy_axes: (G,) axes of the reference whose noise is in that state's regressor. formula: as text.
-    """
-
-    models: tuple[str, ...]
-    gnss_std: Array
-    predicted: Array
-    measured: Array
-    standard_error: Array
-    noisy_axes: Array
-    formula: str
-
-
-@dataclass(frozen=True)
 class EachStudy:
     """Calibration on each of L runs with attitude, evaluated on all other trajectories.
 
@@ -268,7 +250,6 @@ class Evaluation(Answering):
     avg_vrmse_by_time: Array
     published: Mapping[str, Mapping[str, float]]
     coverage: tuple[Coverage, ...]
-    errors_in_variables: ErrorsInVariables | None
     each: EachStudy | None
     single_heading: EachStudy | None
     traces: tuple[Trace, ...]

@@ -13,7 +13,6 @@ import numpy as np
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import BY_VELOCITY, MODELS
-from ..calibration.models.base import Observations
 from ..calibration.models.parameters import SCHEMA, Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.results.results import Result, Verification
@@ -25,24 +24,20 @@ from .convergence import curves
 from .estimation import SensorData, streams_of, true_prior
 from .metrics import BASELINES, coverage
 from .procedure import (
-    NOISE_STUDY_STD,
     Procedure,
     RunOutcome,
     SeedOutcome,
     each_runs,
-    models_in_noise_study,
-    noise_study_run,
     seed_or_failure,
     sensor_data,
     single_headings,
 )
-from .protocol import SCALES_PERCENT, Trajectory, load_folder, own_trajectories
+from .protocol import SCALES_PERCENT, load_folder, own_trajectories
 from .results import (
     CalibrationRun,
     CalibrationSet,
     Coverage,
     EachStudy,
-    ErrorsInVariables,
     Evaluation,
     Failure,
     HeldOut,
@@ -65,7 +60,6 @@ TRACE_SAMPLES = 400
 NAMED_FAILURES = 5
 
 OWN_NOTES: tuple[str, ...] = ("simulated trajectories: the published figures are for others, so no ratio is given",)
-FORMULA = "-a σ²/(E‖h‖² + a σ²), h the noiseless regressor of the scale, a the number of its noisy axes"
 
 
 def evaluate(
@@ -127,7 +121,6 @@ def evaluate(
         published=protocol.PUBLISHED,
         coverage=_coverage(procedure.models, [run for each in outcomes for run in each.by_set]),
         coverage_of_all=_coverage(procedure.models, [run for each in outcomes for run in (*each.by_set, *each.each)]),
-        errors_in_variables=_errors_in_variables(procedure, outcomes),
         each=_each_study(procedure, each_runs(runs), [each.each for each in outcomes]),
         single_heading=_each_study(procedure, single_headings(runs), [each.single_heading for each in outcomes]),
         traces=tuple(_traces(procedure, seeds[0], outcomes[0])),
@@ -184,55 +177,6 @@ def _each_study(
         yaw_observed=mean_of_known(np.array([[run.yaw_observed for run in seed] for seed in outcomes]), 0),
         coverage=_coverage(procedure.models, [run for seed in outcomes for run in seed]),
     )
-
-
-def _errors_in_variables(procedure: Procedure, outcomes: Sequence[SeedOutcome]) -> ErrorsInVariables | None:
-    """Return predicted and measured pull of the scale by reference noise; None without models for it."""
-    models = models_in_noise_study(procedure.studied)
-    if not models:
-        return None
-    pull = np.concatenate([each.pull for each in outcomes], axis=-1)
-    spread = mean_of_known((pull - mean_of_known(pull, -1)[..., None]) ** 2, -1)
-    std = np.array(NOISE_STUDY_STD)
-    predicted, axes = zip(*(_predicted_pull(name, noise_study_run(procedure), std) for name in models), strict=True)
-    return ErrorsInVariables(
-        models=models,
-        gnss_std=std,
-        predicted=np.stack(predicted),
-        measured=mean_of_known(pull, -1),
-        standard_error=np.sqrt(spread / np.maximum(np.isfinite(pull).sum(axis=-1), 1)),
-        noisy_axes=np.array(axes),
-        formula=FORMULA,
-    )
-
-
-def _predicted_pull(name: str, run: Trajectory, std: Array) -> tuple[Array, float]:
-    """Return the bias of a model's first scale state by reference noise (V,) m/s, and the noisy axes.
-
-    By `FORMULA`: least squares with a noisy regressor h + n attenuates its coefficient by E‖h‖² / (E‖h‖² + E‖n‖²). Here
-    the noise is in z as well, so the attenuation applies to 1 + δk instead of δk. The noisy axes are found from the
-    change of the model's h by a step along each axis of the reference.
-    """
-    regressor = _scale_regressor(name, run.velocity, np.zeros(3), run)
-    steps = [_scale_regressor(name, run.velocity, step, run) - regressor for step in np.eye(3)]
-    noisy_axes = float(sum(np.mean(np.sum(step**2, axis=1)) for step in steps))
-    signal, noise = float(np.mean(np.sum(regressor**2, axis=1))), noisy_axes * std**2
-    return -noise / (signal + noise), noisy_axes
-
-
-def _scale_regressor(name: str, velocity: Array, step: Array, run: Trajectory) -> Array:
-    """Return the column of H for the first scale state (N, m), with `step` (m/s) added to the reference."""
-    _, h = MODELS[name].linearise(
-        Observations(
-            velocity_dvl=velocity,
-            reference_body=velocity + step,
-            lever_velocity=None,
-            rotation_dvl_from_body=np.eye(3),
-            sway_heave=np.zeros(2),
-            interval=np.diff(run.time, prepend=run.time[0]),
-        )
-    )
-    return h[:, :, 3]
 
 
 def _traces(procedure: Procedure, seed: int, outcome: SeedOutcome) -> list[Trace]:

@@ -12,7 +12,7 @@ from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.protocol import MANOEUVRING
-from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, ErrorsInVariables, Evaluation, HeldOut, Trace
+from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, Evaluation, HeldOut, Trace
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from .document import (
     CELL_KINDS,
@@ -120,7 +120,6 @@ def evaluation(e: Evaluation) -> Document:
                 for title, found in coverages
                 if found
             ),
-            *([_pull(e.errors_in_variables)] if e.errors_in_variables is not None else []),
             *(_study(e, study, title) for study, title in studies if study is not None and study.runs),
             *([_held_out(e.held_out)] if e.held_out else []),
             *map(_trace, e.traces),
@@ -253,39 +252,6 @@ def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
         ", ".join(f"{c.model} {100 * c.pooled_68:.0f} and {100 * c.pooled_95:.0f} %" for c in coverages),
         [coverage.model for coverage in coverages],
         {0.68: [c.pooled_68 for c in coverages], 0.95: [c.pooled_95 for c in coverages]},
-    )
-
-
-def _pull(study: ErrorsInVariables) -> Section:
-    """Lay out the scale error caused by noise in the reference, predicted and measured."""
-    rows = [
-        (
-            f"{std:g}",
-            *(
-                " / ".join(number(100 * each[i, j], signed=True) for each in (study.predicted, study.measured))
-                for i in range(len(study.models))
-            ),
-        )
-        for j, std in enumerate(study.gnss_std)
-    ]
-    return section(
-        "Noise in the reference pulls the scale",
-        Sentence(study.formula),
-        Table(
-            ("GNSS σ, m/s", *study.models), rows, dense=True, notes=("Pull of the scale in %: predicted / measured.",)
-        ),
-        Legend(study.models, ""),
-        figure(
-            "evaluation_figures.errors_in_variables",
-            "Errors in variables",
-            "Pull of the scale by noise in the reference, predicted and measured",
-            study.models,
-            study.gnss_std,
-            study.predicted,
-            study.measured,
-            study.standard_error,
-            caption="Lines: predicted by the formula. Points: measured, ± 2 standard errors.",
-        ),
     )
 
 

@@ -132,25 +132,6 @@ def coverage_points(models: Sequence[str], within: Mapping[float, Sequence[float
     return figure
 
 
-def errors_in_variables(
-    models: Sequence[str], gnss_std: Array, predicted: Array, measured: Array, standard_error: Array
-) -> Figure:
-    """Draw the pull of the scale (G, V), dimensionless, predicted (lines) and measured (points, ±2 standard errors)."""
-    figure, axes = new_figure(height=3.2)
-    order = np.argsort(gnss_std)
-    for i, (name, width) in enumerate(zip(models, line_widths(models), strict=True)):
-        colour, dashes = MODEL_STYLES[name]
-        axes.plot(gnss_std[order], 100.0 * predicted[i][order], color=colour, linestyle=dashes, linewidth=1.5 * width)
-        axes.errorbar(
-            gnss_std, 100.0 * measured[i], yerr=200.0 * standard_error[i], fmt="o", color=colour,
-            markersize=2.5 * width, elinewidth=1.0, capsize=2.0,
-        )  # fmt: skip
-    axes.axhline(0.0, color=INK, linewidth=0.7)
-    axes.set_xlabel("GNSS noise σ per axis, m/s")
-    axes.set_ylabel("pull of the scale, %")
-    return figure
-
-
 def error_by_run(runs: Sequence[str], models: Sequence[str], uncalibrated: Array, errors: Array) -> Figure:
     """Draw Avg.VRMSE m/s of every model (L, M), calibrated on each of L runs; uncalibrated: (L,)."""
     figure, axes = new_figure(height=1.1 + 0.26 * len(runs))
