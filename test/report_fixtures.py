@@ -33,7 +33,6 @@ from dvl_calib_ros.evaluation.results import (
     EachStudy,
     Evaluation,
     HeldOut,
-    Trace,
 )
 from dvl_calib_ros.present.page import write_replay_report
 from dvl_calib_ros.verdict.reasons import finding
@@ -121,15 +120,12 @@ def replay_page(folder: Path, samples=None, models=FEW, **bag_options: Any) -> t
 
 def evaluation(**changes: Any) -> Evaluation:
     """An evaluation with made-up numbers that have the shapes of real ones. Models that need attitude are nan on E2."""
-    rng = np.random.default_rng(1)
     models = tuple(MODELS)
     sets = (CalibrationSet("E1", "T12", 200.0), CalibrationSet("E2", "T$1$<b>", None))
     windows = (50.0, 100.0, 200.0, None)
     level = np.array([0.12, *np.linspace(0.03, 0.09, len(models))])
     avg_vrmse = np.tile(level[None, :, None], (2, 1, 2))
     avg_vrmse[1, -1] = np.nan
-    time = np.linspace(0.0, 100.0, 900)
-    truth = np.stack([1.5 + 0 * time, 0.2 * np.sin(time / 9), 0 * time], axis=1)
     runs = (CalibrationRun("T01", 0.0, 400.0, 1.9), CalibrationRun("T$1$<b>", 10.0, 80.0, 0.05))
     coverage = tuple(
         Coverage(
@@ -154,12 +150,6 @@ def evaluation(**changes: Any) -> Evaluation:
         "coverage": coverage,
         "each": EachStudy(runs, np.tile(level[None, :, None], (2, 1, 2)), np.ones((2, len(models))), coverage),
         "single_heading": None,
-        "traces": (
-            Trace(
-                "T$1$<b>", "E1", "misalignment of 1°", time, truth, 1.02 * truth,
-                {name: truth + 0.01 * rng.normal(size=truth.shape) for name in models},
-            ),
-        ),
         "parameters": Parameters().as_dict(),
         "version": "0",
         "held_out": (HeldOut("E1", "M3", "accept", 0.12, 0.03, 0.031),),

@@ -52,7 +52,7 @@ class RunOutcome:
 
     by_time: (E, C) Avg.VRMSE m/s after each window. The others are after the run's own window: avg_vrmse (C,). errors,
     std: model -> (B, n) estimate - truth of the error states, and the claimed σ. yaw_observed: (M,) share of
-    combinations. corrections: (C, B, 3, 3).
+    combinations.
     """
 
     by_time: Array
@@ -60,7 +60,6 @@ class RunOutcome:
     errors: Mapping[str, Array]
     std: Mapping[str, Array]
     yaw_observed: Array
-    corrections: Array
 
 
 @dataclass(frozen=True)
@@ -236,7 +235,7 @@ def _calibrate(
         yaw_std = std[name][:, 2]
         yaw_observed[index] = mean_of_known(np.where(np.isnan(yaw_std), np.nan, yaw_std <= observed_std), 0)
     by_time = mean_of_known(vrmse(others, matrices[:, :, None]), (-1, -2))  # (E, C, others, B) -> (E, C)
-    return RunOutcome(by_time, by_time[own], errors, std, yaw_observed, matrices[own])
+    return RunOutcome(by_time, by_time[own], errors, std, yaw_observed)
 
 
 def runs_with_attitude(runs: Mapping[str, Trajectory]) -> list[str]:

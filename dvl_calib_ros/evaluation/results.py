@@ -159,28 +159,6 @@ class EachStudy:
 
 
 @dataclass(frozen=True)
-class Trace:
-    """Velocity of one evaluated trajectory for a figure: body frame, forward-left-up, N samples (decimated).
-
-    time: (N,) s. truth, uncorrected: (N, 3). corrected: model -> (N, 3). calibrated_on: a set's name. combination: as
-    text.
-    """
-
-    trajectory: str
-    calibrated_on: str
-    combination: str
-    time: Array
-    truth: Array
-    uncorrected: Array
-    corrected: Mapping[str, Array]
-
-    @property
-    def best(self) -> str:
-        """Model with the smallest error."""
-        return min(self.corrected, key=lambda name: float(((self.corrected[name] - self.truth) ** 2).sum()))
-
-
-@dataclass(frozen=True)
 class HeldOut:
     """Hold-out verification of one model's calibration on one set.
 
@@ -252,7 +230,6 @@ class Evaluation(Answering):
     coverage: tuple[Coverage, ...]
     each: EachStudy | None
     single_heading: EachStudy | None
-    traces: tuple[Trace, ...]
     parameters: Mapping[str, Any]
     version: str
     held_out: tuple[HeldOut, ...] = ()

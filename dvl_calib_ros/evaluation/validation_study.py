@@ -14,7 +14,6 @@ import numpy as np
 from ..calibration.calibrator import Calibrator
 from ..calibration.models import BY_VELOCITY, MODELS
 from ..calibration.models.parameters import SCHEMA, Parameters
-from ..calibration.numerics.frames import Array
 from ..calibration.results.results import Result, Verification
 from ..errors import InputError
 from ..parallel import Workers, run_all
@@ -41,7 +40,6 @@ from .results import (
     Evaluation,
     Failure,
     HeldOut,
-    Trace,
     mean_of_known,
 )
 
@@ -53,9 +51,6 @@ DEFAULTS: Mapping[str, Any] = {"gate_probability": 0.0, "prior_source": "referen
 # the DVL is mounted without rotation, at the reference point, without delay, and its errors are constant
 FIXED = ("mounting_rpy", "lever_arm", "dvl_time_offset", "initial_calibration", "process_std_misalignment",
          "process_std_scale", "max_speed")  # fmt: skip
-# trajectories and combination of the figures
-TRACED, TRACED_COMBINATION = ("T01", "T07"), 0
-TRACE_SAMPLES = 400
 # number of failures named in a note
 NAMED_FAILURES = 5
 
@@ -123,7 +118,6 @@ def evaluate(
         coverage_of_all=_coverage(procedure.models, [run for each in outcomes for run in (*each.by_set, *each.each)]),
         each=_each_study(procedure, each_runs(runs), [each.each for each in outcomes]),
         single_heading=_each_study(procedure, single_headings(runs), [each.single_heading for each in outcomes]),
-        traces=tuple(_traces(procedure, seeds[0], outcomes[0])),
         parameters=parameters.as_dict(),
         version=__version__,
         held_out=tuple(each for of_set in held_out for each in of_set),
@@ -177,37 +171,6 @@ def _each_study(
         yaw_observed=mean_of_known(np.array([[run.yaw_observed for run in seed] for seed in outcomes]), 0),
         coverage=_coverage(procedure.models, [run for seed in outcomes for run in seed]),
     )
-
-
-def _traces(procedure: Procedure, seed: int, outcome: SeedOutcome) -> list[Trace]:
-    """Return example velocities corrected by the calibration on the first set."""
-    traces = []
-    calibrated_on, corrections = procedure.sets[0], outcome.by_set[0].corrections[1:, TRACED_COMBINATION]
-    for name in TRACED:
-        if name not in procedure.runs or name == calibrated_on.calibration_run:
-            continue
-        run = procedure.runs[name]
-        measured = sensor_data(run, seed).velocity_dvl[TRACED_COMBINATION]
-        every = slice(None, None, -(-len(run.time) // TRACE_SAMPLES))
-        traces.append(
-            Trace(
-                trajectory=name,
-                calibrated_on=calibrated_on.name,
-                combination=protocol.combination_in_words(TRACED_COMBINATION),
-                time=run.time[every],
-                truth=run.velocity[every],
-                uncorrected=measured[every],
-                corrected=_corrected(procedure.models, corrections, measured[every]),
-            )
-        )
-    return traces
-
-
-def _corrected(models: Sequence[str], corrections: Array, measured: Array) -> Mapping[str, Array]:
-    """Return model -> corrected velocities, for usable models."""
-    return {
-        name: measured @ matrix.T for name, matrix in zip(models, corrections, strict=True) if np.isfinite(matrix).all()
-    }
 
 
 # one scale per misalignment, because individual calibrations take ten times longer than vectorised ones

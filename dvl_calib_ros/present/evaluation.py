@@ -12,7 +12,7 @@ from ..calibration.models import MODELS
 from ..evaluation.convergence import PUBLISHED_DEG, PUBLISHED_S, TIMES_S
 from ..evaluation.cross_check import CrossCheck
 from ..evaluation.protocol import MANOEUVRING
-from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, Evaluation, HeldOut, Trace
+from ..evaluation.results import UNCALIBRATED, Coverage, EachStudy, Evaluation, HeldOut
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from .document import (
     CELL_KINDS,
@@ -40,8 +40,6 @@ from .numbers import number
 # largest relative deviations from a published figure for each colour; the last is for no published figure
 WITHIN, KINDS = (0.05, 0.25, 0.5, math.inf), ("good", "off", "far", "bad", "")
 BODY_AXES = ("ahead", "to port", "up")
-# points drawn of a trace
-TRACE_POINTS = 400
 CONVERGENCE_NOTE = (
     "Error of the misalignment, ° rms: of the whole angle / of pitch and yaw alone. Calibrated on each run with "
     f"attitude, for each noise of the reference. A published network has {PUBLISHED_DEG:g}° after {PUBLISHED_S:g} s. "
@@ -122,7 +120,6 @@ def evaluation(e: Evaluation) -> Document:
             ),
             *(_study(e, study, title) for study, title in studies if study is not None and study.runs),
             *([_held_out(e.held_out)] if e.held_out else []),
-            *map(_trace, e.traces),
         ],
         parameters=e.parameters,
     )
@@ -323,43 +320,6 @@ def _held_out(held_out: Sequence[HeldOut]) -> Section:
             )
         )
     return section("Held-out verification", Table(("model", *sets), rows, notes=notes), *drawn)
-
-
-def _trace(trace: Trace) -> Section:
-    """Lay out one trajectory's velocity before and after the correction by its best model."""
-    step = max(1, len(trace.time) // TRACE_POINTS)
-    time_s, truth, uncorrected = trace.time[::step], trace.truth[::step], trace.uncorrected[::step]
-    corrected = {name: velocity[::step] for name, velocity in trace.corrected.items()}
-    best = trace.best
-    drawn = [
-        figure(
-            "evaluation_figures.velocity_of_trace",
-            f"Velocity {where}",
-            f"Velocity {where} of {trace.trajectory}: truth, DVL, and corrected by {best}, m/s",
-            time_s,
-            truth[:, axis],
-            uncorrected[:, axis],
-            corrected[best][:, axis],
-            f"velocity {where}, m/s",
-        )
-        for axis, where in enumerate(BODY_AXES)
-    ]
-    error = figure(
-        "evaluation_figures.error_of_trace",
-        "Velocity error, all models",
-        "Length of the velocity error before and after correction, m/s",
-        time_s,
-        np.linalg.norm(uncorrected - truth, axis=1),
-        {name: np.linalg.norm(velocity - truth, axis=1) for name, velocity in corrected.items()},
-        caption="Running root mean square. Dotted: uncorrected.",
-    )
-    return section(
-        f"Velocity before and after correction: {trace.trajectory}, calibrated on {trace.calibrated_on}",
-        Legend(list(trace.corrected), ""),
-        Sentence(f"Errors put in: {trace.combination}. Corrected by {best}, the best on it.", soft=True),
-        SideBySide([*drawn, error]),
-        where=Where.PAGE,
-    )
 
 
 ERRORS_NOTE = (

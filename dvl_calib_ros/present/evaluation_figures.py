@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from ..calibration.numerics.frames import Array
 from .evaluation import CLAIMED
-from .figure_data import mark_time, running_mean
 from .figure_style import INK, MODEL_STYLES, UNCALIBRATED_COLOUR, legend_above, line_widths, new_figure
 from .figure_style import plain_log_ticks as log_ticks
 
@@ -147,41 +146,3 @@ def error_by_run(runs: Sequence[str], models: Sequence[str], uncalibrated: Array
     log_ticks(axes.xaxis)
     axes.set_xlabel("Avg.VRMSE on all other runs, m/s")
     return figure
-
-
-def velocity_of_trace(time_s: Array, truth: Array, uncorrected: Array, corrected: Array, label: str) -> Figure:
-    """Draw one body axis (N,) m/s of an evaluated trajectory: truth, and the DVL before and after correction."""
-    figure, axes = new_figure()
-    axes.plot(time_s, uncorrected, color="#c0392b", linewidth=0.9, label="DVL as measured")
-    axes.plot(time_s, corrected, color="#1f6fb2", linewidth=0.9, label="DVL corrected")
-    axes.plot(time_s, truth, color=INK, linewidth=0.9, linestyle=(0, (2, 2)), label="truth")
-    axes.set_xlabel("time, s")
-    mark_time(axes, f"{time_s[0]} .. {time_s[-1]}")
-    axes.set_ylabel(label)
-    axes.margins(x=0.01)
-    legend_above(axes)
-    return figure
-
-
-def error_of_trace(time_s: Array, uncorrected: Array, corrected: Mapping[str, Array]) -> Figure:
-    """Draw the running rms of velocity errors, from lengths (N,) m/s, before and after correction by several models."""
-    figure, axes = new_figure(height=3.2)
-    axes.plot(
-        *_running_rms(time_s, uncorrected), color=UNCALIBRATED_COLOUR, linestyle=":", linewidth=1.4,
-        label="uncalibrated",
-    )  # fmt: skip
-    for (name, error), width in zip(corrected.items(), line_widths(list(corrected)), strict=True):
-        colour, dashes = MODEL_STYLES[name]
-        axes.plot(*_running_rms(time_s, error), color=colour, linestyle=dashes, linewidth=width, label=name)
-    axes.set_yscale("log")
-    log_ticks(axes.yaxis)
-    axes.set_xlabel("time, s")
-    mark_time(axes, f"{time_s[0]} .. {time_s[-1]}")
-    axes.set_ylabel("velocity error, m/s rms")
-    axes.margins(x=0.01)
-    return figure
-
-
-def _running_rms(time_s: Array, error: Array) -> tuple[Array, Array]:
-    at, mean_square = running_mean(time_s, error**2)
-    return at, np.sqrt(mean_square)
