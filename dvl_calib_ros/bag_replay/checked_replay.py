@@ -124,16 +124,20 @@ def checked_replay(
     return replayed if recordings is None else _with_common_verdict(replayed, recordings, merge)
 
 
+# Findings of discovery that reject a calibration.
+DECISIVE = "DVL_SIDE_INVERTED", "TRAVELS_ASTERN"
+
+
 def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
     """Add ambiguous frames to the verdict and, if the calibration is rejected anyway, their likely cause.
 
-    Nothing else rejects an inverted sway, because there is no reference.
+    Without a reference nothing else rejects an inverted sway or a vehicle that travels astern.
     """
     is_rejected = verification.verdict is Severity.REJECT
     kept = [
         each
         for each in contradictions
-        if each.severity is Severity.MARGINAL or each.code == "DVL_SIDE_INVERTED" or (is_rejected and is_cause(each))
+        if each.severity is Severity.MARGINAL or each.code in DECISIVE or (is_rejected and is_cause(each))
     ]
     return verification.with_objections(kept) if kept else verification
 

@@ -488,10 +488,13 @@ class _Search:
         yaw = math.atan2(rotation_dvl_from_body[0, 1], rotation_dvl_from_body[0, 0])
         if known is not None:
             ahead_in_body = known @ mean
-            if abs(ahead_in_body[1]) > abs(ahead_in_body[0]) and not self._is_given("mounting_rpy"):
-                given, fits = in_degrees(rpy_from_rotation(known)), nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
-                fields = {"given": given, "found": in_degrees(fits), "option": as_option(fits)}
-                self._contradictions.append(finding("TRAVELS_SIDEWAYS", **fields))
+            is_sideways = abs(ahead_in_body[1]) > abs(ahead_in_body[0])
+            if (is_sideways or ahead_in_body[0] < 0.0) and not self._is_given("mounting_rpy"):
+                given, fits = rpy_from_rotation(known) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
+                fields = {"given": in_degrees(given), "found": in_degrees(fits), "option": as_option(fits)}
+                astern = {} if is_sideways else {"confirmed": as_option(given)}
+                code = "TRAVELS_ASTERN" if astern else "TRAVELS_SIDEWAYS"
+                self._contradictions.append(finding(code, **fields, **astern))
         elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 

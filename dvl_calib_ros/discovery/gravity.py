@@ -72,7 +72,8 @@ class Gravity(NamedTuple):
         if self.across > TILTED and self.inverted < CLEARLY * self.across:
             tilts = {"inverted": math.degrees(self.inverted), "given": math.degrees(self.across)}
             return finding("GRAVITY_FITS_INVERTED", topic=topic, **tilts)
-        if self.across > math.sin(LEANS) and math.hypot(*self.world[:2].tolist()) > math.sin(LEANS):
+        leans = self.across > math.sin(LEANS) and math.hypot(*self.world[:2].tolist()) > math.sin(LEANS)
+        if leans or self.across > CLEARLY:  # no wave pulls that hard, and a lean may turn with the heading
             return finding("GRAVITY_LEANS", topic=topic, degrees=math.degrees(math.acos(min(1.0, up))))
         if abs(self.size - 1.0) < NEAR:
             return finding("GRAVITY_IN_G", topic=topic)

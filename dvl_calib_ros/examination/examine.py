@@ -32,7 +32,7 @@ from ..recordings.topic_messages import Recorded
 from ..recordings.topic_preview import Look
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
-from ..verdict.reasons import Reason, finding
+from ..verdict.reasons import Reason, finding, is_cause
 from . import topic_checks
 
 # a reference below this rate (Hz) interpolates turns by straight lines; 1 Hz receivers are a little slow at times
@@ -108,7 +108,12 @@ class Examination(Answering):
     @property
     def why(self) -> str:
         """Sentence on why it cannot calibrate fully; '' if it can or the findings explain it."""
-        errors = [each for each in self.findings if each.severity is Severity.ERROR]
+        is_explained = bool(self.against) and is_cause(self.against[0])  # why DVL and reference disagree
+        errors = [
+            each
+            for each in self.findings
+            if each.severity is Severity.ERROR and not (is_explained and each.code == "DOCTOR_DISAGREE")
+        ]
         if errors:
             return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
         if not self.has_reference and self.verdict != "no":

@@ -282,6 +282,12 @@ CONFIGURATIONS = (
         "try -p mounting_rpy:={option}",
     ),
     _Said(
+        "TRAVELS_ASTERN",
+        "with the mounting {given} the vehicle travels astern; it goes ahead with {found}",
+        "Without a reference a vehicle that drives astern looks like a DVL that points astern.",
+        "try -p mounting_rpy:={option}; if the vehicle did drive astern, -p mounting_rpy:={confirmed}",
+    ),
+    _Said(
         "FRAMES_AMBIGUOUS",
         "the data fit {taken} and, as well, {other}; the first is taken",
         "Which side is port, and which axes has the reference?",

@@ -213,6 +213,15 @@ def inverted(told: Told) -> None:
             q.x, q.y, q.z = -q.x, -q.y, -q.z
 
 
+def w_first(told: Told) -> None:
+    """Components as w, x, y, z: gravity turns with the heading, so its mean hardly leans."""
+    told.imu("/imu", "base_link")
+    for row in told.rows:
+        if row[1] == "/imu":
+            q = row[3].orientation
+            q.x, q.y, q.z, q.w = q.w, q.x, q.y, q.z
+
+
 def down_labelled_up(told: Told) -> None:
     """Forward-right-down in NED, where the reference does not tell."""
     told.imu("/imu", "base_link", FLU_FROM_FRD, "ned")
@@ -239,6 +248,7 @@ def pulls(told: Told) -> None:
     [
         (turned_over, "turned over"),
         (inverted, "GRAVITY_FITS_INVERTED"),
+        (w_first, "GRAVITY_LEANS"),
         (down_labelled_up, "imu_frame ned"),
         (in_g, "GRAVITY_IN_G"),
         (pulls, "GRAVITY_SIGN"),

@@ -247,8 +247,10 @@ class _Level(NamedTuple):
 
 
 def _followed(recording: ThinnedRecording, after: _Level, use: Index, p: Parameters) -> ResidualTrend | None:
-    """Return `residual_trend` of the samples in use."""
+    """Return `residual_trend` of the samples in use; None without turn rates, as lever arms then look like signals."""
     rotation, velocity, error, rates = (each[use] for each in after.whole)
+    if np.isnan(rates).any():
+        return None
     interval_s = float(median(np.diff(recording.reference.times)))
     times, nominal = recording.dvl.times[use], p.rotation_dvl_from_body
     return residual_trend(times, rotation, velocity, error, rates, interval_s, nominal)

@@ -61,6 +61,17 @@ def test_a_current_confirms_the_sign_of_y_and_that_of_z_is_asked(tmp_path, seed)
     assert "positive when the vehicle moves up?" in question.sentence
 
 
+def test_a_vehicle_that_only_goes_astern_is_a_mounting_turned_round_unless_it_is_confirmed(tmp_path):
+    bag = recording(tmp_path / "bag", (-1.0, -1.0, 1.0))
+    calibration = dc.replay(bag, history=False)
+    assert calibration.verdict == "reject" and dc.doctor(bag).verdict == "no"
+    first, *_ = reasons_of(calibration)
+    assert first.code == "TRAVELS_ASTERN" and "try -p mounting_rpy:=[0deg,0deg,-180deg]" in first.sentence
+    for yaw in (np.pi, 0.0):
+        confirmed = dc.replay(bag, history=False, mounting_rpy=(0.0, 0.0, yaw))
+        assert confirmed.verdict != "reject" and "TRAVELS_ASTERN" not in codes(reasons_of(confirmed))
+
+
 def test_without_a_current_both_signs_are_asked_and_the_answer_is_marginal(tmp_path):
     bag = recording(tmp_path / "bag", (1.0, 1.0, -1.0), current=(0.0, 0.0, 0.0))
     calibration = dc.replay(bag, history=False)
