@@ -21,6 +21,8 @@ from .whitened_least_squares import root_of_inverse
 
 # Standard deviations from which innovations have constant influence (Huber)
 HUBER = 2.5
+# Passes of winsorising: an outlier is in its neighbours' predictions until it is corrected
+WINSORISED_TIMES = 3
 # Least share of a good fit's innovations within that; of Student's t with 3 degrees of freedom 0.93
 MOST_NEAR = 0.5
 # Time constant, s, of the slowest receiver noise; intermittent effects are slower
@@ -59,6 +61,22 @@ class Arma:
         white = innovations * self.std
         white[starts] *= self.ratio
         return self._recursion(self._after(white, starts, self.ma), starts, self.ar[0] if len(self.ar) else 0.0)
+
+    @property
+    def given_others(self) -> float:
+        """Return the standard deviation of a sample given all others."""
+        a = float(self.ar[0]) if len(self.ar) else 0.0
+        return self.std / float(np.sqrt(1.0 + (a + self.ma) ** 2 / (1.0 - self.ma**2)))
+
+    def deviations(self, series: Array, segments: Sequence[slice]) -> Array:
+        """Return the deviations (M,) of samples from the prediction by all others of their segment, standardised."""
+        found = np.zeros_like(series)
+        start = np.zeros(1, dtype=np.intp)
+        for part in segments:
+            if part.stop > part.start:
+                backwards = self.innovations(series[part], start)[::-1]
+                found[part] = self.innovations(backwards, start)[::-1]
+        return found * self.given_others
 
     @staticmethod
     def _after(series: Array, starts: Integers, share: float) -> Array:
@@ -114,6 +132,9 @@ class Noise:
         scaled = np.empty_like(innovations)
         for axis, arma in enumerate(self.axes):
             scaled[:, axis] = arma.series(innovations[:, axis], self._starts)
+        return self._unscaled(scaled)
+
+    def _unscaled(self, scaled: Array) -> Array:
         values = scaled * self.level
         return values if self.rotation is None else np.einsum("mji,mj->mi", self.rotation, values)
 
@@ -218,16 +239,25 @@ class Noise:
         return float(2.0 * (logarithms + first))
 
     def robust(self, residual: Array) -> Array:
-        """Winsorise the innovations of a residual (M, A), so that least squares is Huber's estimate.
+        """Winsorise each sample of a residual (M, A) given all others, so that least squares is Huber's estimate.
 
-        Pseudo-values ψ(r) / E[ψ'] of the innovations r about zero, so the fit must be good. An axis with most
-        innovations far from zero belongs to a bad fit and is unchanged.
+        Pseudo-values ψ(r) / E[ψ'] about zero, so the fit must be good. An axis with most samples far from zero belongs
+        to a bad fit and is unchanged. Innovations are not winsorised: one outlier is also in those after it, which would
+        shift the level of slow noise.
         """
-        white = self.whiten(residual).reshape(residual.shape)
-        scale = robust_std(white)
-        near = np.mean(np.abs(white) < HUBER * scale, axis=0)
-        pseudo = np.clip(white, -HUBER * scale, HUBER * scale) / np.maximum(near, MOST_NEAR)
-        return self.unwhiten(np.where(near > MOST_NEAR, pseudo, white).ravel())
+        scaled = self._scaled(residual)
+        stds = np.array([arma.given_others for arma in self.axes])
+        beyond = np.zeros_like(scaled)
+        for _ in range(WINSORISED_TIMES):
+            cleaned = scaled - beyond * stds
+            off = beyond + np.stack(
+                [arma.deviations(series, self.segments) for arma, series in zip(self.axes, cleaned.T, strict=True)], 1
+            )
+            scale = robust_std(off)
+            near = np.mean(np.abs(off) < HUBER * scale, axis=0)
+            beyond = off - np.clip(off, -HUBER * scale, HUBER * scale)
+        pseudo = (scaled - beyond * stds) / np.maximum(near, MOST_NEAR)
+        return self._unscaled(np.where(near > MOST_NEAR, pseudo, scaled))
 
 
 def white_noise(residual: Array, segments: tuple[slice, ...], rotation: Array | None, interval: float = 1.0) -> Noise:

@@ -23,7 +23,7 @@ from dvl_calib_ros.diagnosis.model.stream_curve import Curve
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise import noise_level
 from dvl_calib_ros.diagnosis.noise.noise_level import claims_of
-from dvl_calib_ros.diagnosis.noise.noise_model import Arma, white_noise
+from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.search.effect_selection import without_slow_outliers
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.injection import injection
@@ -379,3 +379,21 @@ def test_what_heavy_tails_add_to_the_noise_that_a_lag_takes_off_is_not_explained
     taken_off = float(rest.own_noise @ rest.own_noise - fit.own_noise @ fit.own_noise)
     assert gains[1] - gains[0] == pytest.approx(-0.5 * max(taken_off, 0.0))
     assert taken_off > 1.0
+
+
+def test_an_outlier_does_not_shift_the_level_of_slow_noise():
+    """Its innovation was winsorised, those after it were not: a current that comes and goes, by heavy tails alone."""
+    rng, n = np.random.default_rng(4), 400
+    arma = Arma(np.array([0.95]), -0.75, 1.0, float(np.sqrt(1.0 + 0.2**2 / (1.0 - 0.95**2))))
+    noise = Noise((slice(0, n),), None, np.ones((n, 1)), (arma,))
+    sound = noise.unwhiten(rng.standard_normal(n))
+    hit = sound.copy()
+    hit[200] += 60.0
+    column = noise.whiten(np.ones((n, 1)) * (np.arange(n) >= 195)[:, None])
+
+    def step(series):
+        return float(column @ noise.whiten(series) / (column @ column))
+
+    assert abs(step(noise.robust(hit)) - step(noise.robust(sound))) < 0.15 * abs(step(hit) - step(sound))
+    deviations = arma.deviations(sound[:, 0], noise.segments)
+    assert np.std(deviations[5:-5]) == pytest.approx(1.0, rel=0.15)
