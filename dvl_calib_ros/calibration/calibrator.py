@@ -10,6 +10,7 @@ Neither that nor block_size changes the results, only the speed.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 
 import numpy as np
@@ -491,8 +492,12 @@ class Calibrator:
 
     def result(self) -> Result:
         """Return all results, including those that would take effect only at later stamps."""
-        with self._further.settled():
+        with self.settled():
             return self._result()
+
+    def settled(self) -> AbstractContextManager[None]:
+        """Let all complete blocks, and the recording's incomplete end, take effect inside this context."""
+        return self._further.settled()
 
     def _result(self) -> Result:
         """Collect all results as of now."""

@@ -409,12 +409,12 @@ class CalibrationNode(AnsweringNode):
         message.twist.covariance.reshape(6, 6)[:3, :3] = covariance
         self._corrected_publisher.publish(message)
 
-    def _publish_mounting(self) -> None:
-        """Publish the mounting, at most once a second; ~/estimate has every sample."""
+    def _publish_mounting(self, *, again: bool = False) -> None:
+        """Publish the mounting, at most once a second; ~/estimate has every sample. again: also if it is as before."""
         calibrator = self._calibrator
         model = MODELS[calibrator.selected]
         state_of = (model.name, calibrator.n_given(model.name))
-        if state_of == self._mounting_published or calibrator.last_ns is None:
+        if calibrator.last_ns is None or (state_of == self._mounting_published and not again):
             return
         # A subscriber would use the mounting of a wrong configuration. Waiting messages are not examined, so check
         # every time.
@@ -507,7 +507,9 @@ class CalibrationNode(AnsweringNode):
     def _save(self, path: Path, save: Callable[..., None] = save_unless_worse) -> None:
         self._save_problem = None
         try:
-            save(path, self._result_document(), round(self._calibrator.parameters.result_backups))
+            with self._calibrator.settled():  # what is published is what is saved
+                save(path, self._result_document(), round(self._calibrator.parameters.result_backups))
+                self._publish_mounting(again=True)
         except KeptError:
             raise
         except InputError as error:
