@@ -242,7 +242,7 @@ class Noise:
         """Winsorise each sample of a residual (M, A) given all others, so that least squares is Huber's estimate.
 
         Pseudo-values ψ(r) / E[ψ'] about zero, so the fit must be good. An axis with most samples far from zero belongs
-        to a bad fit and is unchanged. Innovations are not winsorised: one outlier is also in those after it, which would
+        to a bad fit and is unchanged. Innovations are not winsorised: an outlier is also in later ones, which would
         shift the level of slow noise.
         """
         scaled = self._scaled(residual)

@@ -895,11 +895,11 @@ def test_a_fast_reference_is_compared_no_more_often_than_a_slow_dvl_can_tell():
     assert slow.dvl.interval == 1.0
 
 
-def test_slow_noise_of_the_reference_is_a_finding_and_no_floor():
+def test_slow_noise_of_the_reference_is_a_finding_and_no_gap():
     diagnosis = diagnosed(effects=["coloured_reference_noise:std_mps=0.06,correlation_time_s=8"], gnss_std=0.03)
     assert "coloured_reference_noise" in {finding.name for finding in diagnosis.noise}
-    assert diagnosis.gap.noise_floor == pytest.approx(np.sqrt(3.0) * 0.03, rel=0.3)
-    assert diagnosis.gap.not_explained > 0.06
+    assert diagnosis.gap.noise_floor == pytest.approx(np.sqrt(3.0) * np.hypot(0.03, 0.06), rel=0.2)
+    assert diagnosis.gap.not_explained < 0.3 * diagnosis.gap.noise_floor
 
 
 def test_what_comes_and_goes_with_a_period_of_its_own_is_unknown():
