@@ -228,7 +228,8 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     rotation, oriented, rates, turning_known = attitude_of(block, at, parameters.imu_timeout)
     seen = dvl_at(block, at + x[DELAY])
     use = seen.known & (oriented | reference.in_body) & turning_known
-    use &= squared(np.where(block.measured, reference.velocity, 0.0)) >= parameters.min_speed**2
+    # by the DVL, which is less noisy: selected by the reference, samples near the limit would bias the scale
+    use &= squared(seen.value) >= parameters.min_speed**2
     if parameters.max_turn_rate > 0.0:
         use &= squared(rates) <= parameters.max_turn_rate**2
     if not use.any():
