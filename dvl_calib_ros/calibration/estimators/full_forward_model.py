@@ -229,7 +229,8 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     n_all, reach, stamps = len(at), block.slope_reach_s, at + x[DELAY]
     velocity, known = dvl_at(block, np.concatenate([stamps, stamps - reach, stamps + reach]))
     use = known[:n_all] & (oriented | reference.in_body) & turning_known
-    use &= squared(np.where(block.measured, reference.velocity, 0.0)) >= parameters.min_speed**2
+    # by the DVL, which is less noisy: selected by the reference, samples near the limit would bias the scale
+    use &= squared(velocity[:n_all]) >= parameters.min_speed**2
     if parameters.max_turn_rate > 0.0:
         use &= squared(rates) <= parameters.max_turn_rate**2
     if not use.any():
