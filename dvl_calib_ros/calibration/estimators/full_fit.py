@@ -38,9 +38,8 @@ from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted
 from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
 from .section_rows import GATE, SECTION_S, SectionRows, masked_median, section_starts, usual_square
-from .slow_errors import Chain, Eliminated, LogNormal, SlowErrors, gram_of, normal_points, scatter
+from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
-DEG = math.pi / 180.0
 OF_DAY = FULL.of_day
 LINEARISED = np.r_[PHI, SCALE, LEVER_ARM, DELAY, REFERENCE_DELAY]  # states that are not linear
 OF_VEHICLE = np.delete(np.arange(N_STATE), OF_DAY)
@@ -75,22 +74,6 @@ GROSS, GROSS_MPS = 10.0, 0.5
 # Median of the absolute value of a standard normal variable.
 MEDIAN_ABSOLUTE = 0.6745
 _UNIT_POINTS: Array = normal_points(5, POINTS)
-
-
-@dataclass(frozen=True)
-class Priors:
-    """Priors of the slow errors, from instrument specifications.
-
-    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s. heading, tilt: AHRS, rad.
-    memory: 10 to 300 s (90 %). deviation: heading deviation as a share of `heading_deviation_std`.
-    """
-
-    horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
-    vertical: LogNormal = field(default_factory=lambda: LogNormal(0.018, 1.7))
-    heading: LogNormal = field(default_factory=lambda: LogNormal(0.21 * DEG, 1.7))
-    tilt: float = 0.1 * DEG
-    memory: LogNormal = field(default_factory=lambda: LogNormal(55.0, 2.8))
-    deviation: LogNormal = field(default_factory=lambda: LogNormal(0.3, 3.0))
 
 
 class _Section(NamedTuple):

@@ -9,6 +9,7 @@ information form). A section is held out by a zero Gram matrix; recordings add u
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from statistics import NormalDist
 from typing import NamedTuple
 
@@ -27,6 +28,7 @@ NOISE_TWICE = 2.0
 # Smallest share of signal in the acceleration column; with less it is not used. Gauss-Newton steps are too long by 1 /
 # √share.
 LEAST_SHARE = 0.4
+DEG = math.pi / 180.0
 
 
 class SlowErrors(NamedTuple):
@@ -45,6 +47,22 @@ class LogNormal(NamedTuple):
 
     median: float
     factor: float
+
+
+@dataclass(frozen=True)
+class Priors:
+    """Priors of the slow errors, from instrument specifications.
+
+    horizontal, vertical: GNSS Doppler velocity, 0.5 to 3 cm/s horizontally (90 %), m/s. heading, tilt: AHRS, rad.
+    memory: 10 to 300 s (90 %). deviation: heading deviation as a share of `heading_deviation_std`.
+    """
+
+    horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
+    vertical: LogNormal = field(default_factory=lambda: LogNormal(0.018, 1.7))
+    heading: LogNormal = field(default_factory=lambda: LogNormal(0.21 * DEG, 1.7))
+    tilt: float = 0.1 * DEG
+    memory: LogNormal = field(default_factory=lambda: LogNormal(55.0, 2.8))
+    deviation: LogNormal = field(default_factory=lambda: LogNormal(0.3, 3.0))
 
 
 def normal_points(k: int, n: int) -> Array:
