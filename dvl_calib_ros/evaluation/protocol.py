@@ -71,12 +71,6 @@ COMBINATIONS: tuple[DvlErrors, ...] = tuple(
 )
 
 
-def combination_in_words(index: int) -> str:
-    """Describe a combination of errors."""
-    angles, percent = list(product(MISALIGNMENTS_DEG, SCALES_PERCENT))[index]
-    return f"misalignment {angles} °, scale {percent} %, forward-right-down"
-
-
 @cache
 def truth() -> Array:
     """Return φ (rad) and δk (B, 6) of every combination, as estimates in forward-left-up.

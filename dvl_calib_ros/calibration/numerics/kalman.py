@@ -404,18 +404,6 @@ def _inverse(a: Array) -> Array:
     return _full([[_dot(columns[i], columns[j][i - j :]) for j in range(i + 1)] for i in range(m)])  # L⁻ᵀ L⁻¹
 
 
-def whitening(noise: Array) -> Array:
-    """Return L⁻¹ (..., m, m) of noise = L Lᵀ; nan where noise is not positive definite."""
-    m = noise.shape[-1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rows = _invert_lower(*_cholesky([[noise[..., i, j] for j in range(i + 1)] for i in range(m)]))
-    found = np.zeros_like(noise)
-    for i, row in enumerate(rows):
-        for j, value in enumerate(row):
-            found[..., i, j] = value
-    return found
-
-
 def _forward(low: Elements, inverse_diagonal: Sequence[Array], b: Sequence[Array]) -> list[Array]:
     """Return L⁻¹ b."""
     y: list[Array] = []

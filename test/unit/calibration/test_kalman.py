@@ -138,13 +138,3 @@ def test_a_sample_that_must_not_be_used_changes_nothing_at_all(rng):
     np.testing.assert_array_equal(after.x, x)
     np.testing.assert_array_equal(after.p, p)
     assert not after.used.any()
-
-
-def test_noise_is_whitened_and_of_what_is_no_covariance_nothing_is_said():
-    root = np.random.default_rng(4).normal(size=(5, 3, 3))
-    noise = root @ root.swapaxes(1, 2) + 1e-3 * np.eye(3)
-    noise[2, 0, 0] = -1.0
-    white = kalman.whitening(noise)
-    good = np.isfinite(white).all(axis=(1, 2))
-    assert good.tolist() == [True, True, False, True, True]
-    np.testing.assert_allclose((white @ noise @ white.swapaxes(1, 2))[good], np.eye(3)[None].repeat(4, 0), atol=1e-9)
