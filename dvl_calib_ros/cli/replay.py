@@ -92,7 +92,10 @@ def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discove
 
     findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])
     known = {str(found) for found in replayed.findings}
-    warnings = [*discovery.doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
+    verification = replayed.result.verifications.get(replayed.result.selected)
+    answered = {each.sentence for each in verification.reasons} if verification is not None else set()
+    doubts = [each for each in discovery.doubts if each not in answered]
+    warnings = [*doubts, *(note for note in replayed.notes if note not in known), *map(str, findings)]
     named = common.options_given(arguments)
     commands = present.next_commands(replayed, arguments.bags, arguments.save, named, bool(findings))
     document = present.replayed(

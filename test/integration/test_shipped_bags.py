@@ -95,3 +95,10 @@ def test_the_demo_bag_holds_the_truth_within_four_standard_deviations():
     assert (np.abs(estimate.misalignment - truth) < 4 * estimate.std[:3]).all()
     drift = predicted_drift(MODELS[result.selected], result.estimate.velocity_covariance, Parameters())
     assert drift.both < 3.5, "m per km; slow errors of the reference leave as much after two minutes"
+
+
+def test_a_doubt_that_the_answer_states_is_not_a_warning_as_well(capsys):
+    assert main(["replay", str(ROOT / "bags" / "harbour_box"), "--gnss-topic", "none"]) == 0
+    seen = capsys.readouterr()
+    text = " ".join((seen.out + seen.err).split())
+    assert text.count("the sign of the DVL's z is not observable") == 1
