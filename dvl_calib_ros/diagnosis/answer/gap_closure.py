@@ -269,7 +269,8 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
 
     The residual is the noise, per sample: before and after share it, and their difference has the precision of the gap
     rather than of the noise. Three parts of it are not: what an unknown cause explains, what exceeds the fitted noise,
-    since it is slower, and what exceeds the reported noise by far. The part that the parameters have absorbed is added.
+    since it is slower, and what exceeds by far the reported noise and is not white. The part that the parameters have
+    absorbed is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
@@ -291,7 +292,10 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
         if excess > SETTINGS.noise_tolerance * error * float(usual[of_bin].mean()):
             systematic += excess
         energy = float(floor[at].sum(axis=1).mean())
-        most = np.inf if claimed is None else WORSE_THAN_CLAIMED**2 * float((claimed[recording] ** 2).sum())
+        most = np.inf
+        if claimed is not None:
+            white = float(np.nansum(high_frequency_variance(problem.sample_time[at], left[at])[0]))
+            most = max(WORSE_THAN_CLAIMED**2 * float((claimed[recording] ** 2).sum()), white)
         floor[at] *= max(0.0, min(energy - systematic, most)) / max(energy, 1e-300)
     floor[:, measured] += _error_variance(fit, np.arange(fit.columns.shape[2]))[problem.bin_of]
     return floor
