@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from command_line import fail, succeed
-from conftest import few
 from io_fixtures import run, write_bag
 from stacks import LEVER_ARM, TWIST, TWIST_STAMPED, Sample, Told, motion, true_mounting
 
@@ -259,16 +258,19 @@ def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_pat
     np.testing.assert_allclose(np.abs(found.parameters.mounting_rpy), (0.0, 0.0, math.pi), atol=1e-9)
 
 
+# A miss that is known: slow noise of 0.1 m/s in the body's axes, five times what a reference is expected to have
+MISSED = pytest.param(38456, marks=pytest.mark.xfail(reason="marginal, and yaw off by 3.7 σ", strict=True))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", few((25036, 32046, 38456), (32046,)))
+@pytest.mark.parametrize("seed", [25036, 32046, MISSED])
 def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path, seed):
     """By the model that takes it as known yaw was off by 1.9 degrees and claimed to 0.3: on a circle one looks like the
-    other. What the model that finds it says instead is in σ as well (32046: off by 1.1, claimed to 0.28; 38456: by
-    3.8, claimed to 0.70)."""
+    other. What the model that finds it says instead is in σ as well (32046: off by 1.1, claimed to 0.28)."""
     truth = write_survey(draw(seed), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     off = abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2])
-    assert off < (3.0 if run.verdict == "accept" else 3.5) * run.mounting.std_deg[2]
+    assert off < 3.0 * run.mounting.std_deg[2]
 
 
 @pytest.mark.slow
