@@ -41,7 +41,8 @@ def angular_velocities(time: Array, rotation_enu_from_body: Array) -> Array:
     attitudes = Rotation.from_matrix(rotation_enu_from_body)
     turned = (attitudes[:-1].inv() * attitudes[1:]).magnitude()
     step = np.diff(time)
-    cuts = np.flatnonzero((turned > FASTEST_RADPS * step) | (step > LONGEST_GAP_S)) + 1  # it would swing to infinity
+    # a curve across would swing to infinity
+    cuts = np.flatnonzero((turned > FASTEST_RADPS * step) | (step > LONGEST_GAP_S)) + 1
     for part in np.split(np.arange(len(time)), cuts):
         if len(part) > 1:
             rates[part] = RotationSpline(time[part], attitudes[part])(time[part], 1)

@@ -173,7 +173,7 @@ def dead_reckoned(
     known = np.isfinite(before.error[:, 0]) & np.isfinite(after.error[:, 0])
     on_a_map = bool(known.any() and (before.oriented & after.oriented)[known].all())
     use = np.flatnonzero(known)
-    step_s = _steps(recording.dvl.times[use])
+    step_s = integration_steps(recording.dvl.times[use])
     axes = slice(2, 4) if on_a_map else slice(0, 2)
     velocity = before.velocity[use, axes]
     along = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
@@ -256,8 +256,8 @@ def _followed(recording: ThinnedRecording, after: _Level, use: Index, p: Paramet
     return residual_trend(times, rotation, velocity, error, rates, interval_s, nominal)
 
 
-def _steps(times: Array) -> Array:
-    """Return the time (N,) s since the previous sample, 0 after a gap."""
+def integration_steps(times: Array) -> Array:
+    """Return the time (N,) s since the previous sample; 0 after a gap, and where a recording follows another."""
     interval = np.diff(times, prepend=times[:1])
     if len(interval) < 2:
         return np.zeros(len(times))

@@ -269,10 +269,8 @@ class JointFit:
         """Slow errors as estimated, the mean of their posterior; None before the first block."""
         if self._fitted is None or not self.has_data:
             return None
-        east, north, *_, heading = np.sqrt(self._fitted.weights @ self._slow.std**2).tolist()
-        return SlowNoise(
-            math.hypot(east, north) / math.sqrt(2.0), heading, float(self._fitted.weights @ self._slow.memory_s[:, 0])
-        )
+        horizontal, *_, heading = np.sqrt(self._fitted.weights @ self._slow.std**2).tolist()
+        return SlowNoise(horizontal, heading, float(self._fitted.weights @ self._slow.memory_s[:, 0]))
 
     def _by_day(self, state: GaussianState) -> list[GaussianState]:
         each = (self._of_day(number) for number in range(len(self._days)))

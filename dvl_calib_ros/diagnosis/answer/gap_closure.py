@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_over, ends_of_stretches
+from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_over, ends_of_stretches, integration_steps
 from ...calibration.numerics.frames import Array
 from ..fit.cross_validation import coloured_anew, fitted_without, folds_of, stretch_of, with_slow_noise
 from ..fit.gauss_newton import Fit, Fitter
@@ -180,9 +180,7 @@ def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
 def _drift(selection: EffectSelection, residuals: HeldOutResiduals) -> tuple[Drift, Drift] | None:
     """Return the drift of dead reckoning on one course with the errors before and after, None for a short track."""
     problem = selection.fitter.problem
-    interval = np.diff(problem.sample_time, prepend=problem.sample_time[0])
-    usual = float(np.median(interval))
-    step_s = np.where((interval < 0.0) | (interval > SETTINGS.max_gap_intervals * usual), 0.0, interval)
+    step_s = integration_steps(problem.sample_time)
     speed = problem.sampled(selection.fit.seen, lambda motion: motion.speed)[problem.bin_of]
     along = np.cumsum(speed * step_s)
     if along[-1] < SHORTEST_M:
