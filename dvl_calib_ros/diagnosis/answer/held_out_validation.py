@@ -9,54 +9,36 @@ import numpy as np
 from ...effects.base import Effect
 from ..fit.cross_validation import surprise_elsewhere
 from ..fit.gauss_newton import Fit
-from ..fit.selection_criteria import NuisanceFit, blocks_of, price, robust_p
+from ..fit.selection_criteria import NuisanceFit, blocks_of, robust_p
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
 from ..search.unexplained import (
     Unexplained,
-    is_of_group,
     matters,
     moved_by,
     unexplained,
 )
 from .gap_closure import Gap
 
-# Shares of the effects' deviance from which an unknown cause is tested for better prediction: unadjusted, and adjusted
-# by simulated recordings; share that inexact interpolation leaves
-TOLD_FROM, AS_MUCH, OF_INEXACT = 0.5, 0.8, 0.02
-# Tolerance for rounding in a bound on deviance
-ROUNDING = 1e-3
 
-
-def settled(selection: EffectSelection, n_tested: int) -> tuple[EffectSelection, Unexplained]:
+def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
     """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
 
-    Only effects below `SETTINGS.instead_of` are tested: a step in a bias resembles a drift except for its residual.
-    Better means more deviance for its price, or better prediction of held-out stretches: several effects jointly can
-    fit a stall in turns. A group of functions that contains the effects includes their cause, so only the former
-    criterion counts.
+    Better means better prediction of held-out stretches. Only effects below `SETTINGS.instead_of` are tested.
     """
     fitter, fit = selection.fitter, selection.fit
-    rest = unexplained(fitter, fit)
+    problem, rest = fitter.problem, unexplained(fitter, fit)
     best: tuple[float, EffectSelection, Unexplained] | None = None
     for out in _subsets(selection):
         reduced = selection.without({effect.name for effect in out})
-        drop = reduced.fit.deviance - fit.deviance
-        if drop > SETTINGS.instead_of:
+        if reduced.fit.deviance - fit.deviance > SETTINGS.instead_of:
             continue
-        lost = drop - sum(price(effect, n_tested, len(fit.seen)) for effect in out)
-        wanted = SETTINGS.indistinguishable + SETTINGS.instead_share * drop
-        other = unexplained(fitter, reduced.fit, asked=min(wanted + lost, TOLD_FROM * drop) - ROUNDING)
-        if not other.found:
+        other = unexplained(fitter, reduced.fit, asked=0.0)
+        if not other.found or not matters(problem, reduced.fit, other):
             continue
-        gain = (other.clear_energy - other.price) - lost - wanted
-        if other.clear_energy > AS_MUCH * drop and not is_of_group(fitter.problem, fit, out, other.about):
-            better = _better_elsewhere(fitter.problem, fit, reduced.fit, other)
-            gain = max(gain, better - SETTINGS.indistinguishable - OF_INEXACT * drop)
-        if gain < 0.0 or not matters(fitter.problem, reduced.fit, other):
-            continue
-        if best is None or gain > best[0]:
+        gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable
+        if gain > 0.0 and (best is None or gain > best[0]):
             best = gain, reduced, other
     return _sure_beside(*((selection, rest) if best is None else best[1:]))
 

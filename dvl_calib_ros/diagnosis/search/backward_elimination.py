@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import cache, partial
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -24,13 +23,8 @@ from ..fit.selection_criteria import (
 )
 from ..model.hypothesis import Hypothesis, is_time_of_run
 from ..model.settings import SETTINGS
-from .arm_clock_ambiguity import DVL_CLOCK, LAG, TWO_CLOCKS, lag_not_taken_back
 from .candidates import KEPT_VARIANTS
 from .clock_jumps import LEAP, gaps, is_in_stamps
-from .unexplained import Unexplained, unexplained
-
-# A constant delay explaining less than this share of two clock jumps that cancel is rejected
-LITTLE_OF_LEAPS = 0.02
 
 
 def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
@@ -38,83 +32,19 @@ def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     threshold = float(np.log(SETTINGS.level / n_effects))
     while fit.effects:
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
-        explained = base.deviance - fit.deviance
+        least = SETTINGS.ghost_share * (base.deviance - fit.deviance)
         rests = [(effect, fit_without(fitter, fit, effect)) for effect in fit.effects]
-        drops = {effect.name: rest.deviance - fit.deviance for effect, rest in rests}
-        left = cache(partial(unexplained, fitter, fit))
         weak = [
             rest
             for effect, rest in rests
             if log_p_in_place(fitter, fit, rest, effect) > threshold
-            or is_taken_back(fitter, fit, effect.name, drops[effect.name], rest)
-            or _makes_leaps_cancel(fit, effect, drops)
-            or _only_smooths(fitter, fit, rest, effect, drops)
-            or (
-                _is_ghost(effect, drops[effect.name], explained, fit.deviance)
-                and not _is_late_before_a_leap(fit, effect)
-                and not _is_all_that_is_left(fitter, rest, left)
-            )
+            or is_taken_back(fitter, fit, effect.name)
+            or rest.deviance - fit.deviance < least
         ]
         if not weak:
             return fit
         fit = min(weak, key=lambda each: each.deviance)
     return fit
-
-
-def _makes_leaps_cancel(fit: Fit, effect: Effect, drops: Mapping[str, float]) -> bool:
-    """Return whether an effect is a constant DVL delay that only makes two clock jumps cancel.
-
-    drops: deviance that each effect explains, by name.
-    """
-    if effect.name != DVL_CLOCK or LEAP not in fit.values or apart_and_undone(fit, LEAP)[1] > TAKEN_BACK_EXACTLY:
-        return False
-    return drops[DVL_CLOCK] < LITTLE_OF_LEAPS * drops[LEAP]
-
-
-def _only_smooths(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect, drops: Mapping[str, float]) -> bool:
-    """Return whether an effect is a lag cancelled by clock offsets that explains no more than smoothing does.
-
-    Both together leave the motion unchanged except at corners and reduce DVL noise. The noise of a slow DVL is known
-    only by its claims, which may be too small by its roughness. If a clock is delayed without the lag as well (rest:
-    that fit), and explains more than the lag, only its change counts. drops: as for `_makes_leaps_cancel`.
-    """
-    if effect.name != LAG:
-        return False
-    is_late_itself = max((drops[name] for name in TWO_CLOCKS if name in drops), default=0.0) > drops[LAG]
-    if lag_not_taken_back(fit, rest if is_late_itself else None) >= TAKEN_BACK:
-        return False
-    smoothed = [float(each.own_noise @ each.own_noise) for each in (rest, fit)]
-    more = (smoothed[0] - smoothed[1]) * (fitter.problem.rougher_than_claimed**2 - 1.0)
-    return rest.deviance - fit.deviance - more < MUCH
-
-
-def _is_ghost(effect: Effect, drop: float, explained: float, left: float) -> bool:
-    """Return whether an effect explains a negligible share of the whole; if it bends the arm, also of the noise."""
-    if drop > SETTINGS.ghost_share * explained:
-        return False
-    return not effect.bends_arm or drop < SETTINGS.ghost_of_noise * left
-
-
-def _is_all_that_is_left(fitter: Fitter, rest: Fit, left: Callable[[], Unexplained]) -> bool:
-    """Return whether the removed effect explains all of the residual. rest: fit without it; left: residual with it.
-
-    The residual of an inexact strong effect has another shape: a further effect explains part of it at most.
-    """
-    return unexplained(fitter, rest).found and not left().found
-
-
-def _is_late_before_a_leap(fit: Fit, effect: Effect) -> bool:
-    """Return whether an effect is a constant DVL delay too large to be part of the clock jump after it.
-
-    It acts only before the jump, so it may explain a small share of the whole.
-    """
-    if effect.name != DVL_CLOCK or LEAP not in fit.values:
-        return False
-    late, leap = fit.values[effect.name], fit.values[LEAP]
-    return any(
-        abs(own["seconds"]) > TAKEN_BACK * max(abs(each["seconds"]), abs(each.get("again_seconds", 0.0)))
-        for own, each in zip(late, leap, strict=True)
-    )
 
 
 def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
@@ -164,8 +94,6 @@ def once_where_confirmed(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], 
 CLEAR = 6.0
 # An effect reversed to within this share, or after one grid step, may be any temporary cause
 TAKEN_BACK = 0.25
-# Share within which a reversal is exact; deviance below which a reversed effect is rejected
-TAKEN_BACK_EXACTLY, MUCH = 0.05, 150.0
 
 
 def repeated_effects(
@@ -191,7 +119,7 @@ def repeated_effects(
             limit = best.deviance + once - twice
             starts = _a_second_time(fitter, best, whole, limit)
         tried = [fitter.fit(start, best.noise) for start in starts]
-        found += [fit for fit in tried if not is_taken_back(fitter, fit, name, best.deviance - fit.deviance)]
+        found += [fit for fit in tried if not is_taken_back(fitter, fit, name)]
     return found
 
 
@@ -242,24 +170,15 @@ def either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] |
     return starts
 
 
-def is_taken_back(fitter: Fitter, fit: Fit, name: str, drop: float, rest: Fit | None = None) -> bool:
+def is_taken_back(fitter: Fitter, fit: Fit, name: str) -> bool:
     """Return whether a second occurrence reverses the first in each recording, or follows immediately.
 
-    drop: deviance that the effect explains. A large reversed effect is rejected if an unknown cause explains more
-    without it (rest). Above `SETTINGS.instead_of` only an exact reversal is tested. A clock jump that the stamps
-    confirm is kept.
+    Any temporary cause resembles that. A clock jump that the stamps confirm is kept.
     """
     apart, share = apart_and_undone(fit, name)
     if apart < step_of_times(fitter.problem):
         return True
-    if share >= TAKEN_BACK or (name == LEAP and is_in_stamps(fitter, fit)):
-        return False
-    if drop < MUCH:
-        return True
-    if rest is None or (drop > SETTINGS.instead_of and share >= TAKEN_BACK_EXACTLY):
-        return False
-    other = unexplained(fitter, rest)
-    return other.clear_energy - other.price > drop
+    return share < TAKEN_BACK and not (name == LEAP and is_in_stamps(fitter, fit))
 
 
 def apart_and_undone(fit: Fit, name: str) -> tuple[float, float]:

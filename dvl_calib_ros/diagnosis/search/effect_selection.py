@@ -146,7 +146,7 @@ def select(
         candidates = [*proposed(fitter, fit, effects), *with_two_cycles(fitter, fit, heading)]
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
         leapt = [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
-        fits += [each for each in leapt if not is_taken_back(fitter, each, LEAP, fit.deviance - each.deviance)]
+        fits += [each for each in leapt if not is_taken_back(fitter, each, LEAP)]
         fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
         for hypothesis in intermittent_effects(fitter, fit, effects):
