@@ -169,8 +169,7 @@ class Effect(AnyEffect, ABC):
 
     remedy: what to do about it, as part of a sentence. manoeuvre: motion that makes it observable and distinguishes it
     from confounded effects. of_the_day: whether its size differs per recording; else it belongs to the vehicle.
-    relative_to_first: whether it is a change from the first of several recordings. bends_arm: whether a small omitted
-    size changes the lever arm by decimetres, as a delay does with an arm of metres. again: parameters of a second
+    relative_to_first: whether it is a change from the first of several recordings. again: parameters of a second
     occurrence, searched after a first was found -> those of the first. rarer: parameters searched only if several
     recordings need them. of_velocity: whether the trace depends on the velocity of the motion.
     """
@@ -179,7 +178,6 @@ class Effect(AnyEffect, ABC):
     manoeuvre: ClassVar[str]
     of_the_day: ClassVar[bool] = False
     relative_to_first: ClassVar[bool] = False
-    bends_arm: ClassVar[bool] = False
     again: ClassVar[Mapping[str, str]] = {}
     rarer: ClassVar[frozenset[str]] = frozenset()
     of_velocity: ClassVar[bool] = True
@@ -257,7 +255,6 @@ class ClockEffect(Effect):
     """A systematic effect on the stamps of one stream."""
 
     of_the_day = True
-    bends_arm = True
 
     @abstractmethod
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:

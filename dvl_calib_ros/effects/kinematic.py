@@ -20,7 +20,6 @@ class LeverArm(Effect):
     parameters = along_axes("m", "m", 0.3, 20.0, "position of the DVL relative to the reference point, body axis {}")
     acts_on = ActsOn.MOTION
     needs = frozenset({EffectNeeds.ANGULAR_VELOCITY})
-    bends_arm = True
     of_velocity = False
     confounded_with = ("sideslip", "reference_time_offset", "reference_lag")
 

@@ -155,7 +155,6 @@ class ReferenceLag(EffectWithMemory):
         ),
     )
     acts_on = ActsOn.REFERENCE
-    bends_arm = True
     confounded_with = ("reference_time_offset", "dvl_time_offset", "sideslip", "lever_arm")
 
     def filtered(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:

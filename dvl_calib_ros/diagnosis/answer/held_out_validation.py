@@ -15,6 +15,7 @@ from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
 from ..search.unexplained import (
     Unexplained,
+    is_of_group,
     matters,
     moved_by,
     unexplained,
@@ -25,7 +26,8 @@ from .gap_closure import Gap
 def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
     """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
 
-    Better means better prediction of held-out stretches. Only effects below `SETTINGS.instead_of` are tested.
+    Better means better prediction of held-out stretches. A group of functions that contains the effects includes their
+    cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
     """
     fitter, fit = selection.fitter, selection.fit
     problem, rest = fitter.problem, unexplained(fitter, fit)
@@ -35,7 +37,7 @@ def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
         if reduced.fit.deviance - fit.deviance > SETTINGS.instead_of:
             continue
         other = unexplained(fitter, reduced.fit, asked=0.0)
-        if not other.found or not matters(problem, reduced.fit, other):
+        if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
             continue
         gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable
         if gain > 0.0 and (best is None or gain > best[0]):

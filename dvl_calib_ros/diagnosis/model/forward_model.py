@@ -213,12 +213,6 @@ class Problem:
         dvl = max(one.dvl.tails for one in self.recordings)
         return (dvl, max(one.reference.tails for one in self.recordings))[: len(self.shaken)]
 
-    @property
-    def rougher_than_claimed(self) -> float:
-        """Return the ratio of the DVL's roughness, the upper bound of its noise, to its simulated noise."""
-        each = [(one.dvl.roughness, one.dvl.noise) for one in self.recordings]
-        return max(float((rough / np.maximum(noise, 1e-12)).max()) for rough, noise in each)
-
     # ------------------------------------------------------------------ the model
 
     def seen(self, hypothesis: Hypothesis, recording: int, at: Array | None = None) -> Seen:

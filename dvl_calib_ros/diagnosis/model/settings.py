@@ -19,17 +19,16 @@ class DiagnosisSettings:
     in number. max_points: number of samples of a stream; longer recordings are averaged.
 
     Finding: level: family-wise, of any effect. max_effects: largest number of effects. ghost_share: least share of the
-    explained deviance that a further effect adds. Less may be the residual of an inexact strong effect. Exceptions: the
-    effect explains all of the residual; an arm, a clock or a lag adds more than ghost_of_noise of the noise's deviance.
+    explained deviance that a further effect adds. Less may be the residual of an inexact strong effect.
     indistinguishable: deviance within which two explanations are equivalent: for a rival better by d, the odds are
     those of a normal variable beyond √d. robust_level: p of an effect from the scatter of blocks, valid for noise of
     any colour.
 
     Judging: block, folds: of hold-out. noise_tolerance: standard errors by which the noise of all frequencies may
     exceed the high ones. instead_of: deviance up to which an unknown cause may replace effects; a larger unknown cause
-    would be significant without a test, and interpolation leaves more than noise of it. instead_share: relative
-    deviance by which the unknown cause must be better. prior_angle, prior_scale: standard deviation of misalignment and
-    scale. They hold insignificant parameters (roll, scale of sway), which would absorb a lever arm.
+    would be significant without a test, and interpolation leaves more than noise of it. prior_angle, prior_scale:
+    standard deviation of misalignment and scale. They hold insignificant parameters (roll, scale of sway), which would
+    absorb a lever arm.
     """
 
     max_stream_rate: float = 10.0
@@ -45,14 +44,12 @@ class DiagnosisSettings:
     level: float = 0.008
     max_effects: int = 4
     ghost_share: float = 0.0008
-    ghost_of_noise: float = 0.25
     indistinguishable: float = 6.0
     robust_level: float = 0.0005
     block: float = 20.0
     folds: int = 5
     noise_tolerance: float = 3.0
     instead_of: float = 1500.0
-    instead_share: float = 0.15
     prior_angle: float = 0.1
     prior_scale: float = 0.02
 

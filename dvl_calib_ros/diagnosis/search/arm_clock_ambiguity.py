@@ -72,21 +72,6 @@ def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, t
     ]
 
 
-def lag_not_taken_back(fit: Fit, rest: Fit | None = None) -> float:
-    """Return the relative sum of a reference's lag and delay, the maximum of recordings; zero if both cancel. rest: fit
-    whose delay is the origin."""
-    lag = np.array([each["time_constant_s"] for each in fit.values[LAG]])
-    late = _late_beside_dvl(fit) - (0.0 if rest is None else _late_beside_dvl(rest))
-    return float((np.abs(lag + late) / np.maximum(np.maximum(lag, np.abs(late)), 1e-9)).max())
-
-
-def _late_beside_dvl(fit: Fit) -> Array:
-    """Return the delay of the reference's stamps relative to the DVL's, s, per recording."""
-    of_none = ({"seconds": 0.0},) * len(fit.seen)
-    dvl, reference = ([each["seconds"] for each in fit.values.get(name, of_none)] for name in TWO_CLOCKS)
-    return np.subtract(reference, dvl)
-
-
 def is_open(guesses: Sequence[FirstGuess]) -> bool:
     """Return whether registration leaves lever arm and clock ambiguous."""
     return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)
