@@ -15,6 +15,7 @@ from ..model.forward_model import Problem
 from ..model.stream_curve import segments_of
 from ..search.alternative_regressors import FADES_S, faded
 from ..search.effect_selection import EffectSelection
+from ..search.event_scan import EVENTS
 from ..search.unexplained import Unexplained
 from .gap_closure import HeldOutResiduals
 from .gap_location import regimes
@@ -204,7 +205,7 @@ def _of_motion(motion: EffectInput, about: str) -> dict[str, Array]:
         return {"acceleration ahead, m/s²": np.gradient(velocity[:, 0], motion.time)}
     if about == "sway and heave":
         return {"velocity to port, m/s": velocity[:, 1], "velocity up, m/s": velocity[:, 2]}
-    if about in ("time", "a step in time"):
+    if about in ("time", *EVENTS):
         return {"time, s": motion.time}
     if rotation is not None and about == "heading":
         return {"yaw, ° from east to north": np.degrees(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))}

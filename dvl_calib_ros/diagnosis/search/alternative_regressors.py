@@ -14,13 +14,12 @@ from ..model.time_grid import Grid
 
 TIME_KNOTS = 7
 SPEED_KNOTS = 7
-STEPS = 11
 # Time constants, s, with which the effect of a turn decays
 FADES_S = (4.0, 12.0, 40.0)
 # rad/s; threshold of a turn, whose side may act until the next
 TURNING_RADPS = float(np.deg2rad(2.0))
 # Groups tested in parts of this many functions: one, or a cosine and its sine
-ALTERNATIVES = {"a step in time": 1, "a band of speeds": 1, "turns before": 1, "heading": 2}
+ALTERNATIVES = {"a band of speeds": 1, "turns before": 1, "heading": 2}
 HEADING_HARMONICS = 4
 
 
@@ -45,7 +44,6 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
         "acceleration": np.column_stack([acceleration, np.abs(acceleration)]),
         "sway and heave": np.column_stack([velocity[:, 1:], np.abs(velocity[:, 1:])]),
         "time": np.column_stack([hats, hats * s[:, None]]),
-        "a step in time": _steps(motion.time, STEPS),
     }
     if motion.rotation_enu_from_body is not None:
         rotation = motion.rotation_enu_from_body
@@ -70,12 +68,6 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
 
 def _spread(speed: Array) -> float:
     return max(float(np.quantile(speed, 0.99) - np.quantile(speed, 0.01)), 1e-3)
-
-
-def _steps(time: Array, count: int) -> Array:
-    """Return (N, count) step functions from zero to one at equal intervals."""
-    at = np.linspace(time[0], time[-1], count + 2)[1:-1]
-    return (time[:, None] >= at).astype(float)
 
 
 def faded(time: Array, values: Array, seconds: float) -> Array:

@@ -26,6 +26,7 @@ from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..noise.noise_model import Noise
 from .alternative_regressors import ALTERNATIVES, dictionary
+from .event_scan import events
 
 LEVEL = 0.001
 # Spectral lines: longer than wave periods; more periods than the time dictionary resolves
@@ -36,7 +37,7 @@ STEPS_OF_A_BIN = 16
 OUTLYING = 5.0
 # Simulated recordings for the null distribution, and degrees of freedom of the prior on its scale of 1
 MADE_UP, PRIOR_DOF = 12, 4.0
-# Among candidates within this log p of the best (a factor of 400), the simplest is named: a step in time rather than
+# Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
 # fifteen functions of the turn rate.
 AS_LIKELY = 6.0
 # A column belongs to a group whose functions leave less than this share of its squares
@@ -107,8 +108,11 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
             if name != "time":
                 drop, rank = alone.lowered_by(_coloured_anew(noise, beside, columns, fit.residual))
                 recoloured.append(FollowTest(name, np.arange(columns.shape[2]), True, drop, rank))
+    happened = events(problem, fit, basis, white) if asked == -np.inf else []
+    happened = [replace(each, gain=holds_out(problem, fit, each.columns)) for each in happened]
     looked_at = float(np.log(tested))
     nominal = [
+        *(each.log_p for each in happened),
         *(look.log_p() for look in looks),
         *(line.log_p for line in followed),
         *(each.log_p() for each in recoloured),
@@ -120,6 +124,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     tests: list[tuple[float, str | float, Array]]
     tests = [(look.log_p(by), look.name, raw[look.name][:, :, look.at]) for look, by in zip(looks, grown, strict=True)]
     tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
+    tests += [(each.log_p, each.about, each.columns) for each in happened]
     recoloured = [replace(each, energy=each.energy / of_group[each.name]) for each in recoloured]
     others: list[tuple[float, str | float, Array]] = []
     for number, each in enumerate(recoloured):
@@ -138,6 +143,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     clearest = noise.whiten(best[2])
+    tested = next((tested + each.tried for each in happened if each.about == best[1]), tested)
     held_against = (basis[: left.size, :0], clearest, left)
     if not isinstance(best[1], float):
         held_against = (basis, clearest, white)
@@ -275,13 +281,13 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
 
 def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
     """Return whether the regressor of the residual predicts held-out data better than slow noise and chance do."""
-    return rest.found and holds_out(problem, fit, rest) > rest.price - rest.clearest.shape[2]
+    return rest.found and holds_out(problem, fit, rest.clearest) > rest.price - rest.clearest.shape[2]
 
 
-def holds_out(problem: Problem, fit: Fit, rest: Unexplained) -> float:
-    """Return the held-out deviance gain of the most significant columns."""
+def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
+    """Return the held-out deviance gain of columns (M, A, c) beside a fit's."""
     known = NuisanceFit.of_fit(problem, fit)
-    both = known.and_rest(rest.clearest, fit.residual)
+    both = known.and_rest(columns, fit.residual)
     return predictive_gain(problem, fit.noise, (known, fit.residual), (both, fit.residual))
 
 
