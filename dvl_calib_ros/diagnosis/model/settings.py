@@ -18,11 +18,9 @@ class DiagnosisSettings:
     errors near its Nyquist frequency do not resemble a delay. Bins are at least shortest_bin long and at most max_bins
     in number. max_points: number of samples of a stream; longer recordings are averaged.
 
-    Finding: level: family-wise, of any effect. max_effects: largest number of effects. ghost_share: least share of the
-    explained deviance that a further effect adds. Less may be the residual of an inexact strong effect.
-    indistinguishable: deviance within which two explanations are equivalent: for a rival better by d, the odds are
-    those of a normal variable beyond √d. robust_level: p of an effect from the scatter of blocks, valid for noise of
-    any colour.
+    Finding: level: family-wise, of any effect. max_effects: largest number of effects. indistinguishable: deviance
+    within which two explanations are equivalent: for a rival better by d, the odds are those of a normal variable
+    beyond √d. robust_level: p of an effect from the scatter of blocks, valid for noise of any colour.
 
     Judging: block, folds: of hold-out. noise_tolerance: standard errors by which the noise of all frequencies may
     exceed the high ones. instead_of: deviance up to which an unknown cause may replace effects; a larger unknown cause
@@ -43,7 +41,6 @@ class DiagnosisSettings:
     min_seconds: float = 60.0
     level: float = 0.008
     max_effects: int = 4
-    ghost_share: float = 0.0008
     indistinguishable: float = 6.0
     robust_level: float = 0.0005
     block: float = 20.0

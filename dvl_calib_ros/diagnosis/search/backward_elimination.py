@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -13,34 +13,24 @@ from ..fit.selection_criteria import (
     WINDOW_STEPS,
     best_of,
     blocks_of,
-    finer_steps,
     fit_without,
     log_p_in_place,
     price,
     robust_p,
-    step_of_times,
     times_tried,
 )
 from ..model.hypothesis import Hypothesis, is_time_of_run
 from ..model.settings import SETTINGS
 from .candidates import KEPT_VARIANTS
-from .clock_jumps import LEAP, gaps, is_in_stamps
+from .clock_jumps import LEAP, gaps
 
 
 def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
-    """Return a fit without effects that are insignificant given the others, or negligible next to a strong one."""
+    """Return a fit without effects that are insignificant given the others."""
     threshold = float(np.log(SETTINGS.level / n_effects))
     while fit.effects:
-        base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
-        least = SETTINGS.ghost_share * (base.deviance - fit.deviance)
         rests = [(effect, fit_without(fitter, fit, effect)) for effect in fit.effects]
-        weak = [
-            rest
-            for effect, rest in rests
-            if log_p_in_place(fitter, fit, rest, effect) > threshold
-            or is_taken_back(fitter, fit, effect.name)
-            or rest.deviance - fit.deviance < least
-        ]
+        weak = [rest for effect, rest in rests if log_p_in_place(fitter, fit, rest, effect) > threshold]
         if not weak:
             return fit
         fit = min(weak, key=lambda each: each.deviance)
@@ -72,28 +62,8 @@ def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
-def once_where_confirmed(fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]) -> Fit:
-    """Return a fit with one occurrence of a repeated effect if blocks do not confirm the other."""
-    block = blocks_of(fitter.problem)
-    for effect in fit.effects:
-        own = {spec.name for spec in effect.parameters}
-        if not effect.again or not effect.again.keys() <= own:
-            continue
-        doubtful = {
-            each.spec.name
-            for each in fit.hypothesis.parameters_of(effect)
-            if robust_p(fit, effect, block, each.spec.name) >= SETTINGS.robust_level
-        }
-        starts = either_alone(fit, effects[effect.name], every[effect.name], clear=own - doubtful)
-        found = [fitter.refined(fitter.fit(start, fit.noise), finer_steps(fitter.problem)) for start in starts]
-        return min(found, key=lambda each: each.deviance, default=fit)
-    return fit
-
-
 # Standard deviations from which a second occurrence is kept without a trial
 CLEAR = 6.0
-# An effect reversed to within this share, or after one grid step, may be any temporary cause
-TAKEN_BACK = 0.25
 
 
 def repeated_effects(
@@ -118,8 +88,7 @@ def repeated_effects(
             once, twice = (price(each, len(effects), n, times_tried(each)) for each in (effects[name], whole))
             limit = best.deviance + once - twice
             starts = _a_second_time(fitter, best, whole, limit)
-        tried = [fitter.fit(start, best.noise) for start in starts]
-        found += [fit for fit in tried if not is_taken_back(fitter, fit, name)]
+        found += [fitter.fit(start, best.noise) for start in starts]
     return found
 
 
@@ -147,18 +116,14 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
     return [start for _, start in sorted(tried, key=lambda each: each[0])[:KEPT_VARIANTS]]
 
 
-def either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] | None = None) -> list[Hypothesis]:
-    """Return starts with the first or the second occurrence alone, if the other is insignificant.
-
-    clear: names of significant parameters; by default larger than `CLEAR` standard deviations.
-    """
-    if clear is None:
-        std = np.sqrt(np.diag(fit.system.covariance()))
-        clear = {
-            each.spec.name
-            for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
-            if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > CLEAR * own
-        }
+def either_alone(fit: Fit, once: Effect, whole: Effect) -> list[Hypothesis]:
+    """Return starts with the first or the second occurrence alone, if the other is within `CLEAR` σ of zero."""
+    std = np.sqrt(np.diag(fit.system.covariance()))
+    clear = {
+        each.spec.name
+        for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
+        if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > CLEAR * own
+    }
     clear = {name for name in clear if not any(is_time_of_run(s) for s in whole.parameters if s.name == name)}
     others = [effect for effect in fit.effects if effect.name != whole.name]
     back = {first: second for second, first in whole.again.items()}
@@ -168,31 +133,3 @@ def either_alone(fit: Fit, once: Effect, whole: Effect, clear: Collection[str] |
             values = tuple({first: each[name] for first, name in kept.items()} for each in fit.values[whole.name])
             starts.append(fit.hypothesis.with_effects([*others, once], len(values), {whole.name: values}))
     return starts
-
-
-def is_taken_back(fitter: Fitter, fit: Fit, name: str) -> bool:
-    """Return whether a second occurrence reverses the first in each recording, or follows immediately.
-
-    Any temporary cause resembles that. A clock jump that the stamps confirm is kept.
-    """
-    apart, share = apart_and_undone(fit, name)
-    if apart < step_of_times(fitter.problem):
-        return True
-    return share < TAKEN_BACK and not (name == LEAP and is_in_stamps(fitter, fit))
-
-
-def apart_and_undone(fit: Fit, name: str) -> tuple[float, float]:
-    """Return interval (s) and share not reversed of two occurrences (maxima of recordings; infinite for one)."""
-    effect = next(each for each in fit.effects if each.name == name)
-    own = {spec.name: spec for spec in effect.parameters}
-    if not effect.again or not effect.again.keys() <= own.keys():
-        return np.inf, np.inf
-    apart, share = [], []
-    for second, first in effect.again.items():
-        for values in fit.values[name]:
-            if is_time_of_run(own[second]):
-                apart.append(values[second] - values[first])
-            else:
-                largest = max(abs(values[first]), abs(values[second]), 1e-12)
-                share.append(abs(values[first] + values[second]) / largest)
-    return max(apart), max(share)

@@ -106,42 +106,6 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     return found
 
 
-def jumps_in_stamps(
-    fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]
-) -> list[Hypothesis]:
-    """Return hypotheses with one or two clock jumps at gaps in the stamps, sized by the motion in each part.
-
-    Empty if the fit has as many jumps already. once, every: effects with one and with two jumps. A jump that explains
-    little would be taken for slow noise, so it is found only by this search.
-    """
-    if len(fit.seen) > 1 or LEAP not in once:
-        return []
-    rest = [effect for effect in fit.effects if effect.name not in STANDS_IN]
-    stamped = replace(fit, hypothesis=fit.hypothesis.with_effects(rest, 1, {}))
-    usual = float(np.median(np.diff(fitter.problem.recordings[0].dvl.time)))
-    shown = [each for each in gaps(fitter, stamped) if _is_shifted(each[1], usual)][:LEAPS]
-    own = fit.values.get(LEAP, ())
-    n_own = sum(np.isfinite(each.get(at_s, np.inf)) for each in own for at_s in ("at_s", "again_at_s"))
-    if n_own >= min(len(shown), 2):
-        return []
-    squares, ends = _squares(fitter, fit, rest, every[DVL_CLOCK])
-    found = []
-    for leapt in (each for n in (1, 2) for each in itertools.combinations(sorted(shown), n)):
-        stamps, by = zip(*leapt, strict=True)
-        edges = [0, *np.searchsorted(fitter.problem.time[np.maximum(ends - 1, 0)], stamps), len(ends)]
-        if min(np.diff(edges)) < FEWEST_PARTS:
-            continue
-        late = [float(DELAYS[squares[:, a:b].sum(axis=1).argmin()]) for a, b in itertools.pairwise(edges)]
-        steps = np.diff(late).tolist()
-        if not all(map(_is_as_large, steps, by)):
-            continue
-        values = {"seconds": steps[0], "at_s": stamps[0] - late[0]}
-        if len(leapt) > 1:
-            values |= {"again_seconds": steps[1], "again_at_s": stamps[1] - late[1]}
-        found += _hypotheses(fit, rest, once, every[LEAP] if len(leapt) > 1 else once[LEAP], values, late[0])
-    return found
-
-
 def _is_shifted(gap: float, usual: float) -> bool:
     """Return whether a gap is a clock jump: negative or not a whole number of steps, unlike lost samples."""
     return gap < 0.0 or OF_A_STEP < (gap / usual) % 1.0 < 1.0 - OF_A_STEP
@@ -189,15 +153,6 @@ def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, f
         if _is_shifted(gap, usual) and _is_as_large(by, gap) and abs(value - at) < max(usual, AS_LARGE_S):
             return value, min(value, at) - usual, max(value, at) + usual
     return None
-
-
-def is_in_stamps(fitter: Fitter, fit: Fit) -> bool:
-    """Return whether the DVL's stamps of one recording confirm a clock jump of a fit near it."""
-    if len(fit.seen) > 1 or LEAP not in fit.values:
-        return False
-    beside = in_gaps(fitter, fit)
-    times = [name for name in ("at_s", "again_at_s") if np.isfinite(beside.values[LEAP][0].get(name, np.inf))]
-    return any(time_by_stamps(fitter, beside, name) is not None for name in times)
 
 
 def _hypotheses(

@@ -28,7 +28,7 @@ from ...calibration.numerics.samples import VelocityFrame
 from ...effects.base import ActsOn, Effect
 from ...effects.composition import late
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.selection_criteria import best_of, criterion, finer_steps, price_of_a_time
+from ..fit.selection_criteria import best_of, finer_steps, price_of_a_time
 from ..model.forward_model import Problem, make_problem
 from ..model.hypothesis import Hypothesis, Values, is_time_of_run, no_effect
 from ..model.recorded_streams import RecordedStreams
@@ -40,17 +40,14 @@ from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .arm_clock_ambiguity import ARM, TWO_CLOCKS, OpenArm, guessed_arm
 from .backward_elimination import (
     eliminate,
-    is_taken_back,
-    once_where_confirmed,
     only_predictive,
     repeated_effects,
 )
 from .candidates import by_other_clocks, intermittent_effects, jumps_at_start, proposed, variants_about
-from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, jumps_in_stamps, leaping
+from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, leaping
 from .identifiability import Selected, identify_effects
 from .initial_guess import FirstGuess, first_guess, guess_beside
 from .observable_parameters import observable_parts, unobservable_parts, without_insignificant
-from .unexplained import unexplained
 
 # The most common causes of a gap; the first fit includes all of them.
 START = (ARM, "dvl_time_offset", "reference_time_offset")
@@ -145,8 +142,7 @@ def select(
     for _ in range(ROUNDS):
         candidates = [*proposed(fitter, fit, effects), *with_two_cycles(fitter, fit, heading)]
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
-        leapt = [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
-        fits += [each for each in leapt if not is_taken_back(fitter, each, LEAP)]
+        fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
         fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
         for hypothesis in intermittent_effects(fitter, fit, effects):
@@ -156,13 +152,12 @@ def select(
         best = fitter.refined_as_white(fitter.refined(best_of(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
         best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))
         best = eliminate(fitter, best, len(effects))
-        fitter, fit = _leapt_where_stamps_say_so(*_about(fitter, best, every), every, effects)
+        fitter, fit = _about(fitter, best, every)
         names = frozenset(effect.name for effect in fit.effects)
         if names in seen_before:
             break
         seen_before.add(names)
     fit = only_predictive(fitter, eliminate(fitter, fit, len(effects)), len(effects))
-    fit = in_gaps(fitter, once_where_confirmed(fitter, fit, every, effects))
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
     fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
@@ -257,22 +252,6 @@ def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Arra
     return np.asarray(columns @ system.solution_without(of_noise)), ridge
 
 
-def _leapt_where_stamps_say_so(
-    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
-) -> tuple[Fitter, Fit]:
-    """Return a fit, or the same with the clock jumps in the stamps, by likelihood.
-
-    Each has its own noise: under the noise about a fit without it, the residual of a jump is noise.
-    """
-    fits = [fitter.fit(hypothesis, fit.noise) for hypothesis in jumps_in_stamps(fitter, fit, effects, every)]
-    if not fits:
-        return fitter, fit
-    leapt = _about(fitter, best_of(fits, effects), every)
-    likely, other = (each.noise.deviance(each.residual) for each in (leapt[1], fit))
-    prices = [criterion(each, len(effects)) - each.deviance for each in (leapt[1], fit)]
-    return leapt if likely + prices[0] < other + prices[1] else (fitter, fit)
-
-
 def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
     """Return a fit with two clocks, or a better one with one clock: candidates were combined with two only."""
     if not set(TWO_CLOCKS) <= set(fit.values) and not jumps_at_start(fitter, fit):
@@ -298,30 +277,7 @@ def _with_what_is_shown_of_the_arm(
         values = tuple(dict(each) for each in fit.values[ARM])  # unobservable parts are held at their values
         hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
         fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
-    whole = _with_all_of_the_arm(fitter, fit, every, effects)
-    return (fitter, fit, effects) if whole is None else (*whole, {**effects, ARM: every[ARM]})
-
-
-def _with_all_of_the_arm(
-    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
-) -> tuple[Fitter, Fit] | None:
-    """Return a fit with the whole lever arm and its own noise, if unobservable parts explain the residual.
-
-    Return None otherwise. every: effects with all parameters; effects: with the observable ones.
-    """
-    if ARM not in fit.values or effects[ARM].parameters == every[ARM].parameters or not unexplained(fitter, fit).found:
-        return None
-    values = tuple(every[ARM].defaults | dict(each) for each in fit.values[ARM])
-    others = [effect for effect in fit.effects if effect.name != ARM]
-    hypothesis = fit.hypothesis.with_effects([*others, every[ARM]], len(fit.seen), {ARM: values})
-    whole = fitter.fit(hypothesis, fit.noise)
-    if (
-        criterion(whole, len(every)) >= criterion(fit, len(every))
-        or without_insignificant(fitter.problem, whole) is not None
-    ):
-        return None
-    about = _about(fitter, whole, every)
-    return None if unexplained(*about).found else about
+    return fitter, fit, effects
 
 
 __all__ = ["EffectSelection", "Selected", "select"]

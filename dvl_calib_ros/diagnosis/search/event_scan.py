@@ -8,37 +8,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...calibration.numerics.distributions import chi2_logsf
 from ...calibration.numerics.frames import Array
 from ..fit.gauss_newton import Fit
 from ..model.forward_model import Problem
+from ..model.hypothesis import is_time_of_run
 
 # Times of a step that are tried, at most, and times that are tried at once
 TIMES, AT_ONCE = 150, 50
-# Log p under the noise as fitted from which an event's prediction of held-out data is tried
-WORTH_A_TRIAL = -4.0
+# A time of the run is known to this, s: clocks and gaps move it
+KNOWN_TO_S = 4.0
 # Lengths of a passage, s
 LENGTHS_S = (8.0, 24.0, 72.0)
 
 
-@dataclass(frozen=True)
-class Event:
-    """Most significant event of a kind. columns: (M, A, c); tried: number of times; gain: held-out deviance."""
+class Event(NamedTuple):
+    """Most significant event of a kind. log_p: adjusted for all times; columns: (M, A, c); tried: number of times."""
 
     about: str
+    log_p: float
     columns: Array
     tried: int
-    gain: float = 0.0
-
-    @property
-    def log_p(self) -> float:
-        """Return log p of the gain, adjusted for all times. Slow noise is its alternative."""
-        c = self.columns.shape[2]
-        return float(chi2_logsf(max(self.gain, 0.0) + c, c)) + math.log(self.tried)
 
 
 def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event]:
@@ -47,18 +42,29 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
     basis: orthonormal (m, k) of what a fit takes, whitened, with its prior rows. white: (m,) whitened residual of unit
     variance, orthogonal to it.
     """
-    found = []
+    found, beside = [], _beside_known_times(problem, fit)
     for about, kind in EVENTS.items():
         best, tried, event = 0.0, 0, None
         for columns in kind(problem, fit):
+            columns[beside] = 0.0
             log_p = _log_p(fit, basis, white, columns)
             tried += len(log_p)
             at = int(np.argmin(log_p))
             if log_p[at] < best:
                 best, event = float(log_p[at]), columns[:, :, at]
-        if event is not None and best + math.log(tried) < WORTH_A_TRIAL:
-            found.append(Event(about, event, tried))
+        if event is not None:
+            found.append(Event(about, best + math.log(tried), event, tried))
     return found
+
+
+def _beside_known_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
+    """Return (M,) bins next to the beginning or end of a fit's effects, which is known to some seconds."""
+    beside = np.zeros(len(problem.time), dtype=bool)
+    for each in fit.hypothesis.parameters():
+        if is_time_of_run(each.spec):
+            rows = problem.rows_of[each.recording or 0]
+            beside[rows] |= np.abs(problem.time[rows] - fit.hypothesis.value(each)) < KNOWN_TO_S
+    return beside
 
 
 def _log_p(fit: Fit, basis: Array, white: Array, columns: Array) -> Array:

@@ -91,7 +91,13 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
     tested = len(looks) + len(followed) + noise.is_coloured * (len(raw) - 1)
-    if asked > -np.inf:
+    happened = [  # slow noise explains a step as well, unless the step predicts better
+        each
+        for each in events(problem, fit, basis, white)
+        if each.log_p < np.log(LEVEL)
+        and _is_predictive(problem, fit, each.columns, _price(tested + each.tried, each.columns.shape[2]))
+    ]
+    if asked > -np.inf and not happened:
         most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
         for line in followed:
             waves = _along_axes(line.waves, problem.axes)
@@ -108,8 +114,6 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
             if name != "time":
                 drop, rank = alone.lowered_by(_coloured_anew(noise, beside, columns, fit.residual))
                 recoloured.append(FollowTest(name, np.arange(columns.shape[2]), True, drop, rank))
-    happened = events(problem, fit, basis, white) if asked == -np.inf else []
-    happened = [replace(each, gain=holds_out(problem, fit, each.columns)) for each in happened]
     looked_at = float(np.log(tested))
     nominal = [
         *(each.log_p for each in happened),
@@ -281,7 +285,11 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
 
 def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
     """Return whether the regressor of the residual predicts held-out data better than slow noise and chance do."""
-    return rest.found and holds_out(problem, fit, rest.clearest) > rest.price - rest.clearest.shape[2]
+    return rest.found and _is_predictive(problem, fit, rest.clearest, rest.price)
+
+
+def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:
+    return holds_out(problem, fit, columns) > least - columns.shape[2]
 
 
 def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
@@ -304,13 +312,14 @@ def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
 def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: str | float) -> bool:
     """Return whether the columns of some effects of a fit, without its calibration, lie in one group.
 
-    about: name of the group; a period (s) is no group.
+    about: what a residual follows; a period (s) and an event are no group.
     """
-    if isinstance(about, float):
+    groups = dictionary(problem, fit.seen)
+    if isinstance(about, float) or about not in groups:
         return False
     noise, parameters = fit.noise, fit.hypothesis.parameters()
     own = [6 + at for at, each in enumerate(parameters) if each.effect in effects]
-    functions = _along_axes(dictionary(problem, fit.seen)[about], problem.axes)
+    functions = _along_axes(groups[about], problem.axes)
     calibration = orthonormal(noise.whiten(fit.columns[:, :, :6]))
     asked = noise.whiten(fit.columns[:, :, own])
     asked = asked - calibration @ (calibration.T @ asked)

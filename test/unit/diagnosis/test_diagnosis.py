@@ -37,8 +37,6 @@ from dvl_calib_ros.diagnosis.search import candidates, observable_parameters
 from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_delays, moved_arm, with_moved
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
     eliminate,
-    is_taken_back,
-    once_where_confirmed,
     repeated_effects,
 )
 from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks, intermittent_effects
@@ -48,15 +46,12 @@ from dvl_calib_ros.diagnosis.search.clock_jumps import (
     Delays,
     gaps,
     in_gaps,
-    jumps_in_stamps,
     time_by_stamps,
 )
 from dvl_calib_ros.diagnosis.search.clock_jumps import _found as _delays
 from dvl_calib_ros.diagnosis.search.effect_selection import (
     _about,
     _by_fewer_clocks,
-    _leapt_where_stamps_say_so,
-    _with_all_of_the_arm,
     started,
 )
 from dvl_calib_ros.diagnosis.search.identifiability import _clock_or_arm, _selected
@@ -465,35 +460,6 @@ def about(given: Scenario, run: Run, offsets: Offsets, effects: list, values: di
     return _about(fitter, fitter.fit(start, noise), EFFECTS)
 
 
-@pytest.mark.parametrize(("leap", "of_leap"), [(-1.3, "seconds=-1.3,at_s=201.3"), (0.7, "seconds=0.7,at_s=201.3")])
-def test_a_leap_of_which_the_stamps_tell_is_not_taken_for_noise(leap, of_leap):
-    """Two leaps where the vehicle went straight on were slow noise (ratio 1.5) beside a lag, and never looked for."""
-    once = {name: effect.once for name, effect in EFFECTS.items()}
-    given = scenario(effects=["dvl_time_offset:seconds=0.5", "time_offset_jump:" + of_leap], gnss_std=0.02)
-    late = {"dvl_time_offset": ({"seconds": 0.5},)}
-    fitter, fit = about(given, as_sent(simulate(given)), Offsets(0.5, 0.0), [once["dvl_time_offset"]], late)
-    (hypothesis, *_) = jumps_in_stamps(fitter, fit, once, EFFECTS)
-    assert hypothesis.values["time_offset_jump"][0] == {
-        "seconds": pytest.approx(leap, abs=0.4),
-        "at_s": pytest.approx(201.3 - 0.5, abs=0.5),
-    }
-    _, found = _leapt_where_stamps_say_so(fitter, fit, EFFECTS, once)
-    assert found.values["time_offset_jump"][0]["seconds"] == pytest.approx(leap, abs=0.1)
-    assert found.noise.deviance(found.residual) < fit.noise.deviance(fit.residual) - 50.0
-    assert jumps_in_stamps(fitter, found, once, EFFECTS) == []
-
-
-def test_a_driver_that_begins_anew_has_not_leapt_though_its_stamps_show_it():
-    once = {name: effect.once for name, effect in EFFECTS.items()}
-    given = scenario(effects=["dvl_time_offset:seconds=0.5"], gnss_std=0.02, dvl_rate=10.0)
-    run = simulate(given)  # every fourth ping, and from 200 s on those half a step later, after a gap of 1.4 s
-    run = replace(run, dvl=[*run.dvl[:2000:4], *run.dvl[2010::4]])
-    fitter, fit = about(
-        given, run, Offsets(0.5, 0.0), [once["dvl_time_offset"]], {"dvl_time_offset": ({"seconds": 0.5},)}
-    )
-    assert _leapt_where_stamps_say_so(fitter, fit, EFFECTS, once) == (fitter, fit)
-
-
 LAGGING = "reference_lag:time_constant_s=1.3"
 SET_BACK_TWICE = "time_offset_jump:seconds=-1.68,at_s=155,again_seconds=-1.99,again_at_s=277"
 
@@ -520,19 +486,6 @@ def test_how_a_run_begins_or_ends_is_no_leap():
         assert _delays(odd) == Delays((-0.5,), ())
     squares[late, 20:], squares[leapt, 20:] = 100.0, 1.0
     assert _delays(squares) == Delays((-0.5, 1.0), (20,))
-
-
-def test_a_clock_that_is_set_back_and_nearly_put_right_again_has_leapt_where_its_stamps_show_it():
-    """Leaps of -0.81 and 1.04 s, which explained 84, were not named beside an arm, and the arm was known."""
-    leap, leaps = EFFECTS["time_offset_jump"], "seconds=-1.3,at_s=101.3,again_seconds=1.1,again_at_s=251.3"
-    values = injection(f"{leap.name}:{leaps}").values
-    for effects, is_wanted in (([f"{leap.name}:{leaps}"], False), ([], True)):
-        given = scenario(effects=effects, gnss_std=0.02)
-        problem = make_problem([recording_of(as_sent(simulate(given)))], np.eye(3), np.zeros(3), [Offsets()])
-        fitter, start = Fitter(problem), no_effect().with_effects([leap], 1, {leap.name: (values,)})
-        noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-        fit = fitter.fit(start, noise, fixed=frozenset([leap.name]))
-        assert is_taken_back(fitter, fit, leap.name) is is_wanted
 
 
 @pytest.mark.parametrize(("better", "name"), [(14.0, "dvl_time_offset"), (40.0, "time_offset_jump")])
@@ -567,19 +520,6 @@ def test_a_second_leap_that_is_not_there_is_taken_back():
     (alone,) = repeated_effects(fitter, [fit], EFFECTS, once)
     assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
     assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
-
-
-def test_a_first_leap_that_the_blocks_do_not_bear_out_is_dropped_and_the_other_stands_alone():
-    """A leap of 75 ms at 233 s was the second, and one of 16 ms at 46 s the first."""
-    fitter, fit, _ = fitted(
-        scenario(effects=["time_offset_jump:seconds=0.8,at_s=200"], gnss_std=0.02),
-        {"time_offset_jump": {"seconds": 0.02, "at_s": 60.0, "again_seconds": 0.8, "again_at_s": 200.0}},
-    )
-    once = {name: effect.once for name, effect in EFFECTS.items()}
-    alone = once_where_confirmed(fitter, fit, EFFECTS, once)
-    assert alone.values["time_offset_jump"][0].keys() == {"seconds", "at_s"}
-    assert alone.values["time_offset_jump"][0]["seconds"] == pytest.approx(0.8, abs=0.05)
-    assert alone.values["time_offset_jump"][0]["at_s"] == pytest.approx(200.0, abs=20.0)  # on a straight leg
 
 
 def test_a_leap_ahead_leaves_a_gap_in_the_stamps_and_none_in_time():
@@ -1388,26 +1328,6 @@ def test_a_height_that_is_not_said_is_held_where_it_is(monkeypatch):
     assert diagnosis.verdict is DiagnosisVerdict.KNOWN
     assert {*found(diagnosis)["lever_arm"]} == {"x_m", "y_m"}
     assert_within(diagnosis, "lever_arm", x_m=-0.6, y_m=-1.6)
-
-
-@pytest.mark.parametrize("z", [-2.8, 0.0])
-def test_a_height_of_three_metres_is_found_where_one_of_a_third_would_not_be_shown(z):
-    """It was what is left, and an unknown cause; where nothing is left, no height is looked for."""
-    given = scenario(effects=[f"lever_arm:x_m=-0.6,y_m=-1.6,z_m={z}"], gnss_std=0.015, waves=Waves(0.2, 6.0))
-    recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
-    problem = make_problem([recording], np.eye(3), np.zeros(3), [Offsets()])
-    arm = EFFECTS["lever_arm"]
-    flat = arm.without({"z_m"})
-    start = no_effect().with_effects([flat], 1, {arm.name: ({"x_m": -0.5, "y_m": -1.5},)})
-    fitter = Fitter(problem)
-    noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-    fitter, fit = _about(fitter, fitter.fit(start, noise), EFFECTS)
-    whole = _with_all_of_the_arm(fitter, fit, EFFECTS, {arm.name: flat})
-    if z:
-        assert whole is not None and whole[1].values[arm.name][0]["z_m"] == pytest.approx(z, abs=0.1)
-        assert max(axis.std for axis in whole[1].noise.axes) < 0.6 * min(axis.std for axis in fit.noise.axes)
-    else:
-        assert whole is None
 
 
 def test_an_arm_that_may_be_another_is_so_after_an_effect_was_dropped():

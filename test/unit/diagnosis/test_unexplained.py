@@ -54,6 +54,7 @@ def without_effects(recording):
 
 def test_what_could_not_be_clear_enough_is_not_held_against_made_up_recordings(stepped, monkeypatch):
     fitter, fit = stepped
+    monkeypatch.setattr(looking, "events", lambda *_: [])
     whole = unexplained(fitter, fit)
     excess = whole.clear_energy - whole.price
     assert whole.found and excess > 20.0
@@ -260,3 +261,32 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
     monkeypatch.setattr(held_out_validation, "_better_elsewhere", lambda *_: 1000.0)
     left, _ = settled(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
     assert bool(left.selected) == is_some
+
+
+@pytest.mark.parametrize(
+    ("about", "third"),
+    [
+        ("a step in time", lambda time, _: 0.04 * np.outer(time > 83.0, [0.0, 0.0, 1.0])),
+        ("a stretch of time", lambda time, _: 0.06 * np.outer(np.abs(time - 150.0) < 12.0, [0.0, 0.0, 1.0])),
+    ],
+)
+def test_one_event_is_found_whenever_it_happens(about, third):
+    fitter, fit = without_effects(with_added(simulate(scenario("lawnmower", seconds=300.0, gnss_std=0.03)), third))
+    rest = unexplained(fitter, fit)
+    assert rest.about == about
+    assert matters(fitter.problem, fit, rest)
+
+
+def test_a_magnetic_anomaly_is_a_passage_that_turns_the_heading():
+    """A wreck turns the compass for 25 s: the reference, in earth axes, is right, and the DVL's velocity is turned."""
+    run = simulate(scenario("lawnmower", seconds=300.0, gnss_std=0.02))
+    x, y, _ = np.transpose([sample.velocity for sample in run.dvl])
+
+    def turned(time, _):
+        off = 0.15 * np.maximum(1.0 - np.abs(time - 140.0) / 24.0, 0.0)
+        return off[:, None] * np.column_stack([-y, x, np.zeros_like(x)])
+
+    fitter, fit = without_effects(with_added(run, turned))
+    rest = unexplained(fitter, fit)
+    assert rest.about == "a passage that turns the heading"
+    assert matters(fitter.problem, fit, rest)
