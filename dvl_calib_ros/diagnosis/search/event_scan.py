@@ -60,10 +60,10 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
 def _beside_known_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     """Return (M,) bins next to the beginning or end of a fit's effects, which is known to some seconds."""
     beside = np.zeros(len(problem.time), dtype=bool)
-    for each in fit.hypothesis.parameters():
-        if is_time_of_run(each.spec):
-            rows = problem.rows_of[each.recording or 0]
-            beside[rows] |= np.abs(problem.time[rows] - fit.hypothesis.value(each)) < KNOWN_TO_S
+    for effect in fit.effects:
+        for rows, values in zip(problem.rows_of, fit.values[effect.name], strict=True):
+            for spec in filter(is_time_of_run, effect.parameters):
+                beside[rows] |= np.abs(problem.time[rows] - values[spec.name]) < KNOWN_TO_S
     return beside
 
 
