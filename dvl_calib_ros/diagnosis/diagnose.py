@@ -54,6 +54,8 @@ VISIBLE_TIMES_TYPICAL = 3.0
 # Least share of observable effects for the verdict NO_GAP
 MIN_VISIBLE_SHARE = 0.5
 POWER = 0.8
+# Least share of the gap's energy, on held-out data, that effects must close to explain it
+MATERIAL = 0.2
 # Least closure of an explanation; less is a part of one (issue 46)
 EXPLAINS = 0.8
 # Least ratio of the unexplained error to the noise for a mention in the sentence
@@ -234,6 +236,8 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
         return DiagnosisVerdict.UNKNOWN
     # effects that leave more than the noise on held-out data explain it no better than their equivalents
     if gap.not_expected > gap.noise_floor:
+        return DiagnosisVerdict.UNKNOWN
+    if selection.selected and gap.closure < MATERIAL:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)

@@ -37,6 +37,8 @@ STEPS_OF_A_BIN = 16
 OUTLYING = 5.0
 # Simulated recordings for the null distribution, and degrees of freedom of the prior on its scale of 1
 MADE_UP, PRIOR_DOF = 12, 4.0
+# Share of what effects explain that they leave behind for a while, as interpolation is inexact
+INEXACT = 0.02
 # Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
 # fifteen functions of the turn rate.
 AS_LIKELY = 6.0
@@ -91,12 +93,15 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
     tested = len(looks) + len(followed) + noise.is_coloured * (len(raw) - 1)
-    happened = [  # slow noise explains a step as well, unless the step predicts better
-        each
-        for each in events(problem, fit, basis, white)
-        if each.log_p < np.log(LEVEL)
-        and _is_predictive(problem, fit, each.columns, _price(tested + each.tried, each.columns.shape[2]))
-    ]
+    happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(LEVEL)]
+    if happened:  # slow noise explains a step as well, unless the step predicts better
+        base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
+        least = INEXACT * (base.deviance - fit.deviance)
+        happened = [
+            each
+            for each in happened
+            if _is_predictive(problem, fit, each.columns, least + _price(tested + each.tried, each.columns.shape[2]))
+        ]
     if asked > -np.inf and not happened:
         most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
         for line in followed:

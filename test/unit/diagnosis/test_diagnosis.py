@@ -36,7 +36,6 @@ from dvl_calib_ros.diagnosis.noise.whitened_least_squares import WhitenedLeastSq
 from dvl_calib_ros.diagnosis.search import candidates, observable_parameters
 from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_delays, moved_arm, with_moved
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
-    eliminate,
     repeated_effects,
 )
 from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks, intermittent_effects
@@ -497,18 +496,6 @@ def test_a_clock_that_is_late_throughout_does_not_choose_a_time_from_which_on_it
     leapt = replace(fitter.fit(leapt, fit.noise), deviance=fit.deviance - better)
     (found,) = _by_fewer_clocks(fitter, leapt, once).effects
     assert found.name == name
-
-
-def test_of_two_leaps_that_a_late_clock_before_them_makes_one_taken_back_the_clock_goes():
-    """Leaps of 1.13 and -1.20 s were one of 1.27 s taken back, after a clock late by -0.27 s, and none was named."""
-    leaps = {"seconds": 1.27, "at_s": 100.0, "again_seconds": -1.26, "again_at_s": 200.0}
-    fitter, fit, _ = fitted(
-        scenario(effects=["time_offset_jump:seconds=1.0,at_s=100,again_seconds=-1.26,again_at_s=200"], gnss_std=0.005),
-        {"dvl_time_offset": {"seconds": -0.27}, "time_offset_jump": leaps},
-    )
-    taken_back = {name: per if name != "time_offset_jump" else (leaps,) for name, per in fit.values.items()}
-    fit = replace(fit, hypothesis=replace(fit.hypothesis, values=taken_back), deviance=fit.deviance - 60.0)
-    assert [each.name for each in eliminate(fitter, fit, len(EFFECTS)).effects] == ["time_offset_jump"]
 
 
 def test_a_second_leap_that_is_not_there_is_taken_back():
