@@ -72,5 +72,8 @@ class ParameterSpec:
         return number
 
 
-def _parameter(default: Any, description: str, **known: Any) -> Any:
-    return dataclasses.field(default=default, metadata={"spec": ParameterSpec(default, description, **known)})
+def _parameter(default: Any, description: str, within: tuple[float, float] | None = None, **known: Any) -> Any:
+    """Return the field of a parameter. within: its smallest and largest value."""
+    low, high = within or (None, None)
+    spec = ParameterSpec(default, description, low=low, high=high, **known)
+    return dataclasses.field(default=default, metadata={"spec": spec})
