@@ -19,9 +19,8 @@ from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.estimation import SensorData, aligned
-from dvl_calib_ros.evaluation.procedure import Procedure, corrections, run_seed, sensor_data
 from dvl_calib_ros.evaluation.protocol import load_folder, own_trajectories
-from dvl_calib_ros.evaluation.validation_study import DEFAULTS
+from dvl_calib_ros.evaluation.validation_study import DEFAULTS, Procedure, corrections, run_seed, sensor_data
 
 from . import DifferentWorkError, Measurement, check_same
 

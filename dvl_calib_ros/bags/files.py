@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path, PurePath
 
-from ..disk.yaml_files import load_yaml
+from ..disk.text_files import load_yaml
 from ..errors import InputError
 from .raw_file import open_raw
 

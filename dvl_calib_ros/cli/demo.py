@@ -125,7 +125,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     """Print live and replayed estimates; return whether they agree to rounding."""
     import numpy as np
 
-    from ..disk.yaml_files import load_yaml
+    from ..disk.text_files import load_yaml
     from ..files.result_file import load_result
     from ..present.document import Table
     from ..present.error_terms import estimate_table

@@ -57,7 +57,7 @@ def _path(name: str | None) -> Path | None:
 
 def _words(path: Path) -> list[str]:
     """Return a profile's content as command-line words. Raises InputError."""
-    from ..disk.yaml_files import load_yaml
+    from ..disk.text_files import load_yaml
     from ..errors import InputError
     from ..files.parameter_files import as_yaml
 

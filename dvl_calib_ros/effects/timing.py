@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.delay_search import LONGEST_S
-from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory
-from .recursion import recursion, slopes
+from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory, recursion, slopes
 
 # search range of the clock registration
 LONGEST_OFFSET_S = LONGEST_S

@@ -15,7 +15,7 @@ import yaml
 from ..calibration.models import MODELS
 from ..calibration.models.parameter_spec import ParameterError
 from ..calibration.models.parameters import SCHEMA, Parameters
-from ..disk.yaml_files import compose_yaml, load_yaml, parse_scalar
+from ..disk.text_files import compose_yaml, load_yaml, parse_scalar
 from ..errors import InputError
 from ..messages.drivers import TYPES_OF, may_be_recognised, velocity_type
 from ..messages.field_map import field_map

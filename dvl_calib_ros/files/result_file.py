@@ -43,7 +43,7 @@ from ..calibration.results.results import (
     scale_and_delay,
 )
 from ..disk.atomic import own_stream, save_bytes
-from ..disk.yaml_files import load_yaml
+from ..disk.text_files import load_yaml
 from ..errors import InputError, printable
 from ..verdict.kinds import Severity
 from ..verdict.reasons import finding

@@ -19,8 +19,7 @@ import numpy as np
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
-from ..effects.base import ActsOn, EffectInput, NoiseEffect
-from ..effects.composition import Injection
+from ..effects.base import ActsOn, EffectInput, Injection, NoiseEffect
 from .scenario import GNSS_PHASE_S, START_NS, Run, Scenario, Seeds, dvl_at, gnss_at, imu_at, world_of
 from .trajectories import Motion
 

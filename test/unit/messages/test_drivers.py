@@ -37,7 +37,7 @@ from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSampl
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.model.recorded_streams import load_recordings
 from dvl_calib_ros.discovery.discovery import Given
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.cross_check import cross_check
 from dvl_calib_ros.files.parameter_files import load_parameters
