@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from dvl_calib_ros.calibration.filters.filter_bank import RelativeHeight
 from dvl_calib_ros.calibration.filters.filter_setup import Assembler
-from dvl_calib_ros.calibration.filters.relative_height import RelativeHeight
 from dvl_calib_ros.calibration.models import MODELS, Model, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import Array

@@ -105,8 +105,7 @@ def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Nam
     """Print an instrument's settings; with the options, also write and send them."""
     from ..disk.atomic import save_bytes
     from ..errors import InputError
-    from ..instruments.settings import AS_RECORDED, instrument_settings
-    from ..instruments.water_linked import configure
+    from ..instruments.settings import AS_RECORDED, configure, instrument_settings
 
     now = _parse_now(arguments.now)
     chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.build_observations import Observer
+from ..calibration.filters.filter_bank import RelativeHeight
 from ..calibration.filters.filter_setup import Assembler
-from ..calibration.filters.relative_height import RelativeHeight
 from ..calibration.models import MODELS, Model, Needs
 from ..calibration.models.base import Observations
 from ..calibration.models.parameters import Parameters

@@ -26,8 +26,7 @@ from ..calibration.numerics.frames import (
 )
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of, rejection
-from ..calibration.results.results import position_in_body, scale_and_delay
-from ..calibration.results.velocity_correction import lever_arm
+from ..calibration.results.results import lever_arm, position_in_body, scale_and_delay
 from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from ..version import __version__

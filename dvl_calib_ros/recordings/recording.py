@@ -27,8 +27,7 @@ from ..calibration.registration.registration import Registration
 from ..errors import InputError
 from ..messages.decode import RESTAMP_ALL, MessageDecoder
 from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, POSE_TYPES, VELOCITY_TYPES
-from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, suggested
-from ..messages.type_recognition import recognised
+from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, recognised, suggested
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
 from .columns import Collector, Laid, TopicColumns, is_kept
 from .far_stamps import without_far

@@ -29,8 +29,7 @@ from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
 from ..numerics.tables import RowTable
 from ..registration.registration import Registration
-from ..results.bias_covariance import BiasCovariance
-from ..results.results import Day
+from ..results.results import BiasCovariance, Day
 from ..results.thinned_recording import NO_TERMS, Terms, ThinnedBlock, ThinnedRecording
 from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS

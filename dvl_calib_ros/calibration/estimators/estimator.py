@@ -28,8 +28,7 @@ from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, Stamps
 from ..registration.registration import Registration
-from ..results.bias_covariance import BiasCovariance
-from ..results.results import Day
+from ..results.results import BiasCovariance, Day
 from ..results.thinned_recording import Terms, ThinnedRecording
 from ..streams.aligner import Aligner
 

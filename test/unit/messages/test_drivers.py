@@ -42,8 +42,8 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.cross_check import cross_check
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.messages.drivers import DVL_TYPES, VELOCITY_TYPES, driver_table, velocity_type
+from dvl_calib_ros.messages.field_map import recognised
 from dvl_calib_ros.messages.live_feed import MessageFeed
-from dvl_calib_ros.messages.type_recognition import recognised
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.recorded_motion import MotionSource, recorded_motion
