@@ -14,7 +14,7 @@ import numpy as np
 
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..calibration.filters.observability import Convergence, observability
-from ..calibration.models import MODELS, REPLACED, Model
+from ..calibration.models import MODELS, Model
 from ..calibration.models.parameter_spec import ParameterError
 from ..calibration.models.parameters import FRD, Parameters
 from ..calibration.numerics.error_model import corrected_mounting
@@ -128,8 +128,6 @@ class CalibratedMounting:
 def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     """Read a result file. Raises InputError if it is none, is damaged, or was changed by hand."""
     content, states = load_result(path)
-    if (name := str(content.get("model"))) in REPLACED:
-        raise InputError(f"{path}: it is of model {name}, which {REPLACED[name]} replaces; replay its recording again")
     try:
         model = MODELS[content["model"]]
         state = states[model.name]
@@ -391,10 +389,8 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
         used = int(content["models"][model.name]["used"])
         span = content["time_span"]["first_ns"], content["time_span"]["last_ns"]
         first_ns, last_ns = (0, 0) if used == 0 else map(int, span)
-        none = np.zeros((model.n_state, N_AXES))
         rejected = rejection(content.get("verification", {}).get("findings", ()))
-        # older files lack it: the effect of a bias is then treated as independent
-        by_bias = np.array(content["models"][model.name].get("by_dvl_bias", none), dtype=float).reshape(none.shape)
+        by_bias = np.array(content["models"][model.name]["by_dvl_bias"], dtype=float).reshape(model.n_state, N_AXES)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     if not used:

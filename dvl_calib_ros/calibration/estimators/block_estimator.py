@@ -12,7 +12,6 @@ import math
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import ClassVar
 
 import numpy as np
 
@@ -27,7 +26,7 @@ from ..models.own import BIAS, DELAY, LEVER_ARM, N_STATE, PHI, REFERENCE_ERROR
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
-from ..numerics.tables import RowTable
+from ..numerics.tables import RowTable, column
 from ..registration.registration import Registration
 from ..results.results import BiasCovariance, Day
 from ..results.thinned_recording import NO_TERMS, Terms, ThinnedBlock, ThinnedRecording
@@ -59,14 +58,9 @@ class _PendingDvl(RowTable):
     """Usable DVL samples that later blocks need."""
 
     IS_REUSED = True  # blocks have copies
-    LAYOUT: ClassVar = {
-        "stamps_ns": (np.int64, ()),
-        "velocity": (np.float64, (3,)),
-        "covariance": (np.float64, (3, 3)),
-    }
-    stamps_ns: Stamps
-    velocity: Array
-    covariance: Array
+    stamps_ns: Stamps = column(np.int64)
+    velocity: Array = column(np.float64, 3)
+    covariance: Array = column(np.float64, 3, 3)
 
 
 class FullEstimator(Estimator):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ class ParameterError(ValueError):
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """Specification of a parameter apart from its name. replaced: choices of earlier versions and their successors."""
+    """Specification of a parameter apart from its name."""
 
     default: Any
     description: str
@@ -25,7 +24,6 @@ class ParameterSpec:
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] = ()
-    replaced: Mapping[str, str] = field(default_factory=dict)
     read_only: bool = True
 
     @property
@@ -53,7 +51,6 @@ class ParameterSpec:
             return value
         if not isinstance(value, str):
             raise ParameterError(f"{name}: expected text, got {value!r}")
-        value = self.replaced.get(value, value)
         if self.choices and value not in self.choices:
             raise ParameterError(f"{name}: {value!r} is not one of {', '.join(self.choices)}")
         return value

@@ -16,7 +16,7 @@ from typing import Any
 
 from ..numerics.frames import Array, rotation_from_rpy
 from ..numerics.samples import VelocityFrame
-from . import MODELS, REPLACED
+from . import MODELS
 from .base import ASSUMPTIONS
 from .parameter_spec import ParameterError, ParameterSpec, _parameter
 
@@ -43,14 +43,12 @@ class Parameters:
         AUTO,
         "Published model: auto (recommended), iac (the paper's selection), or a name.",
         choices=(AUTO, IAC, *MODELS),
-        replaced=REPLACED,
         read_only=False,
     )
     gnss_model: str = _parameter(
         "full",
         "Model of auto with GNSS. iac: M3, or M4 if set here.",
         choices=_AIDED,
-        replaced=REPLACED,
         read_only=False,
     )
     gnss_free_model: str = _parameter(
