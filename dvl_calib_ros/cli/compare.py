@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from ..standard_streams import give_up
 from . import common
 from .common import add_report_option, report_writer
@@ -36,7 +37,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Load or calibrate, compare, save, print. Return the exit code."""
     from ..calibration.comparison.mounting_change import check_distinct, compare
     from ..calibration.comparison.mounting_change_reasons import comparison_document
-    from ..errors import InputError
     from ..present import comparison as present
 
     paths: list[Path] = arguments.results

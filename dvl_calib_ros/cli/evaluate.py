@@ -14,6 +14,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from . import common
 from .common import add_report_option, report_writer
 
@@ -45,7 +46,6 @@ def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print, save."""
     from ..calibration.models import BY_VELOCITY
     from ..disk.atomic import save_text
-    from ..errors import InputError
     from ..evaluation.documents import evaluation_csv, evaluation_document
     from ..evaluation.protocol import SETS
     from ..evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
@@ -90,8 +90,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _are_bags(paths: list[Path]) -> bool:
     """Return whether the paths are bags rather than a folder of trajectories."""
-    from ..errors import InputError
-
     if not paths:
         return False
     for path in paths:
@@ -106,7 +104,6 @@ def _are_bags(paths: list[Path]) -> bool:
 
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
     """Check each bag's calibration on the other bags; print and save."""
-    from ..errors import InputError
     from ..evaluation.cross_check import cross_check, cross_check_document
     from ..present import evaluation as present
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..errors import InputError
 from . import common
 
 
@@ -30,7 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Calibrate new and changed recordings, write the page, print."""
-    from ..errors import InputError
     from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers
     from ..present.fleet import fleet as present

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from . import common
 from .common import add_report_option, report_writer
 
@@ -40,7 +41,6 @@ def run(arguments: argparse.Namespace) -> int:
     from ..bag_replay.checked_replay import checked_replay
     from ..bag_replay.replay import replay_document
     from ..calibration.models import MODELS
-    from ..errors import InputError
     from ..files.result_file import result_document, save_result
     from ..verdict.kinds import Severity
 

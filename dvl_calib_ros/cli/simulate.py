@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError, needing_ros
 from ..standard_streams import show
 from . import common
 
@@ -161,7 +162,6 @@ def _defaults() -> argparse.Namespace:
 
 def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace, scenario: Scenario) -> Scenario:
     """Give the scenario the DVL found by a diagnosis. Raises InputError if options contradict it."""
-    from ..errors import InputError
     from ..simulation.found_effects import with_dvl
     from ..simulator_export.dvl_description import load_description
 
@@ -201,8 +201,6 @@ MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # zero means no such sensor
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    from ..errors import InputError
-
     if len(arguments.scale) not in (1, 3):
         raise InputError("--scale: give one number for all axes, or three")
     for name, (low, high) in LIMITS.items():
@@ -245,8 +243,6 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
     """Raise InputError for options that exclude each other. defaults: of all options."""
-    from ..errors import InputError
-
     if not arguments.live:
         if arguments.output is None:
             raise InputError("name a bag to write, or publish with --live")
@@ -267,7 +263,6 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
 
 def run_live(arguments: argparse.Namespace, scenario: Scenario) -> None:
     """Publish until the end, or until Ctrl-C. Raises InputError."""
-    from ..errors import needing_ros
     from ..node.shutdown import Ending
 
     with Ending() as ending:
