@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,6 @@ from .calibrated import Calibration
 
 if TYPE_CHECKING:
     from ..bags.recover import Recovered
-    from ..calibration.comparison.mounting_change import Comparison
     from ..evaluation.cross_check import CrossCheck
     from ..evaluation.results import Evaluation
     from ..files.apply import Applied
@@ -248,7 +248,6 @@ def report(
     InputError
         If the file cannot be written, or the page needs a missing history or library.
     """
-
     target = Path(path)
     write(result, target)
     return target
@@ -277,32 +276,26 @@ def write(result: object, path: Path) -> None:
 
 def _plain(result: Any) -> Callable[[], Any]:
     """Return the function that makes plain data of a result. Raises InputError for other objects."""
-    if isinstance(result, Calibration):
+    if isinstance(result, Calibration | Examination):
         return result.document
-    if isinstance(result, Examination):
-        return result.document
-    if isinstance(result, Comparison):
-        from ..calibration.comparison.mounting_change_reasons import comparison_document
-
-        return lambda: comparison_document(result)
-    if isinstance(result, Diagnosis):
-        from ..diagnosis.answer.results import diagnosis_document
-
-        return lambda: diagnosis_document(result)
+    from ..calibration.comparison.mounting_change_reasons import comparison_document
+    from ..diagnosis.answer.results import diagnosis_document
     from ..evaluation.cross_check import CrossCheck, cross_check_document
     from ..evaluation.documents import evaluation_document
     from ..evaluation.results import Evaluation
     from ..unpaired.results import UnpairedComparison, unpaired_document
     from ..unpaired.simulator_rounds import ClosedGap, closed_gap_document
 
-    if isinstance(result, Evaluation):
-        return lambda: evaluation_document(result)
-    if isinstance(result, CrossCheck):
-        return lambda: cross_check_document(result)
-    if isinstance(result, UnpairedComparison):
-        return lambda: unpaired_document(result)
-    if isinstance(result, ClosedGap):
-        return lambda: closed_gap_document(result)
-    raise InputError(
-        f"a {type(result).__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"
-    )
+    documents: dict[type, Callable[[Any], Any]] = {
+        Comparison: comparison_document,
+        Diagnosis: diagnosis_document,
+        Evaluation: evaluation_document,
+        CrossCheck: cross_check_document,
+        UnpairedComparison: unpaired_document,
+        ClosedGap: closed_gap_document,
+    }
+    if type(result) not in documents:
+        raise InputError(
+            f"a {type(result).__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"
+        )
+    return partial(documents[type(result)], result)
