@@ -282,12 +282,13 @@ def import_recording(
     else:
         log = DvlLog(read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes), Counter())
     references = list(log.references) if gnss is None else _references(gnss, options, notes)
-    fixes = [] if gnss is None else _fixes(gnss, start_ns, notes)
+    has_fixes = gnss is not None and names_columns(gnss, "latitude", "longitude")
+    fixes = read_positions(gnss, start_ns, notes) if gnss is not None and has_fixes else []
     if attitude is None:
         attitudes = list(log.attitudes)
         notes += log.notes
     else:
-        attitudes = _attitudes(attitude, start_ns, notes)
+        attitudes = (read_heading if names_columns(attitude, "heading") else read_attitude)(attitude, start_ns, notes)
     with BagWriter(output, options.storage, options.compression) as bag:
         writer = SampleWriter(bag)
         if log.nominal_yaw:
@@ -311,16 +312,6 @@ def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[Re
     if names_columns(path, "latitude", "longitude"):
         return []
     return read_reference(path, options.start_ns, options.gnss_frame, options.gnss_std, notes)
-
-
-def _fixes(path: Path, start_ns: int, notes: list[str]) -> list[SatelliteFix]:
-
-    return read_positions(path, start_ns, notes) if names_columns(path, "latitude", "longitude") else []
-
-
-def _attitudes(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
-
-    return (read_heading if names_columns(path, "heading") else read_attitude)(path, start_ns, notes)
 
 
 def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Path, Imported]:
@@ -405,13 +396,9 @@ def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float
             x, y, z = velocity.tolist()
             samples.append(DvlSample(stamp_ns, (x, y, z), covariance))
     if not samples:
-        shown = _shown(rows[-1]) if rows else "it is empty"
+        shown = repr(",".join(rows[-1])[:SHOWN]) if rows else "it is empty"
         raise InputError(f"{path}: no row with time and velocity in the columns of --columns; the last is {shown}")
     return DvlLog(sorted({each.stamp_ns: each for each in samples}.values(), key=lambda each: each.stamp_ns), left_out)
-
-
-def _shown(row: Sequence[str]) -> str:
-    return repr(",".join(row)[:SHOWN])
 
 
 def _is_header(rows: Sequence[Sequence[str]], place: int) -> bool:
