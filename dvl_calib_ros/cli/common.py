@@ -49,7 +49,8 @@ def add_topic_options(parser: argparse._ActionsContainer) -> None:
 
 
 def add_discovery_options(parser: argparse.ArgumentParser) -> None:
-    """Add --dvl-topic, --gnss-topic and --imu-topic of recordings, whose defaults are found by type and content."""
+    """Add the parameters, and the topics of recordings, whose defaults are found by type and content."""
+    add_parameter_options(parser)
     for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
         none = "" if role == "dvl" else "; none: do without"
         help_ = f"default: {default}, else found by type and content{none}"

@@ -29,7 +29,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("results", nargs="+", type=Path, metavar="RESULT", help="result file (YAML), or a bag")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
     add_report_option(parser)
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 

@@ -41,7 +41,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("-v", "--verbose", action="store_true", help="print all tables as well")
     add_report_option(parser)
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
     add_simulator_arguments(parser)
 

@@ -34,7 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
     add_report_option(parser)
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 

@@ -25,7 +25,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
     parser.add_argument("--dask", default="", metavar="ADDRESS", help="scheduler to work on, such as tcp://host:8786")
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 

@@ -32,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the result file (YAML) of the selected model")
     add_report_option(parser)
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 

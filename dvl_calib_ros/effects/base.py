@@ -260,9 +260,9 @@ class ClockEffect(Effect):
     of_the_day = True
     bends_arm = True
 
-    @abstractmethod
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """Return the delay (N,) s of the stamps of measurements at times (N,) s since the start."""
+        """Return the delay (N,) s of the stamps of measurements at times (N,) s since the start; here constant."""
+        return np.full(len(elapsed), values["seconds"])
 
 
 class MountingEffect(Effect):
@@ -289,11 +289,14 @@ Disturbance = Callable[[Array, EffectInput], Array]
 class NoiseEffect(AnyEffect, ABC):
     """An effect on the noise. It is random, so it has no trace; the diagnosis has separate tests for it."""
 
-    @abstractmethod
     def disturb(
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
-        """Return the samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, with the effect."""
+        """Return the samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, with the effect.
+
+        One of this method and `following` must be defined.
+        """
+        return self.following(values, rng)(velocity, motion)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
         """Return a function for batches of samples that continue each other. Raises InputError if impossible."""

@@ -42,10 +42,6 @@ class DvlTimeOffset(_DvlClock):
     parameters = _seconds("delay of the stamps")
     confounded_with = ("reference_time_offset", "reference_lag", "attitude_time_offset")
 
-    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """Return τ."""
-        return np.full(len(elapsed), values["seconds"])
-
 
 class TimeOffsetJump(_DvlClock):
     """The DVL's clock is set once or twice: from then on its stamps are later (or earlier)."""
@@ -103,10 +99,6 @@ class ReferenceTimeOffset(ClockEffect):
     acts_on = ActsOn.REFERENCE_CLOCK
     confounded_with = ("dvl_time_offset", "reference_lag", "attitude_time_offset", "sideslip", "lever_arm")
 
-    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """Return τ."""
-        return np.full(len(elapsed), values["seconds"])
-
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return g(t) - g(t - τ), in the frame in which the reference was recorded, rotated to the body."""
         reference = _in_reference_frame(motion, motion.velocity_body)
@@ -125,10 +117,6 @@ class AttitudeTimeOffset(ClockEffect):
     acts_on = ActsOn.ATTITUDE_CLOCK
     needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("dvl_time_offset", "reference_time_offset", "sideslip", "lever_arm")
-
-    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """Return τ."""
-        return np.full(len(elapsed), values["seconds"])
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return v - R(t - τ)ᵀ R(t) v; a body-frame reference needs no attitude, except for a lever arm."""
