@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..bags.recover import Recovered
     from ..evaluation.cross_check import CrossCheck
     from ..evaluation.results import Evaluation
-    from ..files.apply import Applied
+    from ..files.mounting import Applied
     from ..instruments.settings import InstrumentSettings
     from ..logs.trajectories import Imported
     from ..simulator_export.writer import Export
@@ -154,8 +154,7 @@ def apply(
     InputError
         For a file that is no result, a calibration that must not be applied, or a file that cannot be written.
     """
-    from ..files.apply import Targets, write_calibration
-    from ..files.mounting import load_calibrated_mounting
+    from ..files.mounting import Targets, load_calibrated_mounting, write_calibration
 
     targets = Targets(
         as_path(urdf), as_path(output), joint, keep_position, as_path(params), as_path(launch), as_path(fusion)

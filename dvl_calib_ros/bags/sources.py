@@ -22,8 +22,7 @@ import numpy as np
 from ..errors import InputError
 from .batches import LATEST_NS, MOST_BYTES, MOST_MESSAGES, BagMessage, Batch, batched, by_log_time, times
 from .channels import Channel, Definition, definition_of
-from .files import ZSTD_MAGIC, NewFolder, decompressed, storage_suffix, with_journal
-from .raw_file import open_raw
+from .files import ZSTD_MAGIC, NewFolder, decompressed, open_raw, storage_suffix, with_journal
 from .ros1 import ROS1_MAGIC, as_ros2, bag_batches, batch_as_ros2, is_ros1, open_bag
 from .salvage.damage import LARGEST_RECORD, DamagedError, Salvaged
 from .salvage.mcap_file import MCAP_MAGIC, bytes_at_once, indexed_messages, read_summary, salvage_mcap

@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Check all files and then write them, or roll back."""
-    from ..files.apply import Targets, roll_back, write_calibration
+    from ..files.mounting import Targets, roll_back, write_calibration
 
     names = ("urdf", "output", "joint", "keep_position", "params", "launch", "fusion")
     targets = Targets(**{name: getattr(arguments, name) for name in names})

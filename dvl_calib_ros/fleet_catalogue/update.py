@@ -20,8 +20,17 @@ from ..files.output_paths import check_outputs
 from ..parallel import Lost, Workers, outcomes_as_done
 from ..verdict.answering import Answering
 from ..version import __version__
-from .recording_entry import Entry, Row, Task, entry_of, failed
-from .recording_search import StoredRecording, as_text, recordings_in, vehicle_pattern
+from .recording_entry import (
+    Entry,
+    Row,
+    StoredRecording,
+    Task,
+    as_text,
+    entry_of,
+    failed,
+    recordings_in,
+    vehicle_pattern,
+)
 from .vehicle_history import Catalogued, NeedsPerson, VehicleHistory, distinct, histories, need_person
 
 # Files of the catalogue: one Parquet file per recording, all with one schema, which readers combine to a table.

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..calibration.numerics.samples import DvlSample
 from .dvl_log import DvlLog, imu_samples
-from .nmea import xor
+from .pd0_nmea import xor
 
 _SECOND_NS = 1_000_000_000
 _SENTENCE = re.compile(rb"\$((?:PNORBT|DVPDL)[^*\r\n]*)\*([0-9A-Fa-f]{2})")

@@ -17,8 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import EngFormatter, MaxNLocator
 
-from ..bag_replay.replay import Replayed
-from ..bag_replay.run_history import ModelHistory, RunHistory
+from ..bag_replay.replay import ModelHistory, Replayed, RunHistory
 from ..calibration.assessment.dead_reckoning import Navigation
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
