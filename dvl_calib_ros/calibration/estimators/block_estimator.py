@@ -11,6 +11,7 @@ import copy
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 
 import numpy as np
@@ -34,7 +35,7 @@ from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
 from .block_preprocessing import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .block_solver import BlockSolver, Outcome
-from .estimator import AtOnce, Estimator, EstimatorSetup, Rest, Solved
+from .estimator import AtOnce, Estimator, EstimatorSetup, Rest
 from .full_forward_model import deviation_of
 
 BLOCK_NS = 10_000_000_000  # length of a block
@@ -91,7 +92,7 @@ class FullEstimator(Estimator):
         self._together = given.together
         self._gathered: list[Block] = []
         # blocks being solved: stamp of effect, result, index in the result
-        self._coming: deque[tuple[int, Solved[list[Outcome]], int]] = deque()
+        self._coming: deque[tuple[int, Future[list[Outcome]], int]] = deque()
         self._gathered_ns: list[int] = []  # stamps of effect of the gathered blocks
         self._is_telling = self._is_settled = False
         self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # cached for each model's verification
