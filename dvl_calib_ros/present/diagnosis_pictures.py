@@ -321,10 +321,10 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
             caption=f"Means over {points * interval:.0f} s.",
         )  # fmt: skip
     measured = ["xyz".index(letter) for letter in axes]
-    spectra = {name: spectrum(twin, values[:, measured]) for name, values in found.items()}
-    frequency = next(iter(spectra.values()))[0]
+    by_name = {name: spectrum(twin, values[:, measured]) for name, values in found.items()}
+    frequency = next(iter(by_name.values()))[0]
     noise = float(np.sqrt(2.0 * interval * (twin.noise**2).sum()))
-    densities = {name: density for name, (_, density) in spectra.items()} | {"noise": np.full(len(frequency), noise)}
+    densities = {name: density for name, (_, density) in by_name.items()} | {"noise": np.full(len(frequency), noise)}
     yield picture(
         f"{twin.name}: by frequency", f"Amplitude spectral density of recorded less twin, {names}, and the noise",
         spectra, frequency, densities, "recorded − twin, mm/s/√Hz",
