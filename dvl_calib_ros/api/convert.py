@@ -277,7 +277,7 @@ def _plain(result: Any) -> Callable[[], Any]:
     """Return the function that makes plain data of a result. Raises InputError for other objects."""
     if isinstance(result, Calibration | Examination):
         return result.document
-    from ..calibration.comparison.mounting_change_reasons import comparison_document
+    from ..calibration.comparison.mounting_change import comparison_document
     from ..diagnosis.answer.results import diagnosis_document
     from ..evaluation.cross_check import CrossCheck, cross_check_document
     from ..evaluation.documents import evaluation_document

@@ -17,8 +17,7 @@ from ..calibration.assessment.manoeuvre_planner import drift_left_open
 from ..calibration.calibrator import Calibrator
 from ..calibration.checks.data_warnings import gate_warnings, message_warnings, recording_warnings, reference_warnings
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_document
-from ..calibration.comparison.mounting_change import Comparison
-from ..calibration.comparison.mounting_change_reasons import comparison_document
+from ..calibration.comparison.mounting_change import Comparison, comparison_document
 from ..calibration.filters.build_observations import Observer
 from ..calibration.filters.state_history import StateTrace
 from ..calibration.models import MODELS, Needs

@@ -28,8 +28,7 @@ from .filters.filter_bank import Group, groups_of
 from .filters.heading_diversity import EVERY_NS, Headings
 from .filters.state_history import Counts, Numbers, StateTrace
 from .models import BROKEN, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
-from .models.parameter_spec import ParameterError
-from .models.parameters import IAC, Parameters
+from .models.parameters import IAC, ParameterError, Parameters
 from .numerics.frames import Array, Vector
 from .numerics.kalman import GaussianState
 from .numerics.samples import (

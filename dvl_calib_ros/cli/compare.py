@@ -34,8 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Load or calibrate, compare, save, print. Return the exit code."""
-    from ..calibration.comparison.mounting_change import check_distinct, compare
-    from ..calibration.comparison.mounting_change_reasons import comparison_document
+    from ..calibration.comparison.mounting_change import check_distinct, compare, comparison_document
     from ..present import comparison as present
 
     paths: list[Path] = arguments.results

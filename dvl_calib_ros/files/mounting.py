@@ -16,8 +16,7 @@ import numpy as np
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..calibration.filters.observability import Convergence, observability
 from ..calibration.models import MODELS, Model
-from ..calibration.models.parameter_spec import ParameterError
-from ..calibration.models.parameters import FRD, Parameters
+from ..calibration.models.parameters import FRD, ParameterError, Parameters
 from ..calibration.numerics.error_model import corrected_mounting
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.numerics.kalman import GaussianState

@@ -13,8 +13,7 @@ from typing import Any
 import yaml
 
 from ..calibration.models import MODELS
-from ..calibration.models.parameter_spec import ParameterError
-from ..calibration.models.parameters import SCHEMA, Parameters
+from ..calibration.models.parameters import SCHEMA, ParameterError, Parameters
 from ..disk.text_files import compose_yaml, load_yaml, parse_scalar
 from ..errors import InputError
 from ..messages.drivers import TYPES_OF, may_be_recognised, velocity_type

@@ -26,8 +26,7 @@ from std_srvs.srv import Trigger
 from ..calibration.calibrator import Calibrator
 from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models import MODELS, Model
-from ..calibration.models.parameter_spec import ParameterError
-from ..calibration.models.parameters import SCHEMA, Parameters
+from ..calibration.models.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.numerics import kalman
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import DvlSample, VelocityFrame

@@ -160,7 +160,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
             import rclpy
             from rclpy.signals import SignalHandlerOptions
 
-            from ..calibration.models.parameter_spec import ParameterError
+            from ..calibration.models.parameters import ParameterError
             from .calibration_node import CalibrationNode
     except InputError as error:
         return _refused(error)

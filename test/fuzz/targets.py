@@ -34,8 +34,7 @@ from dvl_calib_ros.bags.salvage.damage import DamagedError
 from dvl_calib_ros.bags.salvage.mcap_file import salvage_mcap_stream
 from dvl_calib_ros.bags.salvage.sqlite_file import salvage_sqlite_stream
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
-from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import ParameterError, Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import Stream
 from dvl_calib_ros.calibration.streams.stream_order import SEGMENT_GAP_NS

@@ -22,8 +22,7 @@ from ..filters.cross_validation import HeldOutError, Moments, held_out_error
 from ..filters.filter_bank import Group, ModelCounts
 from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models import Model
-from ..models.parameter_spec import ParameterError
-from ..models.parameters import Parameters
+from ..models.parameters import ParameterError, Parameters
 from ..models.plugins import load
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
