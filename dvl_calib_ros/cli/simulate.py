@@ -120,17 +120,12 @@ def run(arguments: argparse.Namespace) -> None:
     if recording:
         common.print_warnings(recording.opened.notes)
     scenario = Scenario(
-        trajectory=arguments.trajectory,
+        **{name: getattr(arguments, name) for name in OF_THE_SCENARIO},
         seconds=arguments.duration,
-        seed=arguments.seed,
         errors=DvlErrors(
             (roll, pitch, yaw), (scale[0], scale[1], scale[2]), tuple(arguments.beam_bias), arguments.beam_std
         ),
         mounting_rpy=tuple(arguments.mounting_rpy),
-        dvl_rate=arguments.dvl_rate,
-        gnss_rate=arguments.gnss_rate,
-        imu_rate=arguments.imu_rate,
-        gnss_std=arguments.gnss_std,
         gnss_frame=VelocityFrame(arguments.gnss_frame),
         outages=tuple((start, end) for start, end in arguments.gnss_outage),
         imu_errors=ImuErrors(
@@ -150,6 +145,8 @@ def run(arguments: argparse.Namespace) -> None:
     show(f"wrote {arguments.output}")
 
 
+# options that are fields of a scenario
+OF_THE_SCENARIO = ("trajectory", "seed", "dvl_rate", "gnss_rate", "imu_rate", "gnss_std")
 # options that describe the DVL, as a diagnosis does
 OF_THE_DVL = ("misalignment", "scale", "mounting_rpy", "beam_std", "beam_bias", "dvl_rate")
 

@@ -13,6 +13,8 @@ import struct
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from datetime import datetime, timezone
+from functools import reduce
+from operator import xor
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +51,7 @@ def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
     found: dict[int, ReferenceSample] = {}
     damaged = without = 0
     for text, checksum in _RMC.findall(path.read_bytes()):
-        if xor(text) != int(checksum, 16):
+        if checksum_of(text) != int(checksum, 16):
             damaged += 1
             continue
         try:
@@ -74,12 +76,9 @@ def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
     return [found[at] for at in sorted(found)]
 
 
-def xor(text: bytes) -> int:
+def checksum_of(text: bytes) -> int:
     """Return a sentence's checksum: of the bytes between $ and *."""
-    value = 0
-    for byte in text:
-        value ^= byte
-    return value
+    return reduce(xor, text, 0)
 
 
 GENERAL_NMEA = 0x2022
@@ -170,7 +169,7 @@ def _of_text(kind: str, sentence: re.Match[bytes]) -> list[float]:
     name, text, checksum = sentence.groups()
     fields = text.decode("ascii").split(",")
     whole = sentence[0][1:].partition(b"*")[0]
-    if name.decode() != kind or (checksum is not None and xor(whole) != int(checksum, 16)):
+    if name.decode() != kind or (checksum is not None and checksum_of(whole) != int(checksum, 16)):
         raise ValueError
     if kind == _HDT:
         return [math.radians(float(fields[0]))]
