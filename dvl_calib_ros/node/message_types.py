@@ -13,7 +13,7 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from ..calibration.models import Model
 from ..calibration.numerics.frames import FLU_FROM_FRD
 from ..calibration.numerics.kalman import GaussianState
-from ..calibration.numerics.samples import DvlSample
+from ..calibration.numerics.samples import DvlSample, ReferenceSample
 from ..calibration.results.results import NOT_ESTIMATED, twist_terms
 from ..errors import InputError
 from ..messages.decode import UNREADABLE
@@ -84,11 +84,11 @@ _GOOD: dict[str, Any] = {
 }
 
 
-def fill(message: Any, kind: VelocityType, sample: DvlSample) -> Any:
-    """Fill a new message of a type with a sample (forward-left-up) and return it."""
+def fill(message: Any, kind: VelocityType, sample: DvlSample | ReferenceSample, frame_id: str = DVL_FRAME) -> Any:
+    """Fill a new message of a type with a sample, of a DVL forward-left-up, and return it."""
     axes = FLU_FROM_FRD if kind.points_down else np.eye(3)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(sample.stamp_ns, 1_000_000_000)
-    message.header.frame_id = DVL_FRAME
+    set_stamp(message.header.stamp, sample.stamp_ns)
+    message.header.frame_id = frame_id
     if hasattr(message, "child_frame_id"):  # child_frame_id is the frame of the velocity, header.frame_id of the pose
         message.header.frame_id, message.child_frame_id = "odom", DVL_FRAME
         message.pose.pose.orientation.w = 1.0
