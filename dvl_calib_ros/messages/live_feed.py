@@ -96,10 +96,6 @@ class MessageFeed:
         self.kept.add(stream, decoded)
         return decoded
 
-    def undecodable(self, stream: str, reason: str) -> None:
-        """Count a message that could not be decoded."""
-        self.calibrator.refuse(stream, self.decoder.undecodable(Stream(stream), reason).reason)
-
 
 # largest number of kept messages, 140 bytes each: an IMU at 100 Hz for a quarter of an hour
 MOST = 100_000
