@@ -37,21 +37,8 @@ from ..numerics.samples import Index
 from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted
 from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
-from .slow_errors import (
-    GATE,
-    SECTION_S,
-    Chain,
-    Eliminated,
-    Priors,
-    SectionRows,
-    SlowErrors,
-    gram_of,
-    masked_median,
-    normal_points,
-    scatter,
-    section_starts,
-    usual_square,
-)
+from .section_rows import GATE, SECTION_S, SectionRows, masked_median, section_starts, usual_square
+from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
 OF_DAY = FULL.of_day
 LINEARISED = np.r_[PHI, SCALE, LEVER_ARM, DELAY, REFERENCE_DELAY]  # states that are not linear

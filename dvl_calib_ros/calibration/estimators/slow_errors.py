@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from ..models.own import DELAY, N_STATE, REFERENCE_DELAY
 from ..numerics.frames import Array
-from ..numerics.robust import median
-from .full_forward_model import SLOW, FitBlock, PredictedRows
+from .full_forward_model import SLOW, PredictedRows
 
 # Width of a section's Gram matrix: slow errors at both ends, states, residual.
 WIDTH = 2 * SLOW + N_STATE + 1
@@ -201,87 +200,3 @@ def _without_first(gram: Array) -> tuple[Array, Array]:
     """Return the Schur complement after the first six variables, and the log determinant of their part."""
     head, side = gram[:, :SLOW, :SLOW], gram[:, :SLOW, SLOW:]
     return gram[:, SLOW:, SLOW:] - side.transpose(0, 2, 1) @ np.linalg.solve(head, side), np.linalg.slogdet(head)[1]
-
-
-# Rows of `full` between two knots of its slow errors: their median, misfit, mean climb and bins.
-
-# Interval between knots of the slow errors, and length of bins of rows, s. A bin holds at least BIN_INTERVALS DVL
-# intervals.
-SECTION_S, BIN_S, BIN_INTERVALS = 10.0, 0.5, 2.0
-DENSER = 0.7  # references are denser than the DVL below this ratio of intervals
-# Squared residual of three axes, in variances, that 1 % of good rows exceed. Beyond it a row has weight gate / misfit.
-GATE = 11.3
-# Mean of the smaller 90 % of squares of a standard normal variable.
-TRIMMED_SQUARE = 0.623
-
-
-class SectionRows:
-    """Rows of one section. level: (3,) m/s, median. left: (J, 3) m/s about the median, nan along unmeasured axes."""
-
-    def __init__(self, from_s: float, rows: PredictedRows | None, block: FitBlock) -> None:
-        self.from_s, self.rows, self._bin_s = from_s, rows, _bin_length_s(block)
-        self.slope_variance = block.slope_variance
-        self._bins: Bins | None = None
-        if rows is not None:
-            residual = np.where(rows.weight > 0.0, rows.residual, np.nan)
-            self.level = masked_median(residual)
-            self.left = residual - self.level
-
-    def misfit(self, single: Array) -> Array:
-        """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
-        found: Array = (np.nan_to_num(self.left) ** 2 / single).sum(axis=1)
-        return found
-
-    def up(self, x: Array) -> Array | None:
-        """Return the mean velocity upwards (21,): derivatives by the states, and m/s at zero states; None if unknown.
-
-        x: (20,) point of linearisation.
-        """
-        assert self.rows is not None
-        known = self.rows.oriented & (self.rows.weight[:, 2] > 0.0)
-        if not known.any():
-            return None
-        mean: Array = self.rows.up[known].mean(axis=0)
-        mean[-1] -= mean[:-1] @ x
-        return mean
-
-    def bins(self, single: Array) -> Bins:
-        """Average the rows over bins, with robust weights. single: see `misfit`."""
-        assert self.rows is not None
-        if self._bins is None:
-            weight = np.minimum(1.0, GATE / np.maximum(self.misfit(single), 1e-9))
-            self._bins = binned_rows(self.rows, weight, self.from_s, self.from_s + SECTION_S, self._bin_s)
-        return self._bins
-
-
-def usual_square(values: Array) -> Array:
-    """Return the variance (3,) of (J, 3) without nan, by the smaller 90 % of the squares, against outliers."""
-    found = np.zeros(3)
-    for axis, column in enumerate(values.T):
-        squares = np.sort(column[np.isfinite(column)] ** 2)
-        kept = squares[: math.ceil(0.9 * len(squares))]
-        found[axis] = kept.mean() / TRIMMED_SQUARE if len(kept) else 0.0
-    return found
-
-
-def masked_median(values: Array) -> Array:
-    """Return the median (3,) of (J, 3) without nan; 0 for an axis without values."""
-    finite = np.isfinite(values)
-    if finite.all():
-        return np.sort(values, axis=0)[len(values) // 2]
-    columns = [column[known] for column, known in zip(values.T, finite.T, strict=True)]
-    return np.array([median(column) if len(column) else 0.0 for column in columns])
-
-
-def _bin_length_s(block: FitBlock) -> float:
-    """Return the bin length, s: longer where references are denser than DVL samples, because they then share these."""
-    times = block.reference.times
-    if len(times) < 2 or len(block.dvl.times) < 2:
-        return BIN_S
-    apart = (times[-1] - times[0]) / (len(times) - 1)
-    return max(BIN_S, BIN_INTERVALS * block.interval_s) if apart < DENSER * block.interval_s else BIN_S
-
-
-def section_starts(block: FitBlock) -> list[float]:
-    """Return where the sections of a block begin, s."""
-    return [block.from_s + SECTION_S * n for n in range(round((block.end_s - block.from_s) / SECTION_S))]
