@@ -11,17 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from dvl_calib_ros.calibration.filters.filter_bank import RelativeHeight
 from dvl_calib_ros.calibration.filters.filter_setup import Assembler
-from dvl_calib_ros.calibration.filters.relative_height import RelativeHeight
 from dvl_calib_ros.calibration.models import MODELS, Model, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.estimation import SensorData, aligned
-from dvl_calib_ros.evaluation.procedure import Procedure, corrections, run_seed, sensor_data
 from dvl_calib_ros.evaluation.protocol import load_folder, own_trajectories
-from dvl_calib_ros.evaluation.validation_study import DEFAULTS
+from dvl_calib_ros.evaluation.validation_study import DEFAULTS, Procedure, corrections, run_seed, sensor_data
 
 from . import DifferentWorkError, Measurement, check_same
 

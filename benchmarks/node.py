@@ -19,7 +19,7 @@ from scipy.stats import theilslopes
 
 from dvl_calib_ros.calibration.numerics.frames import Array
 from dvl_calib_ros.cli.demo import private_domain
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 
 from . import Measurement
 

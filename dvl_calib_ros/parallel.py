@@ -58,56 +58,26 @@ def run_all(
 
     Exceptions of `work` propagate. Raises InputError for a cluster that does not answer, or workers that died.
     """
-    if workers.dask:
-        found: dict[int, Outcome] = {}
-        for index, outcome in outcomes_as_done(work, items, workers):
-            if isinstance(outcome, Lost):
-                raise InputError(f"--dask {workers.dask}: {outcome.why}; restart the cluster")
-            found[index] = outcome
-            on_progress(len(found) / len(items))
-        return [found[index] for index in range(len(items))]
-    if workers.jobs == 1 or len(items) == 1:
-        outcomes = []
-        for done, item in enumerate(items, start=1):
-            outcomes.append(work(item))
-            on_progress(done / len(items))
-        return outcomes
-    return _on_cores(work, items, workers.jobs, on_progress)
-
-
-def _on_cores(
-    work: Callable[[Item], Outcome], items: Sequence[Item], jobs: int, on_progress: Callable[[float], None]
-) -> list[Outcome]:
-    outcomes = []
-    for done in outcomes_on_cores(work, items, jobs):
-        outcomes.append(done)
-        on_progress(len(outcomes) / len(items))
-    return outcomes
-
-
-def outcomes_on_cores(work: Callable[[Item], Outcome], items: Iterable[Item], jobs: int) -> Iterator[Outcome]:
-    """Yield `work` of every item in order, as soon as possible. jobs: number of processes, 0: one per core.
-
-    An item is read only when a process is about to be free. Exceptions of `work` propagate. Raises InputError for an
-    item that kills its worker.
-    """
-    early: dict[int, Outcome] = {}
-    following = 0
-    for index, outcome in _as_done_on_cores(work, items, jobs or cores()):
+    if len(items) == 1 and not workers.dask:
+        workers = Workers(jobs=1)
+    found: dict[int, Outcome] = {}
+    for index, outcome in outcomes_as_done(work, items, workers):
         if isinstance(outcome, Lost):
+            if workers.dask:
+                raise InputError(f"--dask {workers.dask}: {outcome.why}; restart the cluster")
             raise InputError("a worker process was killed, perhaps for want of memory; use fewer --jobs")
-        early[index] = outcome
-        while following in early:
-            yield early.pop(following)
-            following += 1
+        found[index] = outcome
+        on_progress(len(found) / len(items))
+    return [found[index] for index in range(len(items))]
 
 
 def outcomes_as_done(
-    work: Callable[[Item], Outcome], items: Sequence[Item], workers: Workers
+    work: Callable[[Item], Outcome], items: Iterable[Item], workers: Workers
 ) -> Iterator[tuple[int, Outcome | Lost]]:
     """Yield index and `work` of each item as it finishes; `Lost` if the item killed its workers.
 
-    Exceptions of `work` propagate. Raises InputError for a cluster that does not answer or lost all workers.
+    On cores an item is read only when a process is about to be free. Exceptions of `work` propagate. Raises InputError
+    for a cluster that does not answer or lost all workers.
     """
     if workers.dask:
         with _quiet_logs():
@@ -197,7 +167,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def _as_done_on_dask(
-    work: Callable[[Item], Outcome], items: Sequence[Item], address: str
+    work: Callable[[Item], Outcome], items: Iterable[Item], address: str
 ) -> Iterator[tuple[int, Outcome | Lost]]:
     """Yield outcomes from a Dask cluster as they come. Raises InputError without scheduler or workers."""
     try:
@@ -217,7 +187,7 @@ def _as_done_on_dask(
             raise InputError(f"--dask {address}: the scheduler has no workers; start some") from error
         # Dask repeats the work of a dead worker elsewhere, as long as the futures exist
         try:
-            yield from _as_done(client, dict(enumerate(client.map(work, items, pure=False))), address)
+            yield from _as_done(client, dict(enumerate(client.map(work, list(items), pure=False))), address)
         except ImportError as error:
             raise InputError(
                 f"--dask {address}: workers lack something ({error}); install this package there"

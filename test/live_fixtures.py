@@ -21,7 +21,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.kalman import GaussianState
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.results.results import Result
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.messages.decode import stamp_ns
 from dvl_calib_ros.messages.live_feed import MessageFeed
 

@@ -11,8 +11,7 @@ Angles are in degrees and lengths in metres where a name says so, else SI. Wrong
 
 from __future__ import annotations
 
-from ..calibration.models.parameter_spec import ParameterError
-from ..calibration.models.parameters import Parameters
+from ..calibration.models.parameters import ParameterError, Parameters
 from ..errors import InputError
 from ..simulation.scenario import Scenario
 from ..verdict.answering import Answering

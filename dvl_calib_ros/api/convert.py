@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from ..calibration.comparison.mounting_change import Comparison
 from ..diagnosis.answer.results import Diagnosis
+from ..disk.text_files import write_json
+from ..errors import InputError
 from ..examination.examine import Examination
 from .arguments import Bags, StrPath, as_path, as_paths, storage_and_compression
 from .calibrated import Calibration
 
 if TYPE_CHECKING:
     from ..bags.recover import Recovered
-    from ..calibration.comparison.mounting_change import Comparison
     from ..evaluation.cross_check import CrossCheck
     from ..evaluation.results import Evaluation
-    from ..files.apply import Applied
+    from ..files.mounting import Applied
     from ..instruments.settings import InstrumentSettings
     from ..logs.trajectories import Imported
     from ..simulator_export.writer import Export
@@ -151,8 +154,7 @@ def apply(
     InputError
         For a file that is no result, a calibration that must not be applied, or a file that cannot be written.
     """
-    from ..files.apply import Targets, write_calibration
-    from ..files.mounting import load_calibrated_mounting
+    from ..files.mounting import Targets, load_calibrated_mounting, write_calibration
 
     targets = Targets(
         as_path(urdf), as_path(output), joint, keep_position, as_path(params), as_path(launch), as_path(fusion)
@@ -245,8 +247,54 @@ def report(
     InputError
         If the file cannot be written, or the page needs a missing history or library.
     """
-    from .reports import write
-
     target = Path(path)
     write(result, target)
     return target
+
+
+# Results as pages and as JSON files.
+
+
+def write(result: object, path: Path) -> None:
+    """Write a result as JSON if the path ends in .json, else as a page. Raises InputError."""
+    document = _plain(result)
+    if path.suffix.lower() == ".json":
+        write_json(path, document())
+        return
+    if isinstance(result, Calibration):
+        result.report(path)
+        return
+    try:
+        from ..present import page
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"{path}: a page needs matplotlib and jinja2 ({error}); pip install matplotlib jinja2"
+        ) from error
+    page.write_report(path, result)
+
+
+def _plain(result: Any) -> Callable[[], Any]:
+    """Return the function that makes plain data of a result. Raises InputError for other objects."""
+    if isinstance(result, Calibration | Examination):
+        return result.document
+    from ..calibration.comparison.mounting_change import comparison_document
+    from ..diagnosis.answer.results import diagnosis_document
+    from ..evaluation.cross_check import CrossCheck, cross_check_document
+    from ..evaluation.documents import evaluation_document
+    from ..evaluation.results import Evaluation
+    from ..unpaired.results import UnpairedComparison, unpaired_document
+    from ..unpaired.simulator_rounds import ClosedGap, closed_gap_document
+
+    documents: dict[type, Callable[[Any], Any]] = {
+        Comparison: comparison_document,
+        Diagnosis: diagnosis_document,
+        Evaluation: evaluation_document,
+        CrossCheck: cross_check_document,
+        UnpairedComparison: unpaired_document,
+        ClosedGap: closed_gap_document,
+    }
+    if type(result) not in documents:
+        raise InputError(
+            f"a {type(result).__name__} is no result; give what replay, compare, doctor, diagnose or evaluate gave"
+        )
+    return partial(documents[type(result)], result)

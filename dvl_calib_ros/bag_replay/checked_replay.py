@@ -14,8 +14,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison.mounting_change import Comparison, compare, contradicts
-from ..calibration.comparison.mounting_change_reasons import between, moved_in_words, scale_changed, suspicious
+from ..calibration.comparison.mounting_change import (
+    Comparison,
+    between,
+    compare,
+    contradicts,
+    moved_in_words,
+    scale_changed,
+    suspicious,
+)
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.error_model import corrected_mounting

@@ -143,7 +143,7 @@ SEPARATOR = "=" * 80 + "\n"
 
 
 class Definition(NamedTuple):
-    """Text of a message definition. is_ros1: whether its messages have ROS 1's layout (ros1.py)."""
+    """Text of a message definition. is_ros1: whether its messages have ROS 1's layout (sources.py)."""
 
     format: MessageDefinitionFormat
     text: str

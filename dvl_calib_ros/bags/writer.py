@@ -22,7 +22,7 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Writer
 from rosbags.typesys import Stores, get_typestore
 
 from ..disk.atomic import NO_SPACE
-from ..disk.yaml_files import load_yaml
+from ..disk.text_files import load_yaml
 from ..errors import InputError
 from .batches import LATEST_NS
 from .channels import Channel, Definition, DefinitionError, typestore

@@ -14,7 +14,6 @@ from .assessment.dead_reckoning import Navigation, SlowNoise, dead_reckoned, dou
 from .assessment.manoeuvre_planner import drift_left_open
 from .estimators.estimator import NEVER, Estimator, Rest
 from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
-from .filters.day_to_day_covariance import day_covariance
 from .filters.filter_setup import nis_bounds
 from .filters.observability import MEASURES_VERTICAL, convergence, observability
 from .models import MODELS, Model
@@ -25,6 +24,7 @@ from .numerics.kalman import GaussianState
 from .numerics.samples import Index, Stamps
 from .registration.registration import Registration
 from .results import results
+from .results.extrinsics import day_covariance
 from .results.held_out_verification import SEVERAL, verify
 from .results.results import Estimate, Verification, estimates_lever_arm
 from .results.thinned_recording import NO_TERMS, Compared, Terms, ThinnedRecording, typical_error, without_outliers

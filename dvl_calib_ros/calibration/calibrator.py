@@ -10,6 +10,7 @@ Neither that nor block_size changes the results, only the speed.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from functools import partial
 
@@ -21,14 +22,13 @@ from .assessment.dead_reckoning import Navigation
 from .assessment.manoeuvre_planner import RecentMotion, recent_motion
 from .assessment.model_selection import Selection
 from .assessor import Assessor, Estimates, NonlinearEstimators
-from .estimators.estimator import Estimator, EstimatorSetup, LinearEstimator, Worker, kind_of
+from .estimators.estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
 from .filters.build_observations import Observer, RowsSeen, own_copy
 from .filters.filter_bank import Group, groups_of
 from .filters.heading_diversity import EVERY_NS, Headings
 from .filters.state_history import Counts, Numbers, StateTrace
 from .models import BROKEN, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
-from .models.parameter_spec import ParameterError
-from .models.parameters import IAC, Parameters
+from .models.parameters import IAC, ParameterError, Parameters
 from .numerics.frames import Array, Vector
 from .numerics.kalman import GaussianState
 from .numerics.samples import (
@@ -93,7 +93,7 @@ class Calibrator:
         verified: bool = False,
         trace: StateTrace | None = None,
         recordings_ns: Sequence[int] = (),
-        worker: Worker | None = None,
+        worker: Executor | None = None,
         models: Collection[str] = tuple(MODELS),
         registration: Registration | None = None,
     ) -> None:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import printable
+from ..errors import InputError, printable
 from ..standard_streams import show
 from . import common
 
@@ -62,8 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Check all files and then write them, or roll back."""
-    from ..errors import InputError
-    from ..files.apply import Targets, roll_back, write_calibration
+    from ..files.mounting import Targets, roll_back, write_calibration
 
     names = ("urdf", "output", "joint", "keep_position", "params", "launch", "fusion")
     targets = Targets(**{name: getattr(arguments, name) for name in names})
@@ -104,9 +103,7 @@ def run(arguments: argparse.Namespace) -> None:
 def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Namespace) -> None:
     """Print an instrument's settings; with the options, also write and send them."""
     from ..disk.atomic import save_bytes
-    from ..errors import InputError
-    from ..instruments.settings import AS_RECORDED, instrument_settings
-    from ..instruments.water_linked import configure
+    from ..instruments.settings import AS_RECORDED, configure, instrument_settings
 
     now = _parse_now(arguments.now)
     chosen = instrument_settings(calibrated, arguments.instrument, now, arguments.force)
@@ -128,8 +125,6 @@ def _apply_to_instrument(calibrated: CalibratedMounting, arguments: argparse.Nam
 
 def _parse_now(words: Sequence[str]) -> dict[str, float]:
     """Parse --now NAME=VALUE. Raises InputError."""
-    from ..errors import InputError
-
     settings = {}
     for word in words:
         name, _, value = word.partition("=")

@@ -100,7 +100,7 @@ def _run(argv: Sequence[str]) -> int:
     """Parse and run. Return the exit code, with errors printed in one line."""
     parser = build_parser(argv)
     arguments = parser.parse_args(argv)
-    from ..calibration.models.parameter_spec import ParameterError
+    from ..calibration.models.parameters import ParameterError
     from ..errors import InputError
 
     recordings = recordings_now(arguments)

@@ -8,8 +8,9 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
+from ..errors import InputError, needing_ros, printable
 from ..standard_streams import give_up
 from . import profile
 
@@ -48,7 +49,8 @@ def add_topic_options(parser: argparse._ActionsContainer) -> None:
 
 
 def add_discovery_options(parser: argparse.ArgumentParser) -> None:
-    """Add --dvl-topic, --gnss-topic and --imu-topic of recordings, whose defaults are found by type and content."""
+    """Add the parameters, and the topics of recordings, whose defaults are found by type and content."""
+    add_parameter_options(parser)
     for role, default in (("dvl", "dvl/twist"), ("gnss", "gnss/twist"), ("imu", "imu/data")):
         none = "" if role == "dvl" else "; none: do without"
         help_ = f"default: {default}, else found by type and content{none}"
@@ -130,8 +132,6 @@ def load(arguments: argparse.Namespace, defaults: Mapping[str, Any] | None = Non
 
 def chosen(option: str, text: str, names: Sequence[str]) -> list[str]:
     """Return the unique names in an option such as ``M3,M7`` or ``all``. Raises InputError for unknown names."""
-    from ..errors import InputError
-
     if text == "all":
         return list(names)
     given = [name.strip() for name in text.split(",") if name.strip()]
@@ -156,7 +156,6 @@ def check_outputs(
     also_read: further inputs. also_written: further outputs, by their names in errors.
     """
     from ..disk.atomic import check_folder_writable, check_writable
-    from ..errors import InputError
     from ..files.output_paths import check_outputs as check_apart
 
     given = {name: value for name, value in vars(arguments).items() if isinstance(value, Path)}
@@ -183,8 +182,6 @@ def console(stderr: bool = False) -> Console:
     """Return a rich console, without styles if the output is no terminal. Each printed string becomes one line."""
     from rich.console import Console as RichConsole
 
-    from ..errors import printable
-
     class Console(RichConsole):
         def print(self, *objects: Any, **options: Any) -> None:
             super().print(*(printable(each) if isinstance(each, str) else each for each in objects), **options)
@@ -192,12 +189,8 @@ def console(stderr: bool = False) -> Console:
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # main handles it; rich would exit with 1
 
-    return Console(stderr=stderr, width=_width(sys.stderr if stderr else sys.stdout), highlight=False, emoji=False)
-
-
-def _width(stream: TextIO) -> int | None:
-    """Return None for a terminal, else 160 columns, enough for every table."""
-    return None if stream.isatty() else 160
+    stream = sys.stderr if stderr else sys.stdout  # 160 columns are enough for every table
+    return Console(stderr=stderr, width=None if stream.isatty() else 160, highlight=False, emoji=False)
 
 
 def print_warnings(notes: Sequence[str]) -> None:
@@ -239,8 +232,6 @@ def progress(what: str) -> Iterator[Callable[[float], None]]:
     from rich.markup import escape
     from rich.progress import Progress
 
-    from ..errors import printable
-
     with Progress(console=console(stderr=True), transient=True) as bar:
         task = bar.add_task(escape(printable(what)), total=1.0)
         yield lambda share: bar.update(task, completed=share)
@@ -258,7 +249,6 @@ def deliver(answer: Callable[[], None], *writes: tuple[Path | None, Callable[[Pa
 
     writes: path (None: not wanted) and the function that writes it. Raises InputError at the end for failed writes.
     """
-    from ..errors import InputError
 
     failed = []
     for path, write in writes:
@@ -284,7 +274,6 @@ def ros_node(what: str, name: str) -> Iterator[tuple[AnsweringNode, Ending]]:
 
     Yields the node and the watch for signals that end the process.
     """
-    from ..errors import needing_ros
     from ..node.shutdown import Ending
 
     with Ending() as ending:
@@ -304,8 +293,6 @@ def ros_node(what: str, name: str) -> Iterator[tuple[AnsweringNode, Ending]]:
 
 def share_folder() -> Path:
     """Return the folder of bags/ and config/: the source tree or share/dvl_calib_ros. Raises InputError."""
-    from ..errors import InputError
-
     candidates = [
         Path(__file__).resolve().parents[2],
         Path(sys.prefix) / "share" / "dvl_calib_ros",
@@ -334,7 +321,6 @@ def report_writer(arguments: argparse.Namespace, name: str = "write_report") -> 
     """
     if arguments.report is None:
         return _no_report
-    from ..errors import InputError
 
     try:
         from ..present import page

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from ..standard_streams import give_up
 from . import common
 from .common import add_report_option, report_writer
@@ -28,15 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("results", nargs="+", type=Path, metavar="RESULT", help="result file (YAML), or a bag")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
     add_report_option(parser)
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Load or calibrate, compare, save, print. Return the exit code."""
-    from ..calibration.comparison.mounting_change import check_distinct, compare
-    from ..calibration.comparison.mounting_change_reasons import comparison_document
-    from ..errors import InputError
+    from ..calibration.comparison.mounting_change import check_distinct, compare, comparison_document
     from ..present import comparison as present
 
     paths: list[Path] = arguments.results

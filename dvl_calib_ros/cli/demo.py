@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
+from ..errors import InputError, needing_ros
 from . import common
 from .common import add_report_option, report_writer
 from .watch import node_command
@@ -40,7 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Play, watch, compare. Return the exit code."""
     from ..calibration.models import MODELS
-    from ..errors import InputError, needing_ros
 
     if not 0.1 <= arguments.speed <= 1000.0:
         raise InputError("--speed: give a number in 0.1 .. 1000")
@@ -125,7 +124,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
     """Print live and replayed estimates; return whether they agree to rounding."""
     import numpy as np
 
-    from ..disk.yaml_files import load_yaml
+    from ..disk.text_files import load_yaml
     from ..files.result_file import load_result
     from ..present.document import Table
     from ..present.error_terms import estimate_table

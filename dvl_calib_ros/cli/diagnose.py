@@ -13,6 +13,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from . import common
 from .common import add_report_option, report_writer
 
@@ -40,7 +41,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("-v", "--verbose", action="store_true", help="print all tables as well")
     add_report_option(parser)
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
     add_simulator_arguments(parser)
 
@@ -56,7 +56,6 @@ def run(arguments: argparse.Namespace) -> int:
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.model.recorded_streams import recording_names
     from ..disk.atomic import own_stream, save_all
-    from ..errors import InputError
     from ..present import diagnosis as present
 
     parameters = common.load(arguments)
@@ -124,7 +123,6 @@ def run(arguments: argparse.Namespace) -> int:
 def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
     """Return parameter files per recording, next to --apply, if there are several. Raises InputError."""
     from ..disk.atomic import own_stream
-    from ..errors import InputError
 
     if path is None or len(names) < 2:
         return {}
@@ -136,7 +134,6 @@ def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
 def _check_twins(folder: Path | None, names: Sequence[str]) -> None:
     """Raise InputError if a twin exists already, before work is done."""
     from ..diagnosis.answer.simulated_twin import twin_paths
-    from ..errors import InputError
 
     if folder is None:
         return
@@ -171,8 +168,6 @@ def add_simulator_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check_without(arguments: argparse.Namespace) -> None:
     """Raise InputError for options that need --simulator."""
-    from ..errors import InputError
-
     for option in NEEDS_SIMULATOR:
         if getattr(arguments, option) is not None:
             raise InputError(f"--{option.replace('_', '-')} works only with --simulator")
@@ -180,7 +175,6 @@ def check_without(arguments: argparse.Namespace) -> None:
 
 def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, float]) -> int:
     """Compare, print, save. Return 1 if the recordings cannot answer."""
-    from ..errors import InputError
     from ..present.result_documents import DOCUMENTS
     from ..unpaired.results import SimulatorVerdict, unpaired_document
     from ..unpaired.simulator_rounds import ClosedGap, against, check_rounds, closed_gap_document

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from ..errors import InputError
 from ..standard_streams import say
 from . import common
 from .common import add_report_option, report_writer
@@ -33,7 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything as JSON")
     add_report_option(parser)
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 
@@ -58,8 +58,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    from ..errors import InputError
-
     if bool(arguments.bags) == (arguments.live is not None):
         raise InputError(
             "name a BAG, or the topics there are: --live" if not arguments.bags else "a BAG or --live, not both"
@@ -83,7 +81,6 @@ def _recordings(arguments: argparse.Namespace) -> Iterator[list[Path]]:
 def _record(path: Path, seconds: float) -> None:
     """Record the live topics for some seconds. Raises InputError if nothing comes."""
     from ..bags.writer import BagWriter
-    from ..errors import InputError
 
     with common.ros_node("--live", "dvl_calib_doctor") as (node, ending):
         from rclpy.executors import SingleThreadedExecutor

@@ -14,6 +14,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from . import common
 from .common import add_report_option, report_writer
 
@@ -37,7 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_report_option(parser)
     parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
     parser.add_argument("--dask", default="", metavar="ADDRESS", help="scheduler to work on, such as tcp://host:8786")
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 
@@ -45,7 +45,6 @@ def run(arguments: argparse.Namespace) -> None:
     """Evaluate, print, save."""
     from ..calibration.models import BY_VELOCITY
     from ..disk.atomic import save_text
-    from ..errors import InputError
     from ..evaluation.documents import evaluation_csv, evaluation_document
     from ..evaluation.protocol import SETS
     from ..evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
@@ -90,8 +89,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _are_bags(paths: list[Path]) -> bool:
     """Return whether the paths are bags rather than a folder of trajectories."""
-    from ..errors import InputError
-
     if not paths:
         return False
     for path in paths:
@@ -106,7 +103,6 @@ def _are_bags(paths: list[Path]) -> bool:
 
 def _cross_check(arguments: argparse.Namespace, models: list[str], workers: Workers) -> None:
     """Check each bag's calibration on the other bags; print and save."""
-    from ..errors import InputError
     from ..evaluation.cross_check import cross_check, cross_check_document
     from ..present import evaluation as present
 

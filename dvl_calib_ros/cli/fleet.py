@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..errors import InputError
 from . import common
 
 
@@ -24,13 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--jobs", type=int, default=0, metavar="N", help="processes; default: one per core")
     parser.add_argument("--dask", default="", metavar="ADDRESS", help="scheduler to work on, such as tcp://host:8786")
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Calibrate new and changed recordings, write the page, print."""
-    from ..errors import InputError
     from ..fleet_catalogue.update import run_fleet
     from ..parallel import Workers
     from ..present.fleet import fleet as present

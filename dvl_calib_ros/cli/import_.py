@@ -60,16 +60,10 @@ def run(arguments: argparse.Namespace) -> None:
     from ..bags.writer import Compression, Storage
     from ..logs.trajectories import ImportOptions, import_files
 
-    options = ImportOptions(
-        frame=arguments.frame,
-        gnss_frame=arguments.gnss_frame,
-        dvl_std=arguments.dvl_std,
-        gnss_std=arguments.gnss_std,
-        start=arguments.start,
-        columns=arguments.columns,
-        storage=Storage(arguments.storage),
-        compression=Compression(arguments.compression),
-    )
+    names = ("frame", "gnss_frame", "dvl_std", "gnss_std", "start", "columns")
+    given = {name: getattr(arguments, name) for name in names}
+    storage, compression = Storage(arguments.storage), Compression(arguments.compression)
+    options = ImportOptions(**given, storage=storage, compression=compression)
     common.check_outputs(arguments, folders=["output"])
     written = import_files(arguments.dvl, arguments.gnss, arguments.attitude, arguments.output, options)
     common.print_warnings([note for imported in written.values() for note in imported.notes])

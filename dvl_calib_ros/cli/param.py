@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from ..errors import InputError
 from ..standard_streams import show
 from . import common
 
@@ -26,7 +27,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Send a request to the node and print the answer. Raises InputError if it refuses or there is no node."""
     from ..calibration.models.parameters import SCHEMA
-    from ..errors import InputError
     from ..files.parameter_files import NODE_NAME, as_yaml, load_parameters
 
     what, name, value = arguments.what, arguments.name, arguments.value
@@ -59,8 +59,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _answer(node: Any, name: str, ask: Any, about: Any) -> Any:
     import rclpy
-
-    from ..errors import InputError
 
     for _ in range(TRIES):
         future = ask(about)

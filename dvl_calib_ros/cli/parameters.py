@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..errors import InputError
 from ..standard_streams import show
 
 # tables of messages by their names in `verdict.reasons`
@@ -42,8 +43,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Print the requested table."""
     if arguments.joint is not None and arguments.urdf is None:
-        from ..errors import InputError
-
         raise InputError("--joint goes with --urdf; name that, too")
     if arguments.effects:
         from ..effects.registry import effect_table

@@ -8,6 +8,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
+from ..errors import InputError
 from ..standard_streams import say
 
 IN_FOLDER = Path(".dvl-calib.yaml")
@@ -39,8 +40,6 @@ def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str
 
 
 def _path(name: str | None) -> Path | None:
-    from ..errors import InputError
-
     if name is None:
         return IN_FOLDER if IN_FOLDER.exists() else None
     if name == "none":
@@ -57,8 +56,7 @@ def _path(name: str | None) -> Path | None:
 
 def _words(path: Path) -> list[str]:
     """Return a profile's content as command-line words. Raises InputError."""
-    from ..disk.yaml_files import load_yaml
-    from ..errors import InputError
+    from ..disk.text_files import load_yaml
     from ..files.parameter_files import as_yaml
 
     content = load_yaml(path, "profile")

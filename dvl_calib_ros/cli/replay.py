@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError
 from . import common
 from .common import add_report_option, report_writer
 
@@ -31,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write estimates, counts and selection as JSON")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the result file (YAML) of the selected model")
     add_report_option(parser)
-    common.add_parameter_options(parser)
     common.add_discovery_options(parser)
 
 
@@ -40,7 +40,6 @@ def run(arguments: argparse.Namespace) -> int:
     from ..bag_replay.checked_replay import checked_replay
     from ..bag_replay.replay import replay_document
     from ..calibration.models import MODELS
-    from ..errors import InputError
     from ..files.result_file import result_document, save_result
     from ..verdict.kinds import Severity
 

@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import InputError, needing_ros
 from ..standard_streams import show
 from . import common
 
@@ -119,17 +120,12 @@ def run(arguments: argparse.Namespace) -> None:
     if recording:
         common.print_warnings(recording.opened.notes)
     scenario = Scenario(
-        trajectory=arguments.trajectory,
+        **{name: getattr(arguments, name) for name in OF_THE_SCENARIO},
         seconds=arguments.duration,
-        seed=arguments.seed,
         errors=DvlErrors(
             (roll, pitch, yaw), (scale[0], scale[1], scale[2]), tuple(arguments.beam_bias), arguments.beam_std
         ),
         mounting_rpy=tuple(arguments.mounting_rpy),
-        dvl_rate=arguments.dvl_rate,
-        gnss_rate=arguments.gnss_rate,
-        imu_rate=arguments.imu_rate,
-        gnss_std=arguments.gnss_std,
         gnss_frame=VelocityFrame(arguments.gnss_frame),
         outages=tuple((start, end) for start, end in arguments.gnss_outage),
         imu_errors=ImuErrors(
@@ -149,6 +145,8 @@ def run(arguments: argparse.Namespace) -> None:
     show(f"wrote {arguments.output}")
 
 
+# options that are fields of a scenario
+OF_THE_SCENARIO = ("trajectory", "seed", "dvl_rate", "gnss_rate", "imu_rate", "gnss_std")
 # options that describe the DVL, as a diagnosis does
 OF_THE_DVL = ("misalignment", "scale", "mounting_rpy", "beam_std", "beam_bias", "dvl_rate")
 
@@ -161,7 +159,6 @@ def _defaults() -> argparse.Namespace:
 
 def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace, scenario: Scenario) -> Scenario:
     """Give the scenario the DVL found by a diagnosis. Raises InputError if options contradict it."""
-    from ..errors import InputError
     from ..simulation.found_effects import with_dvl
     from ..simulator_export.dvl_description import load_description
 
@@ -201,8 +198,6 @@ MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # zero means no such sensor
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    from ..errors import InputError
-
     if len(arguments.scale) not in (1, 3):
         raise InputError("--scale: give one number for all axes, or three")
     for name, (low, high) in LIMITS.items():
@@ -245,8 +240,6 @@ def add_live_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
     """Raise InputError for options that exclude each other. defaults: of all options."""
-    from ..errors import InputError
-
     if not arguments.live:
         if arguments.output is None:
             raise InputError("name a bag to write, or publish with --live")
@@ -267,7 +260,6 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
 
 def run_live(arguments: argparse.Namespace, scenario: Scenario) -> None:
     """Publish until the end, or until Ctrl-C. Raises InputError."""
-    from ..errors import needing_ros
     from ..node.shutdown import Ending
 
     with Ending() as ending:

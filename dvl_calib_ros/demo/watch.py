@@ -19,7 +19,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rich.console import Group
 from rich.table import Table
 
-from ..calibration.results.velocity_correction import NOT_ESTIMATED
+from ..calibration.results.results import NOT_ESTIMATED
 from ..files.parameter_files import NODE_NAME
 from ..node.calibration_node import QUEUE
 from ..node.services import AnsweringNode

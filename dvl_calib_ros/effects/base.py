@@ -7,13 +7,14 @@ a diagnosis.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import ClassVar
 
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 from scipy.spatial.transform import Rotation
 
 from ..calibration.numerics.frames import Array
@@ -256,9 +257,9 @@ class ClockEffect(Effect):
 
     of_the_day = True
 
-    @abstractmethod
     def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """Return the delay (N,) s of the stamps of measurements at times (N,) s since the start."""
+        """Return the delay (N,) s of the stamps of measurements at times (N,) s since the start; here constant."""
+        return np.full(len(elapsed), values["seconds"])
 
 
 class MountingEffect(Effect):
@@ -285,12 +286,82 @@ Disturbance = Callable[[Array, EffectInput], Array]
 class NoiseEffect(AnyEffect, ABC):
     """An effect on the noise. It is random, so it has no trace; the diagnosis has separate tests for it."""
 
-    @abstractmethod
     def disturb(
         self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
     ) -> Array:
-        """Return the samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, with the effect."""
+        """Return the samples (N, 3) m/s of one sensor, in its own frame and at `motion.time`, with the effect.
+
+        One of this method and `following` must be defined.
+        """
+        return self.following(values, rng)(velocity, motion)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
         """Return a function for batches of samples that continue each other. Raises InputError if impossible."""
         raise InputError(f"effect {self.name}: cannot be made sample by sample; simulate a recorded motion instead")
+
+
+# Slopes, and first-order recursions with varying decay, along time.
+
+
+def slopes(time: Array, values: Array) -> Array:
+    """Return slopes (N, k) per s of values (N, k) at times (N,) s, N > 1, faster than `numpy.gradient`."""
+    steps = np.diff(time)
+    between = np.diff(values, axis=0)
+    between /= steps[:, None]
+    found: Array = np.empty_like(between, shape=values.shape)
+    found[:-1], found[-1] = between, between[-1]
+    found[1:-1] += (steps[1:] / (steps[1:] + steps[:-1]))[:, None] * (between[:-1] - between[1:])
+    return found
+
+
+def recursion(decay: Array, added: Array) -> Array:
+    """Return x (N, ...) with x_n = decay_n x_(n-1) + added_n and x_0 = added_0.
+
+    decay: (N,), the first is unused. added: (N, ...). It solves a triangular system with two bands.
+    """
+    if not added.size:
+        return added.copy()
+    bands = np.ones((2, len(added)))
+    bands[1, :-1] = -decay[1:]
+    solved, _ = dtbtrs(bands, added.reshape(len(added), -1), uplo="L", diag="U")
+    return np.ascontiguousarray(solved).reshape(added.shape)
+
+
+@dataclass(frozen=True)
+class Injection:
+    """An effect and the value of each of its parameters."""
+
+    effect: AnyEffect
+    values: Mapping[str, float]
+
+
+def traces(injections: Sequence[Injection], motion: EffectInput, acts_on: ActsOn) -> Array:
+    """Return the sum (N, 3) m/s, body frame, of the systematic effects of one stage."""
+    total = np.zeros_like(motion.velocity_body)
+    for each in injections:
+        if isinstance(each.effect, Effect) and each.effect.acts_on is acts_on:
+            total += each.effect.trace(motion, each.values)
+    return total
+
+
+def at_dvl(injections: Sequence[Injection], motion: EffectInput) -> EffectInput:
+    """Return the DVL's own motion: the reference point's with the traces on MOTION."""
+    return replace(motion, velocity_body=motion.velocity_body + traces(injections, motion, ActsOn.MOTION))
+
+
+def turns(injections: Sequence[Injection], motion: EffectInput) -> Array:
+    """Return (N, 3) rad, or (3,) for all times, of rotation in addition to φ; motion: of the DVL."""
+    total = np.zeros(3)
+    for each in injections:
+        if isinstance(each.effect, MountingEffect):
+            total = total + each.effect.turn(motion, each.values)
+    return total
+
+
+def late(injections: Sequence[Injection], clock: ActsOn, elapsed: Array) -> Array:
+    """Return the delay (N,) s of a clock's stamps for measurements at times (N,) s since the start."""
+    total = np.zeros(len(elapsed))
+    for each in injections:
+        if isinstance(each.effect, ClockEffect) and each.effect.acts_on is clock:
+            total += each.effect.late(elapsed, each.values)
+    return total

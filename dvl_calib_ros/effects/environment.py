@@ -69,26 +69,8 @@ class HeadingError(Effect):
         EffectParameter(
             "cos_rad", "rad", 0.02, -0.5, 0.5, "part in phase with the cosine of yaw", linear=False, said="cos"
         ),
-        EffectParameter(
-            "sin2_rad",
-            "rad",
-            0.02,
-            -0.5,
-            0.5,
-            "part in phase with sin 2ψ",
-            linear=False,
-            said="sin 2ψ",
-        ),
-        EffectParameter(
-            "cos2_rad",
-            "rad",
-            0.02,
-            -0.5,
-            0.5,
-            "part in phase with cos 2ψ",
-            linear=False,
-            said="cos 2ψ",
-        ),
+        EffectParameter("sin2_rad", "rad", 0.02, -0.5, 0.5, "part in phase with sin 2ψ", linear=False, said="sin 2ψ"),
+        EffectParameter("cos2_rad", "rad", 0.02, -0.5, 0.5, "part in phase with cos 2ψ", linear=False, said="cos 2ψ"),
         EffectParameter(
             "rad_per_hour", "rad/h", 0.05, -2.0, 2.0, "part that grows with time", linear=False, said="drift"
         ),

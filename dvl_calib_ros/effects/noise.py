@@ -46,12 +46,6 @@ class StaleSamples(NoiseEffect):
     parameters = (EffectParameter("share", "1", 0.05, 0.0, 1.0, _SHARE),)
     acts_on = ActsOn.DVL
 
-    def disturb(
-        self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
-    ) -> Array:
-        """Replace each stale sample by the last fresh one."""
-        return self.following(values, rng)(velocity, motion)
-
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
         """Return a function that remembers the last fresh sample."""
         last: Array = np.empty((0, 3))
@@ -110,12 +104,6 @@ class ColouredReferenceNoise(NoiseEffect):
         ),
     )
     acts_on = ActsOn.REFERENCE
-
-    def disturb(
-        self, velocity: Array, motion: EffectInput, values: Mapping[str, float], rng: np.random.Generator
-    ) -> Array:
-        """Add first-order Gauss-Markov noise, exact for any sampling interval."""
-        return self.following(values, rng)(velocity, motion)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
         """Return a function that remembers the last noise and its time."""

@@ -13,48 +13,35 @@ from itertools import chain, groupby
 from typing import Generic, TypeVar
 
 from ..errors import InputError
+from . import environment, kinematic, noise, sensor, timing
 from .base import ActsOn, AnyEffect, ClockEffect, Effect, MountingEffect, NoiseEffect
-from .environment import HeadingError, WaterLock
-from .kinematic import LeverArm, Sideslip, TiltCoupling
-from .noise import ColouredReferenceNoise, NoiseInflation, Outliers, StaleSamples
-from .sensor import (
-    AxisNonorthogonality,
-    MisalignmentDrift,
-    MountFlexure,
-    MountingMoved,
-    QuadraticScale,
-    ScaleDrift,
-    SoundSpeedMoved,
-    VelocityBias,
-)
-from .timing import AttitudeTimeOffset, ClockDrift, DvlTimeOffset, ReferenceLag, ReferenceTimeOffset, TimeOffsetJump
 
 ENTRY_POINTS = "dvl_calib_ros.effects"
 
 OWN: tuple[type[AnyEffect], ...] = (
-    LeverArm,
-    DvlTimeOffset,
-    ReferenceTimeOffset,
-    AttitudeTimeOffset,
-    TimeOffsetJump,
-    ClockDrift,
-    ReferenceLag,
-    VelocityBias,
-    QuadraticScale,
-    ScaleDrift,
-    MisalignmentDrift,
-    MountFlexure,
-    AxisNonorthogonality,
-    HeadingError,
-    WaterLock,
-    Sideslip,
-    TiltCoupling,
-    MountingMoved,
-    SoundSpeedMoved,
-    Outliers,
-    StaleSamples,
-    NoiseInflation,
-    ColouredReferenceNoise,
+    kinematic.LeverArm,
+    timing.DvlTimeOffset,
+    timing.ReferenceTimeOffset,
+    timing.AttitudeTimeOffset,
+    timing.TimeOffsetJump,
+    timing.ClockDrift,
+    timing.ReferenceLag,
+    sensor.VelocityBias,
+    sensor.QuadraticScale,
+    sensor.ScaleDrift,
+    sensor.MisalignmentDrift,
+    sensor.MountFlexure,
+    sensor.AxisNonorthogonality,
+    environment.HeadingError,
+    environment.WaterLock,
+    kinematic.Sideslip,
+    kinematic.TiltCoupling,
+    sensor.MountingMoved,
+    sensor.SoundSpeedMoved,
+    noise.Outliers,
+    noise.StaleSamples,
+    noise.NoiseInflation,
+    noise.ColouredReferenceNoise,
 )
 
 E = TypeVar("E", bound=AnyEffect)

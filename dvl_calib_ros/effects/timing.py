@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.delay_search import LONGEST_S
-from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory
-from .recursion import recursion, slopes
+from .base import ActsOn, ClockEffect, EffectInput, EffectNeeds, EffectParameter, EffectWithMemory, recursion, slopes
 
 # search range of the clock registration
 LONGEST_OFFSET_S = LONGEST_S
@@ -42,10 +41,6 @@ class DvlTimeOffset(_DvlClock):
     manoeuvre = "straight legs that speed up and slow down, in waves or with quick changes of speed"
     parameters = _seconds("delay of the stamps")
     confounded_with = ("reference_time_offset", "reference_lag", "attitude_time_offset")
-
-    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """Return τ."""
-        return np.full(len(elapsed), values["seconds"])
 
 
 class TimeOffsetJump(_DvlClock):
@@ -104,10 +99,6 @@ class ReferenceTimeOffset(ClockEffect):
     acts_on = ActsOn.REFERENCE_CLOCK
     confounded_with = ("dvl_time_offset", "reference_lag", "attitude_time_offset", "sideslip", "lever_arm")
 
-    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """Return τ."""
-        return np.full(len(elapsed), values["seconds"])
-
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return g(t) - g(t - τ), in the frame in which the reference was recorded, rotated to the body."""
         reference = _in_reference_frame(motion, motion.velocity_body)
@@ -126,10 +117,6 @@ class AttitudeTimeOffset(ClockEffect):
     acts_on = ActsOn.ATTITUDE_CLOCK
     needs = frozenset({EffectNeeds.ATTITUDE})
     confounded_with = ("dvl_time_offset", "reference_time_offset", "sideslip", "lever_arm")
-
-    def late(self, elapsed: Array, values: Mapping[str, float]) -> Array:
-        """Return τ."""
-        return np.full(len(elapsed), values["seconds"])
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
         """Return v - R(t - τ)ᵀ R(t) v; a body-frame reference needs no attitude, except for a lever arm."""

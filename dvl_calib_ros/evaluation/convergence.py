@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
-from ..calibration.numerics.kalman import GaussianState
 from . import protocol
 from .estimation import SensorData, estimate
 from .metrics import BASELINES
@@ -54,7 +53,7 @@ def squared_errors(
         free = [name for name in _FREE if name in models] if std == REFERENCE_STD[0] else []
         states = estimate([*aided, *free], data, parameters.replace(gnss_aided_std=std), ends, failures)
         for name, state in states.items():
-            by_key[name, None if name in free else std] = _of_states(state, truth)
+            by_key[name, None if name in free else std] = mean_of_known((state.x[..., :3] - truth) ** 2, 1)
         for name, align in BASELINES.items():
             try:
                 rotations = [
@@ -67,10 +66,6 @@ def squared_errors(
             by_key[name, std] = (off**2).mean(axis=1)
     missing = np.full((len(TIMES_S), 3), np.nan)
     return np.stack([by_key.get(key, missing) for key in curve_keys(models)])
-
-
-def _of_states(state: GaussianState, truth: Array) -> Array:
-    return mean_of_known((state.x[..., :3] - truth) ** 2, 1)
 
 
 def _rotation_errors(body_from_dvl: Array, misalignment: Array) -> Array:

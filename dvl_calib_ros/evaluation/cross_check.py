@@ -26,8 +26,7 @@ from ..discovery.discover import discover
 from ..discovery.discovery import Given
 from ..errors import InputError
 from ..parallel import Workers, run_all
-from ..recordings.recording import open_recording
-from ..recordings.requirements import hold_the_same
+from ..recordings.recording import hold_the_same, open_recording
 from ..recordings.topic_messages import Recorded
 from ..verdict.answering import Answering
 from ..version import __version__

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.build_observations import Observer
+from ..calibration.filters.filter_bank import RelativeHeight
 from ..calibration.filters.filter_setup import Assembler
-from ..calibration.filters.relative_height import RelativeHeight
 from ..calibration.models import MODELS, Model, Needs
 from ..calibration.models.base import Observations
 from ..calibration.models.parameters import Parameters
@@ -106,13 +106,10 @@ def aligned(data: SensorData, parameters: Parameters) -> AlignedVariants:
             (Needs.NOTHING, rows.usable), (Needs.ATTITUDE, rows.oriented), (Needs.REFERENCE, rows.paired)
         )
     }  # fmt: skip
-    rows = replace(rows, attitude=np.nan_to_num(rows.attitude), reference=_finite(rows.reference))
+    # missing velocities are 0; covariances are unchanged
+    reference = np.concatenate([np.nan_to_num(rows.reference[:, :3]), rows.reference[:, 3:]], axis=1)
+    rows = replace(rows, attitude=np.nan_to_num(rows.attitude), reference=reference)
     return AlignedVariants(rows, has, np.array([sway_heave for _, sway_heave in found]))
-
-
-def _finite(reference: Array) -> Array:
-    """Replace missing velocities by 0; covariances are unchanged."""
-    return np.concatenate([np.nan_to_num(reference[:, :3]), reference[:, 3:]], axis=1)
 
 
 def estimate(
@@ -123,15 +120,12 @@ def estimate(
     Returns x (E, B, n) and P (E, B, n, n) by the model's name. parameters: without process noise, lever arm or
     mounting. A variant whose estimation raises is nan in that model only, and is added to `failures`.
     """
-    able = [name for name in models if MODELS[name].needs is not Needs.ATTITUDE or _has_attitude(data)]
+    has_attitude = data.run.rotation_enu_from_body is not None
+    able = [name for name in models if has_attitude or MODELS[name].needs is not Needs.ATTITUDE]
     try:
         return _estimate(able, data, parameters, ends)
     except Exception:  # repeat individually, so that an exception affects only its own variant
         return {name: _estimate_by_variant(name, data, parameters, ends, failures) for name in able}
-
-
-def _has_attitude(data: SensorData) -> bool:
-    return data.run.rotation_enu_from_body is not None
 
 
 def _estimate_by_variant(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 import textwrap
@@ -14,26 +15,20 @@ import numpy as np
 
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_of_document
 from ..calibration.filters.observability import Convergence, observability
-from ..calibration.models import MODELS, REPLACED, Model
-from ..calibration.models.parameter_spec import ParameterError
-from ..calibration.models.parameters import FRD, Parameters
+from ..calibration.models import MODELS, Model
+from ..calibration.models.parameters import FRD, ParameterError, Parameters
 from ..calibration.numerics.error_model import corrected_mounting
-from ..calibration.numerics.frames import (
-    FLU_FROM_FRD,
-    Array,
-    rotation_from_rpy,
-    rpy_from_rotation,
-)
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.extrinsics import N_AXES, Extrinsics, dvl_in_words, extrinsics_of, rejection
-from ..calibration.results.results import position_in_body, scale_and_delay
-from ..calibration.results.velocity_correction import lever_arm
+from ..calibration.results.results import lever_arm, position_in_body, scale_and_delay
+from ..disk.atomic import backup_of, own_stream, save_all
 from ..errors import InputError, printable
 from ..verdict.kinds import VERDICT_WORDS, Severity
 from ..version import __version__
 from .parameter_files import NODE_NAME, as_yaml, changed_parameters, load_parameters, new_file, with_parameters
 from .result_file import load_result, static_transform_arguments
-from .urdf import Urdf, UrdfMounting, numbers
+from .urdf import Urdf, UrdfMounting, numbers, read_urdf
 
 # tolerance (rad) for the initial mounting, which may be written by hand with three digits
 SAME_MOUNTING = 2e-3
@@ -129,8 +124,6 @@ class CalibratedMounting:
 def load_calibrated_mounting(path: Path) -> CalibratedMounting:
     """Read a result file. Raises InputError if it is none, is damaged, or was changed by hand."""
     content, states = load_result(path)
-    if (name := str(content.get("model"))) in REPLACED:
-        raise InputError(f"{path}: it is of model {name}, which {REPLACED[name]} replaces; replay its recording again")
     try:
         model = MODELS[content["model"]]
         state = states[model.name]
@@ -392,10 +385,8 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
         used = int(content["models"][model.name]["used"])
         span = content["time_span"]["first_ns"], content["time_span"]["last_ns"]
         first_ns, last_ns = (0, 0) if used == 0 else map(int, span)
-        none = np.zeros((model.n_state, N_AXES))
         rejected = rejection(content.get("verification", {}).get("findings", ()))
-        # older files lack it: the effect of a bias is then treated as independent
-        by_bias = np.array(content["models"][model.name].get("by_dvl_bias", none), dtype=float).reshape(none.shape)
+        by_bias = np.array(content["models"][model.name]["by_dvl_bias"], dtype=float).reshape(model.n_state, N_AXES)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path}: damaged, or of another version ({type(error).__name__}: {error})") from error
     if not used:
@@ -421,3 +412,113 @@ def load_extrinsics(path: Path, name: str) -> Extrinsics:
         by_bias=by_bias,
         rejected=rejected,
     )
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Files to write a calibration into; None for no file.
+
+    urdf: its DVL joint is rotated and moved. output: URDF to write instead. joint: the DVL's joint; None: the one above
+    the DVL's frame. keep_position: keep its xyz. params: parameter file of the node. launch: launch file (XML) with a
+    static transform. fusion: parameters of robot_localization (YAML). Raises InputError for options that need a URDF
+    without one.
+    """
+
+    urdf: Path | None = None
+    output: Path | None = None
+    joint: str | None = None
+    keep_position: bool = False
+    params: Path | None = None
+    launch: Path | None = None
+    fusion: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.urdf is None and (self.output is not None or self.joint is not None or self.keep_position):
+            raise InputError("--output, --joint and --keep-position go with --urdf; name that, too")
+
+    @property
+    def paths(self) -> list[Path]:
+        """Paths of the files to write."""
+        urdf = self.output or self.urdf
+        return [path for path in (urdf, self.params, self.launch, self.fusion) if path is not None]
+
+
+@dataclass(frozen=True)
+class Applied:
+    """Result of applying a calibration.
+
+    written: new or changed files, also planned ones. unchanged: files that already had the values. kept: path of each
+    replaced file's backup. notes: remarks for users of the files. changes: planned changes of a dry run, as a unified
+    diff.
+    """
+
+    written: tuple[Path, ...]
+    unchanged: tuple[Path, ...]
+    kept: dict[Path, Path]
+    notes: tuple[str, ...]
+    changes: str = ""
+
+
+def write_calibration(
+    calibrated: CalibratedMounting, targets: Targets, force: bool = False, dry_run: bool = False
+) -> Applied:
+    """Write a calibration into all files, or into none. Each previous file is kept as a backup.
+
+    force: also for a calibration that is rejected, not converged, or of another mounting. dry_run: write nothing,
+    return the planned changes. Raises InputError.
+    """
+    if targets.paths:
+        calibrated.check_applicable(force)
+    contents, notes = _contents(calibrated, targets, force)
+    existing = [path for path in contents if own_stream(path) is None and path.exists()]
+    new = {path: content for path, content in contents.items() if path not in existing or path.read_bytes() != content}
+    unchanged = tuple(path for path in contents if path not in new)
+    if dry_run:
+        before = {path: path.read_bytes() if path in existing else b"" for path in new}
+        changes = "".join(_difference(path, before[path], content) for path, content in new.items())
+        return Applied(tuple(new), unchanged, {}, tuple(notes), changes)
+    save_all(new)  # a new URDF with old parameters would apply the rotation twice or not at all
+    kept = {path: backup_of(path) for path in new if path in existing}
+    return Applied(tuple(new), unchanged, kept, tuple(notes))
+
+
+def _difference(path: Path, before: bytes, after: bytes) -> str:
+    old, new = (text.decode(errors="replace").splitlines() for text in (before, after))
+    lines = difflib.unified_diff(old, new, printable(str(path)), "would be", n=1, lineterm="")
+    return "".join(f"{printable(line)}\n" for line in lines)
+
+
+def _contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> tuple[dict[Path, bytes], list[str]]:
+    """Return new contents by file, and notes."""
+    contents: dict[Path, bytes] = {}
+    notes = []
+    if targets.urdf is not None:
+        urdf = read_urdf(targets.urdf)
+        mounting = urdf.mounting(calibrated.base_frame, calibrated.dvl_frame, targets.joint)
+        contents[targets.output or targets.urdf] = calibrated_urdf(
+            urdf, mounting, calibrated, force, targets.keep_position
+        )
+        if urdf.generated:
+            notes.append(f"{targets.urdf} was generated by xacro, whose next run overwrites it: change its source, too")
+    if targets.params is not None:
+        contents[targets.params] = calibrated_parameters(targets.params, calibrated, force)
+    if targets.launch is not None:
+        contents[targets.launch] = launch_file(calibrated).encode()
+    if targets.fusion is not None:
+        contents[targets.fusion] = fusion_file(calibrated).encode()
+    return contents, notes
+
+
+def roll_back(targets: Targets) -> dict[Path, Path]:
+    """Restore the backups; the replaced files become the backups. Return the backup of each file. Raises InputError."""
+    if not targets.paths:
+        raise InputError("--rollback: name the files again, with --urdf, --params, --launch or --fusion")
+    before: dict[Path, bytes] = {}
+    for path in targets.paths:
+        backup = backup_of(path)
+        try:
+            before[path] = backup.read_bytes()
+        except OSError as error:
+            raise InputError(f"{backup}: cannot be read ({error.strerror}); there is nothing to go back to") from error
+    save_all(before)  # the current files become the backups
+    return {path: backup_of(path) for path in before}

@@ -13,9 +13,8 @@ from typing import Any
 import yaml
 
 from ..calibration.models import MODELS
-from ..calibration.models.parameter_spec import ParameterError
-from ..calibration.models.parameters import SCHEMA, Parameters
-from ..disk.yaml_files import compose_yaml, load_yaml, parse_scalar
+from ..calibration.models.parameters import SCHEMA, ParameterError, Parameters
+from ..disk.text_files import compose_yaml, load_yaml, parse_scalar
 from ..errors import InputError
 from ..messages.drivers import TYPES_OF, may_be_recognised, velocity_type
 from ..messages.field_map import field_map

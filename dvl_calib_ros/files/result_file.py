@@ -43,7 +43,7 @@ from ..calibration.results.results import (
     scale_and_delay,
 )
 from ..disk.atomic import own_stream, save_bytes
-from ..disk.yaml_files import load_yaml
+from ..disk.text_files import load_yaml
 from ..errors import InputError, printable
 from ..verdict.kinds import Severity
 from ..verdict.reasons import finding
@@ -391,8 +391,7 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
     models = content.get("models")
     if not isinstance(models, dict) or not models:
         raise InputError(f"{path}: damaged, it holds no models")
-    # older files do not announce the end; their last entry is the parameters
-    if "parameters" not in content or ("ends_with" in content and content.get(_END) is not True):
+    if content.get(_END) is not True:
         raise InputError(f"{path}: damaged, its end is missing")
     known = {
         name: _gaussian(f"{path}: models: {name}", name, saved, of_recording)
@@ -432,30 +431,15 @@ def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequen
         )
 
 
-def _with_new_states(name: str, names: tuple[str, ...], x: Array, p: Array) -> tuple[tuple[str, ...], Array, Array]:
-    """Add a model's newer nuisance states with their prior to an older file's states; return others unchanged."""
-    model = MODELS[name]
-    at = [index for index, each in enumerate(model.state_names) if each in names]
-    ordered = names == tuple(model.state_names[index] for index in at) and len(names) < model.n_state
-    whole = x.shape == (len(names),) and p.shape == (len(names), len(names))
-    if not ordered or not whole or at[: model.n_errors] != [*range(model.n_errors)]:
-        return names, x, p
-    start = prior(model, Parameters())
-    start.x[at] = x
-    start.p[np.ix_(at, at)] = p
-    return model.state_names, *start
-
-
 def _gaussian(where: str, name: str, saved: Any, of_recording: bool) -> GaussianState:
-    published = _with_covariance(where, name, saved, "covariance")
-    if "covariance_of_recording" not in saved:  # older files have only one covariance
-        return published
-    recorded = _with_covariance(where, name, saved, "covariance_of_recording")
+    """Return a saved state with one of its two covariances, both checked. Raises InputError."""
+    keys = ("covariance", "covariance_of_recording")
+    published, recorded = (_with_covariance(where, name, saved, key) for key in keys)
     return recorded if of_recording else published
 
 
 def _with_covariance(where: str, name: str, saved: Any, key: str) -> GaussianState:
-    """Return a saved state with one of its covariances, both checked. Raises InputError."""
+    """Return a saved state with the covariance of this key, both checked. Raises InputError."""
     model = MODELS[name]
     try:
         x = np.array(saved["state"], dtype=float)
@@ -463,7 +447,6 @@ def _with_covariance(where: str, name: str, saved: Any, key: str) -> GaussianSta
         names = tuple(saved["state_names"])
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: damaged ({type(error).__name__}: {error})") from error
-    names, x, p = _with_new_states(name, names, x, p)
     if names != model.state_names or x.shape != (model.n_state,) or p.shape != (model.n_state, model.n_state):
         raise InputError(f"{where}: states {names} are not the model's, {model.state_names}")
     if not np.isfinite(x).all() or not np.isfinite(p).all() or not np.allclose(p, p.T, rtol=1e-9, atol=0.0):

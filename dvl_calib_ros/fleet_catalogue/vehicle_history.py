@@ -1,6 +1,6 @@
 """History of each vehicle's mounting by day, and recordings that need a person.
 
-Recordings of one day share the variation between days (`day_to_day_covariance`): they are averaged by their own σ, and
+Recordings of one day share the variation between days (`day_covariance`): they are averaged by their own σ, and
 the day's σ is added once. A mounting that moves within a day splits the day.
 """
 

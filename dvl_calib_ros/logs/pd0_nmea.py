@@ -12,13 +12,74 @@ import re
 import struct
 from collections import Counter, defaultdict
 from collections.abc import Sequence
+from datetime import datetime, timezone
+from functools import reduce
+from operator import xor
+from pathlib import Path
 
 import numpy as np
 
 from ..calibration.numerics.frames import Array, over_ground
 from ..calibration.numerics.samples import ReferenceSample, VelocityFrame
+from ..errors import InputError
 from ..messages.positions import FixDifference
-from .nmea import KNOT, STANDING, xor
+
+_RMC = re.compile(rb"\$(\w{2}RMC,[^*\r\n]*)\*([0-9A-Fa-f]{2})")
+_SNIFFED = 65536
+KNOT = 1852.0 / 3600.0
+# a slower receiver gives no course, which does not matter, m/s
+STANDING = 0.05
+
+
+def is_nmea(path: Path) -> bool:
+    """Return whether the beginning of a file has RMC sentences."""
+    if not path.is_file():  # a pipe would block
+        return False
+    try:
+        with path.open("rb") as file:
+            return _RMC.search(file.read(_SNIFFED)) is not None
+    except OSError:
+        return False  # the reader reports the error
+
+
+def read_rmc(path: Path, std: float, notes: list[str]) -> list[ReferenceSample]:
+    """Read horizontal velocities in ENU (vertical exactly 0), stamped by UTC; std (m/s) 0: covariance not given.
+
+    notes: receives remarks on skipped data. Raises InputError if there is no usable sentence.
+    """
+    covariance = np.eye(3) * std**2 if std else None
+    found: dict[int, ReferenceSample] = {}
+    damaged = without = 0
+    for text, checksum in _RMC.findall(path.read_bytes()):
+        if checksum_of(text) != int(checksum, 16):
+            damaged += 1
+            continue
+        try:
+            fields = text.decode("ascii").split(",")
+            speed = float(fields[7]) * KNOT
+            course = math.radians(float(fields[8])) if fields[8] or speed > STANDING else 0.0
+            at = datetime.strptime(fields[9] + fields[1].partition(".")[0], "%d%m%y%H%M%S").replace(tzinfo=timezone.utc)
+            fraction = float("0." + (fields[1].partition(".")[2] or "0"))
+            if fields[2] != "A" or not 0.0 <= speed < 100.0:
+                raise ValueError
+        except (ValueError, IndexError):
+            without += 1
+            continue
+        stamp_ns = int(at.timestamp()) * 1_000_000_000 + round(fraction * 1e9)
+        east, north, up = over_ground(speed, course).tolist()
+        found[stamp_ns] = ReferenceSample(stamp_ns, (east, north, up), covariance, VelocityFrame.ENU)
+    if not found:
+        raise InputError(f"{path}: no RMC sentence with a fix, time, date, speed and course in it")
+    for count, why in ((damaged, "have a wrong checksum"), (without, "have no fix, time, speed or course")):
+        if count:
+            notes.append(f"{path}: {count} RMC sentences {why}, left out")
+    return [found[at] for at in sorted(found)]
+
+
+def checksum_of(text: bytes) -> int:
+    """Return a sentence's checksum: of the bytes between $ and *."""
+    return reduce(xor, text, 0)
+
 
 GENERAL_NMEA = 0x2022
 _HEAD = struct.Struct("<HHHd")  # data ID, specific ID, size of the message, time difference
@@ -108,7 +169,7 @@ def _of_text(kind: str, sentence: re.Match[bytes]) -> list[float]:
     name, text, checksum = sentence.groups()
     fields = text.decode("ascii").split(",")
     whole = sentence[0][1:].partition(b"*")[0]
-    if name.decode() != kind or (checksum is not None and xor(whole) != int(checksum, 16)):
+    if name.decode() != kind or (checksum is not None and checksum_of(whole) != int(checksum, 16)):
         raise ValueError
     if kind == _HDT:
         return [math.radians(float(fields[0]))]

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..calibration.numerics.samples import DvlSample
 from .dvl_log import DvlLog, imu_samples
-from .nmea import xor
+from .pd0_nmea import checksum_of
 
 _SECOND_NS = 1_000_000_000
 _SENTENCE = re.compile(rb"\$((?:PNORBT|DVPDL)[^*\r\n]*)\*([0-9A-Fa-f]{2})")
@@ -75,7 +75,7 @@ def read_sentences(_: Path, content: bytes) -> DvlLog:
     beam_ns = 0
     for text, checksum in _SENTENCE.findall(content):
         name, *fields = text.decode("ascii", "replace").split(",")
-        if xor(text) != int(checksum, 16):
+        if checksum_of(text) != int(checksum, 16):
             left_out["with a wrong checksum"] += 1
             continue
         try:

@@ -5,25 +5,93 @@ Columns are identified by their order. A header is checked for the units (``Time
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 import os
 import re
 import shutil
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from ..bags.writer import BagWriter, Compression, Storage
-from ..calibration.numerics.frames import FLU_FROM_FRD, Array
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, over_ground
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from ..errors import InputError
 from ..messages.encode import SampleWriter, SatelliteFix
-from .column_map import column_map, read_table
-from .csv_columns import EXPECTED, N_COLUMNS, SHOWN, _is_number, cells, numbers_of, stamps_ns
 from .dvl_log import DvlLog, imu_samples
 from .dvl_logs import is_dvl_log, read_dvl_log
+from .pd0_nmea import KNOT
+
+# Columns of numbers and stamps in CSV files.
+
+N_COLUMNS = 4
+# cells that mean a missing value, in addition to nan
+NO_VALUE = ("", "na", "n/a", "null", "none", "-")
+EXPECTED = "time and three values, separated by commas, with decimal points"
+# number of characters shown of a bad row
+SHOWN = 200
+
+
+def cells(path: Path) -> tuple[list[list[str]], list[str]]:
+    """Return the non-empty rows of a CSV file, and notes on the file. Raises InputError."""
+    try:
+        text = path.read_text(encoding="utf-8-sig").rstrip("\0")  # a file cut by a power failure may end in zeros
+        rows = [row for row in csv.reader(io.StringIO(text)) if row]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: cannot be read as CSV ({error}); save it as such, in UTF-8") from error
+    left_out = []
+    if len(rows) > 1 and not text.endswith("\n"):
+        left_out.append(f"{path}: its last line is not finished, and left out: {','.join(rows.pop())[:SHOWN]}")
+    return rows, left_out
+
+
+def numbers_of(path: Path, rows: Sequence[Sequence[str]], at: Sequence[int], n_columns: int) -> Array:
+    """Return columns `at` of rows (N, k), nan for missing values. Raises InputError naming file and row."""
+    values = []
+    for number, row in enumerate(rows, start=1):
+        if len(row) != n_columns:
+            expected = EXPECTED if n_columns == N_COLUMNS else f"{n_columns}, as the header has"
+            raise InputError(f"{path}: data row {number} has {len(row)} columns, expected {expected}")
+        try:
+            values.append([math.nan if row[i].strip().lower() in NO_VALUE else _number(row[i]) for i in at])
+        except ValueError:
+            shown = ",".join(row)[:SHOWN]
+            raise InputError(f"{path}: data row {number} is not all numbers: {shown}; expected {EXPECTED}") from None
+    return np.array(values, dtype=float).reshape(-1, len(at))
+
+
+def _number(text: str) -> float:
+    """Parse a number. Raises ValueError if invalid, also for 1_0, which Python reads as ten."""
+    if "_" in text:
+        raise ValueError
+    return float(text)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        _number(text)
+    except ValueError:
+        return False
+    return True
+
+
+def stamps_ns(path: Path, time: Array, start_ns: int) -> list[int]:
+    """Convert times (N,) s after a start to integer nanoseconds. Raises InputError if a stamp cannot represent them."""
+    stamps = [start_ns + round(float(t) * 1e9) for t in time]
+    if stamps[0] < 0 or stamps[-1] >= 2**31 * 1_000_000_000:
+        raise InputError(
+            f"{path}: from {time[0]:.12g} to {time[-1]:.12g} s, after --start, is not in 1970 .. 2038; times are "
+            "seconds, and those since 1970 need --start 0"
+        )
+    return stamps
+
 
 FRAMES = ("frd", "flu", "enu", "ned")  # the body's frames first
 SUFFIXES = ("csv", "npy")
@@ -214,12 +282,13 @@ def import_recording(
     else:
         log = DvlLog(read_dvl(dvl, start_ns, options.frame, options.dvl_std, notes), Counter())
     references = list(log.references) if gnss is None else _references(gnss, options, notes)
-    fixes = [] if gnss is None else _fixes(gnss, start_ns, notes)
+    has_fixes = gnss is not None and names_columns(gnss, "latitude", "longitude")
+    fixes = read_positions(gnss, start_ns, notes) if gnss is not None and has_fixes else []
     if attitude is None:
         attitudes = list(log.attitudes)
         notes += log.notes
     else:
-        attitudes = _attitudes(attitude, start_ns, notes)
+        attitudes = (read_heading if names_columns(attitude, "heading") else read_attitude)(attitude, start_ns, notes)
     with BagWriter(output, options.storage, options.compression) as bag:
         writer = SampleWriter(bag)
         if log.nominal_yaw:
@@ -234,8 +303,7 @@ def import_recording(
 
 
 def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[ReferenceSample]:
-    from .course_and_heading import names_columns, read_course  # imports this module
-    from .nmea import is_nmea, read_rmc
+    from .pd0_nmea import is_nmea, read_rmc
 
     if is_nmea(path):
         return read_rmc(path, options.gnss_std, notes)
@@ -244,18 +312,6 @@ def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[Re
     if names_columns(path, "latitude", "longitude"):
         return []
     return read_reference(path, options.start_ns, options.gnss_frame, options.gnss_std, notes)
-
-
-def _fixes(path: Path, start_ns: int, notes: list[str]) -> list[SatelliteFix]:
-    from .course_and_heading import names_columns, read_positions
-
-    return read_positions(path, start_ns, notes) if names_columns(path, "latitude", "longitude") else []
-
-
-def _attitudes(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
-    from .course_and_heading import names_columns, read_heading
-
-    return (read_heading if names_columns(path, "heading") else read_attitude)(path, start_ns, notes)
 
 
 def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Path, Imported]:
@@ -278,3 +334,191 @@ def import_folder(folder: Path, output: Path, options: ImportOptions) -> dict[Pa
 
 def _file(folder: Path, stem: str) -> Path | None:
     return next((path for kind in SUFFIXES if (path := folder / f"{stem}.{kind}").is_file()), None)
+
+
+# Text tables of any layout, read by a map of their columns.
+#
+# The map is time=NAME,vx=NAME,vy=NAME,vz=NAME,valid=NAME. A column is given by its name in the header or by its number
+# from 1. Time is in seconds, in ISO 8601, or a time of day with its date (``time=Date+Time``). The separator (comma,
+# semicolon, tab) is detected.
+
+_NEEDED, _KEYS = ("time", "vx", "vy", "vz"), ("time", "vx", "vy", "vz", "valid")
+_SEPARATORS = ",;\t"
+# from here on numbers are seconds since 1970 (this is 2001); smaller ones count from a start
+_SINCE_1970_S = 1e9
+_FALSE = ("", "0", "false", "f", "no", "invalid", "v", "nan")
+# formats of loggers for a date and a time of day
+_FORMATS = ("%m/%d/%Y %H:%M:%S.%f", "%m/%d/%Y %H:%M:%S", "%d.%m.%Y %H:%M:%S.%f", "%d.%m.%Y %H:%M:%S")
+
+
+def column_map(text: str) -> Mapping[str, str]:
+    """Return the column's name of each key. Raises InputError."""
+    pairs = [part.partition("=")[::2] for part in text.split(",")]
+    found = {key.strip(): name.strip() for key, name in pairs}
+    missing = [key for key in _NEEDED if not found.get(key)]
+    unknown = [key for key in found if key not in _KEYS]
+    if missing or unknown:
+        what = f"{unknown[0]!r} is none of {', '.join(_KEYS)}" if unknown else f"{missing[0]} is missing"
+        raise InputError(f"--columns: {what}; write time=NAME,vx=NAME,vy=NAME,vz=NAME,valid=NAME")
+    return found
+
+
+def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float) -> DvlLog:
+    """Read the velocities of a table. Raises InputError naming file and column.
+
+    text: the map. start_ns: stamp of time 0. rotation: (3, 3) to forward-left-up. std: m/s; 0: covariance not given.
+    """
+    names = column_map(text)
+    if not path.is_file():  # a pipe would block
+        raise InputError(f"{path}: no such file")
+    try:
+        lines = path.read_text(encoding="utf-8-sig").rstrip("\0").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as text ({error}); save it in UTF-8") from error
+    first = next((line for line in lines if line.strip()), "")
+    rows = [row for row in csv.reader(lines, delimiter=max(_SEPARATORS, key=first.count)) if row]
+    at = {key: [_place(path, rows[:1], name) for name in names[key].split("+")] for key in names}
+    covariance = np.eye(3) * std**2 if std else None
+    samples: list[DvlSample] = []
+    left_out: Counter[str] = Counter()
+    for row in rows[_is_header(rows[:1], at["vx"][0]) :]:
+        try:
+            stamp_ns = _stamp_ns(" ".join(row[place].strip() for place in at["time"]), start_ns)
+            velocity = rotation @ [float(row[at[key][0]]) for key in _NEEDED[1:]]
+        except (ValueError, IndexError, OverflowError):
+            left_out["without a time or a velocity"] += 1
+            continue
+        if not np.isfinite(velocity).all() or not 0 < stamp_ns < 2**31 * 1_000_000_000:
+            left_out["without a time or a velocity"] += 1
+        elif "valid" in at and row[at["valid"][0]].strip().lower() in _FALSE:
+            left_out["not valid"] += 1
+        else:
+            x, y, z = velocity.tolist()
+            samples.append(DvlSample(stamp_ns, (x, y, z), covariance))
+    if not samples:
+        shown = repr(",".join(rows[-1])[:SHOWN]) if rows else "it is empty"
+        raise InputError(f"{path}: no row with time and velocity in the columns of --columns; the last is {shown}")
+    return DvlLog(sorted({each.stamp_ns: each for each in samples}.values(), key=lambda each: each.stamp_ns), left_out)
+
+
+def _is_header(rows: Sequence[Sequence[str]], place: int) -> bool:
+    """Return whether the first row has no number in a column."""
+    try:
+        return bool(rows) and math.isnan(float(rows[0][place]))
+    except (ValueError, IndexError):
+        return True
+
+
+def _place(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
+    """Return the index of a column by its name, its name without the unit, or its number. Raises InputError."""
+    header = [cell.strip().lower() for cell in rows[0]] if rows else []
+    wanted = name.strip().lower()
+    for each in (header, [cell.partition("(")[0].partition("[")[0].strip() for cell in header]):
+        if wanted in each:
+            return each.index(wanted)
+    if wanted.isdecimal() and 0 < int(wanted) <= len(header):
+        return int(wanted) - 1
+    raise InputError(f"{path}: --columns: no column {name!r}; there are {', '.join(header)[:SHOWN] or 'none'}")
+
+
+def _stamp_ns(text: str, start_ns: int) -> int:
+    """Convert a time to a stamp. Raises ValueError if it is invalid."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        at = _moment(text)
+        at = at if at.tzinfo is not None else at.replace(tzinfo=timezone.utc)
+        return int(at.replace(microsecond=0).timestamp()) * 1_000_000_000 + at.microsecond * 1000
+    return round(seconds * 1e9) + (0 if seconds >= _SINCE_1970_S else start_ns)
+
+
+def _moment(text: str) -> datetime:
+    for form in _FORMATS:
+        try:
+            return datetime.strptime(text, form)
+        except ValueError:
+            continue
+    # Python 3.10 needs six digits of a second
+    text = re.sub(r"\.(\d+)", lambda found: f".{found[1][:6]:0<6}", text.replace("Z", "+00:00"))
+    return datetime.fromisoformat(text)
+
+
+# Course and speed over ground, positions, and compass headings, read by the columns' names.
+#
+# A receiver's course and speed have no vertical component: it is set to exactly 0, which marks an axis as not measured.
+# Units are in a column's name (`_deg`, `[rad]`, `_mps`, `knots`); the default is SI and radians.
+
+# units in column names, with their factors to SI
+_UNITS = {"deg": math.pi / 180.0, "rad": 1.0, "mps": 1.0, "m/s": 1.0, "knots": KNOT, "kn": KNOT, "km/h": 1.0 / 3.6}
+
+
+def names_columns(path: Path, *wanted: str) -> bool:
+    """Return whether a file is a CSV with a header that has columns for all these words."""
+    if not path.is_file() or path.suffix == ".npy":
+        return False
+    header = _header(path)
+    return all(any(word in _words(cell) for cell in header) for word in wanted)
+
+
+def read_course(path: Path, start_ns: int, std: float, notes: list[str]) -> list[ReferenceSample]:
+    """Read speed m/s and course (from true north, clockwise) as horizontal velocities in ENU. Raises InputError."""
+    time, values = _named(path, ("speed", "course"), notes)
+    velocities = over_ground(*values.T).tolist()
+    covariance = np.eye(3) * std**2 if std else None
+    return [
+        ReferenceSample(at, (x, y, z), covariance, VelocityFrame.ENU)
+        for at, (x, y, z) in zip(stamps_ns(path, time, start_ns), velocities, strict=True)
+    ]
+
+
+def read_positions(path: Path, start_ns: int, notes: list[str]) -> list[SatelliteFix]:
+    """Read latitude and longitude. Raises InputError."""
+    time, values = _named(path, ("latitude", "longitude"), notes)
+    rows = np.degrees(values).tolist()
+    return [
+        SatelliteFix(at, latitude, longitude)
+        for at, (latitude, longitude) in zip(stamps_ns(path, time, start_ns), rows, strict=True)
+    ]
+
+
+def read_heading(path: Path, start_ns: int, notes: list[str]) -> list[ImuSample]:
+    """Read headings (from true north, clockwise), with pitch and roll of a forward-right-down body if present."""
+    header = _header(path)
+    tilt = [name for name in ("pitch", "roll") if any(name in _words(cell) for cell in header)]
+    time, values = _named(path, ("heading", *tilt), notes)
+    rpy = np.zeros((len(time), 3))
+    rpy[:, 2] = values[:, 0]
+    for place, name in enumerate(tilt, start=1):
+        rpy[:, ("roll", "pitch").index(name)] = values[:, place]
+    return imu_samples(stamps_ns(path, time, start_ns), rpy)
+
+
+def _header(path: Path) -> list[str]:
+    rows, _ = cells(path)
+    return rows[0] if rows else []
+
+
+def _words(cell: str) -> set[str]:
+    return set(re.findall(r"[a-z]+", cell.lower()))
+
+
+def _named(path: Path, names: Sequence[str], notes: list[str]) -> tuple[Array, Array]:
+    """Return time (N,) s and columns (N, k) in SI, without rows that have a missing number."""
+    (header, *rows), left_out = cells(path)
+    notes += left_out
+    at = [next(i for i, cell in enumerate(header) if name in _words(cell)) for name in names]
+    table = numbers_of(path, rows, [0, *at], len(header))
+    good = np.isfinite(table).all(axis=1)
+    if not good.any():
+        raise InputError(f"{path}: no row with a number in every column")
+    if not good.all():
+        notes.append(f"{path}: {int((~good).sum())} of {len(table)} rows have a value that is not finite, left out")
+    table = table[good]
+    if (np.diff(table[:, 0]) <= 0.0).any():
+        raise InputError(f"{path}: time does not increase at row {int(np.argmax(np.diff(table[:, 0]) <= 0.0)) + 2}")
+    return table[:, 0], table[:, 1:] * [_factor(header[i]) for i in at]
+
+
+def _factor(cell: str) -> float:
+    text = cell.lower()
+    return next((factor for unit, factor in _UNITS.items() if unit in text), 1.0)

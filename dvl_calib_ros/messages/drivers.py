@@ -12,6 +12,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from operator import attrgetter
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -96,9 +97,9 @@ class VelocityType:
 
     name: str
     sent_by: str
-    velocity: Callable[[Any], Any]
-    covariance: Callable[[Any], Any]
-    covariance_says: str
+    velocity: Callable[[Any], Any] = attrgetter("velocity")
+    covariance: Callable[[Any], Any] = lambda _: None
+    covariance_says: str = "none"
     lacks_covariance: Callable[[Any], Any] = lambda _: False
     is_read_in_columns: bool = True
     frame_id: Callable[[Any], Any] = attrgetter("header.frame_id")
@@ -225,7 +226,8 @@ def _no_velocity(message: Any) -> Any:
     raise ValueError("a position is no velocity")  # MessageDecoder computes a velocity from two positions
 
 
-_LINEAR, _TWIST_LINEAR, _VELOCITY = attrgetter("twist.linear"), attrgetter("twist.twist.linear"), attrgetter("velocity")
+_LINEAR, _TWIST_LINEAR, _VELOCITY = map(attrgetter, ("twist.linear", "twist.twist.linear", "velocity"))
+_reference_alone = partial(VelocityType, is_read_in_columns=False, is_reference=True, is_dvl=False)
 
 _MARINE_DVL = """std_msgs/Header header
 uint8 DVL_MODE_BOTTOM=1
@@ -285,7 +287,8 @@ _FEW_BEAMS = Rule(
     CHECK_LOCK,
 )
 
-_TYPES: dict[str, VelocityType] = {
+# extended by recognised types (field_map.py)
+VELOCITY_TYPES: dict[str, VelocityType] = {
     each.name: each
     for each in (
         VelocityType(
@@ -300,8 +303,6 @@ _TYPES: dict[str, VelocityType] = {
             name="geometry_msgs/msg/TwistStamped",
             sent_by="simple drivers and simulators",
             velocity=_LINEAR,
-            covariance=lambda _: None,
-            covariance_says="none",
             rules=(_zero_velocity(_LINEAR),),
             is_reference=True,
         ),
@@ -309,8 +310,6 @@ _TYPES: dict[str, VelocityType] = {
             name="geometry_msgs/msg/Vector3Stamped",
             sent_by="simple drivers, Gazebo's GNSS velocity",
             velocity=attrgetter("vector"),
-            covariance=lambda _: None,
-            covariance_says="none",
             rules=(_zero_velocity(attrgetter("vector")),),
             is_reference=True,
         ),
@@ -328,7 +327,6 @@ _TYPES: dict[str, VelocityType] = {
         VelocityType(
             name="marine_acoustic_msgs/msg/Dvl",
             sent_by="Water Linked's driver, others",
-            velocity=_VELOCITY,
             covariance=attrgetter("velocity_covar"),
             lacks_covariance=lambda message: np.asarray(message.velocity_covar)[..., 0] == -1.0,
             covariance_says="`velocity_covar`; -1 or zero: not given",
@@ -352,7 +350,6 @@ _TYPES: dict[str, VelocityType] = {
         VelocityType(
             name="dvl_msgs/msg/DVL",
             sent_by="dvl-a50 (Water Linked A50, A125)",
-            velocity=_VELOCITY,
             covariance=_dvl_msgs_covariance,
             is_read_in_columns=False,
             covariance_says="`covariance` where the version has it, else `fom`²",
@@ -382,7 +379,6 @@ _TYPES: dict[str, VelocityType] = {
             VelocityType(
                 name=name,
                 sent_by=sent_by,
-                velocity=_VELOCITY,
                 covariance=attrgetter("velocity_covariance"),
                 covariance_says="`velocity_covariance`; zero: not given",
                 rules=(
@@ -405,7 +401,6 @@ _TYPES: dict[str, VelocityType] = {
         VelocityType(
             name="ds_sensor_msgs/msg/Dvl",
             sent_by="ds_dvl (Sentry, DAVE)",
-            velocity=_VELOCITY,
             covariance=attrgetter("velocity_covar"),
             lacks_covariance=lambda message: np.asarray(message.velocity_covar)[..., 0] == -1.0,
             covariance_says="`velocity_covar`; -1 or zero: not given",
@@ -422,78 +417,51 @@ _TYPES: dict[str, VelocityType] = {
             ),
             install="build ds_msgs in your workspace",
         ),
-        VelocityType(
+        _reference_alone(
             name="gps_msgs/msg/GPSFix",
             sent_by="gpsd_client, swri: course, speed and climb",
             velocity=_course_and_speed,
             covariance=_speed_covariance,
-            is_read_in_columns=False,
             covariance_says="`err_speed`, `err_climb` (95 %); zero: not given",
             frame_says="east-north-up",
-            is_reference=True,
-            is_dvl=False,
             reference_frame=VelocityFrame.ENU,
             install="sudo apt install ros-$ROS_DISTRO-gps-msgs",
         ),
-        VelocityType(
+        _reference_alone(
             name="px4_msgs/msg/VehicleOdometry",
             sent_by="PX4 (uXRCE-DDS)",
-            velocity=_VELOCITY,
             covariance=attrgetter("covariance"),
-            is_read_in_columns=False,
             covariance_says="`velocity_variance`; nan: not given",
             frame_says="`velocity_frame`: NED or BODY_FRD",
-            is_reference=True,
-            is_dvl=False,
             adapted=of_vehicle_odometry,
             install="build px4_msgs in your workspace",
         ),
-        *(
-            VelocityType(
-                name=name,
-                sent_by=sent_by,
-                velocity=_no_velocity,
-                covariance=lambda _: None,
-                is_read_in_columns=False,
-                covariance_says=covariance_says,
-                is_reference=True,
-                is_dvl=False,
-                position=POSE,
-            )
-            for name, sent_by, covariance_says in (
-                (
-                    POSE_TYPES[0],
-                    "acoustic positioning (USBL), motion capture",
-                    "of the difference of two positions, from `pose.covariance`; zero: not given",
-                ),
-                (POSE_TYPES[1], "motion capture", "none"),
-            )
+        _reference_alone(
+            name=POSE_TYPES[0],
+            sent_by="acoustic positioning (USBL), motion capture",
+            velocity=_no_velocity,
+            covariance_says="of the difference of two positions, from `pose.covariance`; zero: not given",
+            position=POSE,
         ),
-        VelocityType(
+        _reference_alone(name=POSE_TYPES[1], sent_by="motion capture", velocity=_no_velocity, position=POSE),
+        _reference_alone(
             name="sensor_msgs/msg/NavSatFix",
             sent_by="receivers that give positions alone (RTK)",
             velocity=_no_velocity,
-            covariance=lambda _: None,
-            is_read_in_columns=False,
             covariance_says="of the difference of two positions, from `position_covariance`",
             frame_says="east-north-up",
-            is_reference=True,
-            is_dvl=False,
             position=SATELLITES,
             reference_frame=VelocityFrame.ENU,
         ),
     )
 }
-_WRITTEN = tuple(_TYPES.values())
-VELOCITY_TYPES: Mapping[str, VelocityType] = _TYPES  # extended by recognised types (type_recognition.py)
+_WRITTEN = tuple(VELOCITY_TYPES.values())
 # for bags without message definitions
 KNOWN_DEFINITIONS: Mapping[str, tuple[str, ...]] = {
     name: each.definitions for name, each in VELOCITY_TYPES.items() if each.definitions
 }
-_DVLS = {name: each for name, each in _TYPES.items() if each.is_dvl}
-_REFERENCES = {name: each for name, each in _TYPES.items() if each.is_reference}
-DVL_TYPES: Mapping[str, VelocityType] = _DVLS
-REFERENCE_TYPES: Mapping[str, VelocityType] = _REFERENCES
+DVL_TYPES = {name: each for name, each in VELOCITY_TYPES.items() if each.is_dvl}
+REFERENCE_TYPES = {name: each for name, each in VELOCITY_TYPES.items() if each.is_reference}
 # allowed values of these parameters
 TYPES_OF: Mapping[str, Mapping[str, VelocityType]] = {"dvl_type": DVL_TYPES, "gnss_type": REFERENCE_TYPES}
 
@@ -508,7 +476,7 @@ def add_type(name: str, like: str) -> VelocityType:
 
 def register(added: VelocityType) -> VelocityType:
     """Add a type."""
-    for types, belongs in ((_TYPES, True), (_DVLS, added.is_dvl), (_REFERENCES, added.is_reference)):
+    for types, belongs in ((VELOCITY_TYPES, True), (DVL_TYPES, added.is_dvl), (REFERENCE_TYPES, added.is_reference)):
         if belongs:
             types[added.name] = added
     return added
@@ -516,7 +484,7 @@ def register(added: VelocityType) -> VelocityType:
 
 def forget(name: str) -> None:
     """Remove a type that was added."""
-    for types in (_TYPES, _DVLS, _REFERENCES):
+    for types in (VELOCITY_TYPES, DVL_TYPES, REFERENCE_TYPES):
         types.pop(name, None)
 
 

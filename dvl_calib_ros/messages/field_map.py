@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from operator import attrgetter
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,10 +17,11 @@ import numpy as np
 
 from ..calibration.numerics.frames import Array
 from ..errors import InputError
-from .drivers import CHECK_LOCK, ENOUGH_BEAMS, IMU_TYPE, VELOCITY_TYPES, Rule, VelocityType, forget, register
+from .drivers import CHECK_LOCK, ENOUGH_BEAMS, IMU_TYPE, VELOCITY_TYPES, Rule, VelocityType, add_type, forget, register
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
+
 
 # rosbags' numbers of field kinds (`rosbags.interfaces.Nodetype`); a ROS machine need not have rosbags
 BASE, NAME, ARRAY, SEQUENCE = 1, 2, 3, 4
@@ -270,3 +271,43 @@ def _velocities(fields: _Fields, below: Mapping[str, Description]) -> Iterator[s
         speeds = [name for name, of in own.items() if "vel" in name and fields.is_number(of)]
         if vectors and speeds:
             yield f"beams={path},{vectors[0]},{speeds[0]}"
+
+
+# Recognition of message types by their fields, for any package name.
+# Forks and ports of a driver send its messages under their own package names: waterlinked_a50_ros_driver and
+# dvl_a50_msgs equal dvl_msgs, stonefish_msgs and dave_interfaces equal uuv_sensor_ros_plugins_msgs.
+
+# characteristic fields of a DVL's message, the most specific first -> the known type with the same layout
+_ALIKE: tuple[tuple[frozenset[str], str], ...] = (
+    (
+        frozenset({"header", "velocity", "velocity_valid", "fom", "altitude", "beams"}),
+        "dvl_msgs/msg/DVL",
+    ),
+    (
+        frozenset({"header", "velocity", "coordinate_mode", "velocity_mode", "velocity_covar", "num_good_beams"}),
+        "ds_sensor_msgs/msg/Dvl",
+    ),
+    (
+        frozenset(
+            {"header", "velocity", "velocity_mode", "velocity_covar", "num_good_beams", "beam_velocities_valid",
+             "altitude", "beam_ranges_valid", "range"}
+        ),
+        "marine_acoustic_msgs/msg/Dvl",
+    ),
+    (
+        frozenset({"header", "velocity", "velocity_covariance", "altitude"}),
+        "uuv_sensor_ros_plugins_msgs/msg/DVL",
+    ),
+)  # fmt: skip
+
+
+def recognised(name: str, fields: Collection[str]) -> VelocityType | None:
+    """Return the type of this name if known, else by its fields; None if they are not a DVL's.
+
+    A recognised type is then also known by its name.
+    """
+    known = VELOCITY_TYPES.get(name)
+    if known is not None:
+        return known
+    like = next((like for needed, like in _ALIKE if needed <= set(fields)), None)
+    return None if like is None else add_type(name, like)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from ..calibration.numerics.samples import (
     Streams,
     sample_block,
 )
-from ..calibration.numerics.tables import FULL, RowTable
+from ..calibration.numerics.tables import FULL, RowTable, column
 from .decode import MessageDecoder, Refusal
 
 AnySample = TypeVar("AnySample", DvlSample, ReferenceSample, ImuSample)
@@ -96,10 +96,6 @@ class MessageFeed:
         self.kept.add(stream, decoded)
         return decoded
 
-    def undecodable(self, stream: str, reason: str) -> None:
-        """Count a message that could not be decoded."""
-        self.calibrator.refuse(stream, self.decoder.undecodable(Stream(stream), reason).reason)
-
 
 # largest number of kept messages, 140 bytes each: an IMU at 100 Hz for a quarter of an hour
 MOST = 100_000
@@ -113,22 +109,13 @@ class KeptMessages(RowTable):
     The memory is allocated at the start, so that a node's memory does not grow with the messages received.
     """
 
-    LAYOUT: ClassVar = {
-        "stream": (np.uint8, ()),
-        "stamps_ns": (np.int64, ()),
-        "values": (np.float64, (7,)),
-        "covariance": (np.float64, (3, 3)),
-        "has_covariance": (np.bool_, ()),
-        "frames": (np.uint8, ()),
-        "refused": (np.uint8, ()),
-    }
-    stream: Codes
-    stamps_ns: Stamps
-    values: Array
-    covariance: Array
-    has_covariance: Mask
-    frames: Codes
-    refused: Codes
+    stream: Codes = column(np.uint8)
+    stamps_ns: Stamps = column(np.int64)
+    values: Array = column(np.float64, 7)
+    covariance: Array = column(np.float64, 3, 3)
+    has_covariance: Mask = column(np.bool_)
+    frames: Codes = column(np.uint8)
+    refused: Codes = column(np.uint8)
 
     def __init__(self) -> None:
         super().__init__()

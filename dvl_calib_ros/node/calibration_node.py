@@ -26,13 +26,11 @@ from std_srvs.srv import Trigger
 from ..calibration.calibrator import Calibrator
 from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models import MODELS, Model
-from ..calibration.models.parameter_spec import ParameterError
-from ..calibration.models.parameters import SCHEMA, Parameters
+from ..calibration.models.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.numerics import kalman
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import DvlSample, VelocityFrame
-from ..calibration.results.results import mounting_pose
-from ..calibration.results.velocity_correction import Correction, lever_arm
+from ..calibration.results.results import Correction, lever_arm, mounting_pose
 from ..calibration.streams.position_velocities import check_model
 from ..discovery.gravity import believed_heading
 from ..discovery.transforms import Frames, not_default, placement
@@ -58,9 +56,8 @@ from .diagnostics import RECENT_S, RecentCounts, Silence, diagnose
 from .live_checks import GravitySeen, LateClocks, Pauses, steady_s
 from .live_discovery import Discovering
 from .message_queue import Arrived, in_order_of_arrival, take
-from .message_types import velocity_class
+from .message_types import empty_twist, fill_errors, set_stamp, velocity_class
 from .operator_card import Card
-from .output_messages import empty_twist, fill_errors, set_stamp
 from .ros_parameters import declare_parameters
 from .services import AnsweringNode
 from .status import status_name

@@ -8,9 +8,13 @@ from operator import attrgetter
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import TwistWithCovarianceStamped
 
+from ..calibration.models import Model
 from ..calibration.numerics.frames import FLU_FROM_FRD
-from ..calibration.numerics.samples import DvlSample
+from ..calibration.numerics.kalman import GaussianState
+from ..calibration.numerics.samples import DvlSample, ReferenceSample
+from ..calibration.results.results import NOT_ESTIMATED, twist_terms
 from ..errors import InputError
 from ..messages.decode import UNREADABLE
 from ..messages.drivers import (
@@ -21,8 +25,7 @@ from ..messages.drivers import (
     may_be_recognised,
     velocity_type,
 )
-from ..messages.field_map import mapped_type, may_be_mapped
-from ..messages.type_recognition import recognised
+from ..messages.field_map import mapped_type, may_be_mapped, recognised
 
 
 def velocity_class(parameter: str, name: str, dvl_fields: str = "") -> Any:
@@ -81,11 +84,11 @@ _GOOD: dict[str, Any] = {
 }
 
 
-def fill(message: Any, kind: VelocityType, sample: DvlSample) -> Any:
-    """Fill a new message of a type with a sample (forward-left-up) and return it."""
+def fill(message: Any, kind: VelocityType, sample: DvlSample | ReferenceSample, frame_id: str = DVL_FRAME) -> Any:
+    """Fill a new message of a type with a sample, of a DVL forward-left-up, and return it."""
     axes = FLU_FROM_FRD if kind.points_down else np.eye(3)
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(sample.stamp_ns, 1_000_000_000)
-    message.header.frame_id = DVL_FRAME
+    set_stamp(message.header.stamp, sample.stamp_ns)
+    message.header.frame_id = frame_id
     if hasattr(message, "child_frame_id"):  # child_frame_id is the frame of the velocity, header.frame_id of the pose
         message.header.frame_id, message.child_frame_id = "odom", DVL_FRAME
         message.pose.pose.orientation.w = 1.0
@@ -126,3 +129,28 @@ def _put_covariance(message: Any, covariance: Any) -> None:
     for name in _COVARIANCES:
         if hasattr(message, name) and covariance is not None:
             setattr(message, name, covariance.ravel())
+
+
+def empty_twist() -> TwistWithCovarianceStamped:
+    """Return a message that is filled repeatedly, with its constant values set."""
+    message = TwistWithCovarianceStamped()
+    message.twist.covariance[[21, 28, 35]] = NOT_ESTIMATED  # calibrated_twist has no angular velocity
+    return message
+
+
+def fill_errors(
+    message: TwistWithCovarianceStamped, model: Model, state: GaussianState, stamp_ns: int | None, dvl_frame: str | None
+) -> None:
+    """Fill in a model's scale errors and misalignment, with their joint covariance."""
+    terms, covariance = twist_terms(model, state)
+    if stamp_ns is not None:
+        set_stamp(message.header.stamp, stamp_ns)
+    message.header.frame_id = dvl_frame or "dvl_link"
+    linear, angular = message.twist.twist.linear, message.twist.twist.angular
+    linear.x, linear.y, linear.z, angular.x, angular.y, angular.z = terms.tolist()
+    message.twist.covariance = covariance.ravel()
+
+
+def set_stamp(stamp: Any, nanoseconds: int) -> None:
+    """Set a builtin_interfaces/Time."""
+    stamp.sec, stamp.nanosec = divmod(nanoseconds, 1_000_000_000)

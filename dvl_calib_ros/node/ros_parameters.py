@@ -9,8 +9,7 @@ from typing import Any
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterType
 from rclpy.parameter import Parameter
 
-from ..calibration.models.parameter_spec import ParameterSpec
-from ..calibration.models.parameters import SCHEMA, Parameters
+from ..calibration.models.parameters import SCHEMA, Parameters, ParameterSpec
 from ..files.parameter_files import is_ros_parameter, names_of_others
 from .services import AnsweringNode
 

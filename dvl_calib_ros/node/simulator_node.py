@@ -31,7 +31,7 @@ from ..messages.drivers import TWIST_TYPE, TYPES_OF, VELOCITY_TYPES
 from ..messages.encode import FRAME_IDS
 from ..simulation.live_simulation import Follower, MotionSample, Sample, in_order, shifted
 from ..simulation.scenario import START_NS, Scenario, simulate
-from .message_types import fill, message_class
+from .message_types import fill, message_class, set_stamp
 from .services import AnsweringNode
 from .shutdown import Ending
 
@@ -81,7 +81,9 @@ class SimulatorNode(AnsweringNode):
             if isinstance(sample, DvlSample):
                 self._dvl.publish(fill(self._dvl_class(), self._dvl_type, sample))
             elif isinstance(sample, ReferenceSample):
-                self._gnss.publish(_reference(sample))
+                self._gnss.publish(
+                    fill(TwistWithCovarianceStamped(), VELOCITY_TYPES[TWIST_TYPE], sample, FRAME_IDS[sample.frame])
+                )
             else:
                 self._imu.publish(_imu(sample))
             self.sent += 1
@@ -189,25 +191,10 @@ def _play(
     node.finish()
 
 
-def _header(message: Any, sample: Sample, frame_id: str) -> Any:
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(sample.stamp_ns, 1_000_000_000)
-    message.header.frame_id = frame_id
-    return message
-
-
-def _reference(sample: ReferenceSample) -> Any:
-    message = _header(TwistWithCovarianceStamped(), sample, FRAME_IDS[sample.frame])
-    linear = message.twist.twist.linear
-    linear.x, linear.y, linear.z = sample.velocity
-    if sample.covariance is not None:
-        covariance = np.zeros((6, 6))
-        covariance[:3, :3] = sample.covariance
-        message.twist.covariance = covariance.ravel()
-    return message
-
-
 def _imu(sample: Any) -> Any:
-    message = _header(Imu(), sample, "base_link")
+    message = Imu()
+    set_stamp(message.header.stamp, sample.stamp_ns)
+    message.header.frame_id = "base_link"
     q, w = message.orientation, message.angular_velocity
     q.x, q.y, q.z, q.w = sample.orientation
     w.x, w.y, w.z = sample.angular_velocity

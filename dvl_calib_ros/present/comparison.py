@@ -8,8 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
-from ..calibration.comparison.mounting_change import Comparison, Difference
-from ..calibration.comparison.mounting_change_reasons import reasons, remarks
+from ..calibration.comparison.mounting_change import Comparison, Difference, reasons, remarks
 from ..calibration.results.extrinsics import MOUNTING, Extrinsics
 from ..calibration.results.mounting_quantities import date
 from .document import Answer, Columns, Document, Section, Sentence, Table, Where, columns_for, figures, table_by

@@ -86,16 +86,13 @@ def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> Non
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     else:
         names = [each.name for each in comparison.calibrations]
-        axes.set_xticks(range(len(names)), [_short(name) for name in names], rotation=30, ha="right")
+        shown = [name if len(name) <= 16 else f"{name[:7]}…{name[-8:]}" for name in names]
+        axes.set_xticks(range(len(names)), shown, rotation=30, ha="right")
         axes.set_xlim(-0.5, len(names) - 0.5)
     axes.margins(y=0.25)
     axes.set_ylabel(f"{quantity.name}, {quantity.unit}", color=INK)
     if changes:
         axes.legend(loc="best")
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= 16 else f"{name[:7]}…{name[-8:]}"
 
 
 def _dated(calibrations: Sequence[Extrinsics]) -> bool:

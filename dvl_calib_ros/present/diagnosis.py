@@ -140,7 +140,7 @@ def diagnosis(d: Diagnosis) -> Document:
     regimes = None if series is None else figures("diagnosis_pictures.regime_picture", series, has_effects)
     alone = ", ".join(f"{effect.name} {share(effect.closure)}" for effect in d.effects)
     closed = figure(
-        "diagnosis_figures.closure_bars",
+        "diagnosis_pictures.closure_bars",
         "Closure",
         f"Share of the gap closed: {alone}; together {share(d.gap.closure)}",
         [effect.name for effect in d.effects],
@@ -258,7 +258,7 @@ def _residual_items(d: Diagnosis) -> Iterator[Item]:
     if series.followed:
         where, followed = series.axes[series.followed.axis], series.followed
         yield figure(
-            "diagnosis_figures.against_what_it_follows",
+            "diagnosis_pictures.against_what_it_follows",
             f"Residual {where}, against {followed.label.partition(',')[0]}",
             f"Residual of the fit {where} against {followed.label}, with means of groups and their standard deviations",
             followed,

@@ -2,20 +2,225 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy.signal import welch
 
+from ..calibration.numerics.distributions import normal_isf, normal_sf
 from ..calibration.numerics.frames import Array
-from ..diagnosis.answer.plotted_series import DiagnosisSeries, HeldOutTwin
-from . import diagnosis_figures as figures
+from ..diagnosis.answer.plotted_series import DiagnosisSeries, Followed, HeldOutTwin
 from .diagnosis import twin_errors
 from .figure_data import CUT_FROM_S, TimeAxis, running_mean
-from .figure_style import Picture, picture
+from .figure_style import FAINT, INK, Picture, legend_above, new_figure, picture, plain_log_ticks
 from .numbers import mm
+from .replay_figures import AFTER, BAD
+
+# Figures of a diagnosis: functions from plain arrays to a matplotlib Figure, units on every axis.
+
+# points of a line; a running mean has no finer detail
+LINE_POINTS = 300
+# number of groups of equal size in which measurement and effect are compared
+GROUPS = 12
+# bins of a histogram, points of a line of quantiles, dots of a scatter plot
+BINS, QUANTILES, SCATTER_POINTS = 40, 200, 2000
+MM = 1e3
+MEASURED_COLOUR = "#555b61"
+_STYLES = {
+    "before": (BAD, 1.3),
+    "after": (AFTER, 1.3),
+    "measured": (MEASURED_COLOUR, 1.1),
+    "residual": (MEASURED_COLOUR, 1.3),
+    "without": (BAD, 1.1),
+    "with": (AFTER, 1.3),
+    "twin": (AFTER, 1.3),
+    "noise": (FAINT, 2.0),
+}
+
+
+def over_time(time: TimeAxis, stamps_ns: Array, series: Mapping[str, Array], points: int, label: str) -> Figure:
+    """Draw running means over `points` samples of series (M,), m/s, by name; the last in front."""
+    figure, axes = new_figure()
+    t = time(stamps_ns)
+    for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
+        where, mean = running_mean(t, MM * values, points)
+        kept = slice(None, None, max(1, len(where) // LINE_POINTS))
+        axes.plot(where[kept], mean[kept], color=colour, linewidth=width, label=name)
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    axes.set_ylabel(label)
+    time.dress(axes)
+    legend_above(axes)
+    return figure
+
+
+def _line_styles(names: Sequence[str]) -> list[tuple[str, float]]:
+    """Return colour and width of each line by its name; effects have the default."""
+    return [_STYLES.get(name, (AFTER, 2.0)) for name in names]
+
+
+def spectra(frequency: Array, series: Mapping[str, Array], label: str) -> Figure:
+    """Draw amplitude spectral densities (F,) m/s/√Hz of one body axis, by name, over frequency (F,) Hz."""
+    figure, axes = new_figure()
+    for (name, values), (colour, width) in zip(series.items(), _line_styles(list(series)), strict=True):
+        axes.plot(frequency, MM * values, color=colour, linewidth=width, label=name)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_ylim(*_decade_limits(MM * np.concatenate(list(series.values()))))
+    plain_log_ticks(axes.xaxis)
+    plain_log_ticks(axes.yaxis)
+    axes.set_xlabel("frequency, Hz")
+    axes.set_ylabel(label)
+    legend_above(axes)
+    return figure
+
+
+def _decade_limits(values: Array) -> tuple[float, float]:
+    """Return limits around positive values, at least a decade apart, so that a logarithmic axis has tick labels."""
+    low, high = 0.8 * float(values.min()), 1.25 * float(values.max())
+    widen = max(1.0, np.sqrt(10.0 * low / high))
+    return low / widen, high * widen
+
+
+def gap_bars(names: Sequence[str], gaps: Mapping[str, Array]) -> Figure:
+    """Draw the gap in each regime of motion, by name (R, 3): value and 95 per cent interval, m/s."""
+    return _bars(names, gaps, "gap beyond the noise, mm/s rms (95 %)")
+
+
+def error_bars(names: Sequence[str], errors: Mapping[str, Array], noise: float) -> Figure:
+    """Draw the error in each regime of motion (R, 1) m/s rms, by name, and the common noise."""
+    return _bars(names, errors, "recorded − twin, mm/s rms", noise)
+
+
+def _bars(names: Sequence[str], groups: Mapping[str, Array], label: str, noise: float | None = None) -> Figure:
+    """Draw bars for each regime, by name (R, 1) or with an interval (R, 3), m/s. noise: a line across all."""
+    figure, axes = new_figure(height=1.2 + 0.36 * len(names))
+    height = 0.8 / len(groups)
+    for i, ((name, values), (colour, _)) in enumerate(zip(groups.items(), _line_styles(list(groups)), strict=True)):
+        rows = np.arange(len(names)) + (i - 0.5 * (len(groups) - 1)) * height
+        value, *interval = MM * values.T
+        axes.barh(rows, value, height=0.9 * height, color=colour, alpha=0.85, label=name)
+        if interval:
+            axes.hlines(rows, *interval, color=INK, linewidth=1.0)
+    if noise is not None:
+        axes.axvline(MM * noise, color=INK, linewidth=1.0, linestyle=":", label="noise")
+    axes.set_yticks(range(len(names)), names)
+    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel(label)
+    axes.grid(False, axis="y")
+    legend_above(axes)
+    return figure
+
+
+def histogram(values: Mapping[str, Array], noise: Array) -> Figure:
+    """Draw densities of values (K,) m/s, by name, and of mixed normal noise with σ (A,) m/s.
+
+    The range is set by the last series; values beyond it are in the last bins.
+    """
+    figure, axes = new_figure()
+    last = list(values.values())[-1]
+    reach = MM * float(max(np.quantile(np.abs(last), 0.995), 4.0 * np.max(noise)))
+    edges = np.linspace(-reach, reach, BINS + 1)
+    for (name, each), (colour, width) in zip(values.items(), _line_styles(list(values)), strict=True):
+        counts, _ = np.histogram(np.clip(MM * each, -reach, reach), edges)
+        axes.stairs(counts / len(each) / np.diff(edges), edges, color=colour, linewidth=width, label=name)
+    at = np.linspace(-reach, reach, 20 * BINS)
+    std = MM * np.maximum(noise, 1e-9)[:, None]
+    density = (np.exp(-0.5 * (at / std) ** 2) / (std * np.sqrt(2.0 * np.pi))).mean(axis=0)
+    axes.plot(at, density, color=FAINT, linewidth=2.0, label="noise", zorder=1)
+    axes.set_xlabel("recorded − twin, mm/s")
+    axes.set_ylabel("density, 1/(mm/s)")
+    axes.set_ylim(bottom=0.0)
+    legend_above(axes)
+    return figure
+
+
+def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
+    """Draw quantiles of values (K,) m/s, by name, against mixed normal noise with σ (A,) m/s.
+
+    The range is set by the last series.
+    """
+    figure, axes = new_figure(height=3.2)
+    k = max(len(each) for each in values.values())
+    end = float(normal_isf(0.5 / k))
+    shares = normal_sf(np.linspace(end, -end, QUANTILES))
+    std = MM * np.maximum(noise, 1e-9)
+    grid = np.linspace(-6.0, 6.0, 4001) * std.max()
+    of_noise = np.interp(shares, normal_sf(-grid[:, None] / std).mean(axis=1), grid)
+    axes.plot(of_noise[[0, -1]], of_noise[[0, -1]], color=FAINT, linewidth=2.0, label="noise", zorder=1)
+    for (name, each), (colour, _) in zip(values.items(), _line_styles(list(values)), strict=True):
+        axes.plot(of_noise, MM * np.quantile(each, shares), ".", color=colour, markersize=3.5, label=name)
+    axes.set_xlabel("quantiles of normal noise, mm/s")
+    axes.set_ylabel("of recorded − twin, mm/s")
+    reach = 1.3 * max(float(of_noise[-1]), MM * float(np.abs(list(values.values())[-1]).max()))
+    axes.set_ylim(-reach, reach)
+    legend_above(axes, markerscale=2.0)
+    return figure
+
+
+def against_what_it_follows(followed: Followed, label: str) -> Figure:
+    """Draw the residual against its explaining variable: samples, group means with two standard errors, and scatter."""
+    figure, axes = new_figure(height=3.2)
+    at, mean, std, error = followed.groups()
+    shown = slice(None, None, max(1, len(followed.at) // SCATTER_POINTS))
+    axes.plot(
+        followed.at[shown], MM * followed.left[shown], ".", color=FAINT, markersize=2.5, label="residual", zorder=1,
+        rasterized=True,
+    )  # fmt: skip
+    axes.fill_between(at, MM * (mean - std), MM * (mean + std), color=AFTER, alpha=0.15, linewidth=0.0, label="σ")
+    axes.errorbar(at, MM * mean, 2.0 * MM * error, fmt="o", markersize=4.0, color=AFTER, linewidth=1.2, label="mean")
+    axes.axhline(0.0, color=INK, linewidth=0.7)
+    reach = 1.2 * MM * float(np.nanmax([np.quantile(np.abs(followed.left), 0.98), *np.abs(mean) + std]))
+    axes.set_ylim(-reach, reach)
+    axes.set_xlabel(followed.label)
+    axes.set_ylabel(label)
+    legend_above(axes, markerscale=2.0)
+    return figure
+
+
+def closure_bars(names: Sequence[str], closures: Array, together: tuple[float, float, float]) -> Figure:
+    """Draw the share of the gap closed by each effect alone (E,), and by all: value and 95 per cent interval."""
+    labels = [*names, "together"] if len(names) > 1 else list(names)
+    values = [*closures, together[0]] if len(names) > 1 else [together[0]]
+    colours = [FAINT] * len(names) + [AFTER] if len(names) > 1 else [AFTER]
+    figure, axes = new_figure(height=1.1 + 0.36 * len(labels))
+    rows = np.arange(len(labels))
+    axes.barh(rows, 100.0 * np.asarray(values), color=colours, height=0.6)
+    axes.hlines(rows[-1], 100.0 * together[1], 100.0 * together[2], color=INK, linewidth=1.4)
+    axes.axvline(100.0, color=INK, linewidth=0.7, linestyle=":")
+    axes.set_yticks(rows, labels)
+    axes.set_ylim(len(labels) - 0.4, -0.6)
+    axes.set_xlim(min(0.0, 100.0 * float(np.min([*values, together[1]]))), 105.0)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}"))
+    axes.set_xlabel("share of the gap closed on held-out data, %")
+    axes.grid(False, axis="y")
+    return figure
+
+
+def measured_against_effect(effect: Array, measured: Array) -> Figure:
+    """Draw measurements (K,) against an effect's contribution (K,), m/s: group means with 95 per cent intervals.
+
+    Points on the diagonal mean that the effect equals the measurement.
+    """
+    figure, axes = new_figure(height=3.2)
+    groups = np.array_split(np.argsort(effect), GROUPS)
+    at = MM * np.array([effect[group].mean() for group in groups])
+    mean = MM * np.array([measured[group].mean() for group in groups])
+    error = 1.96 * MM * np.array([measured[group].std() / np.sqrt(len(group)) for group in groups])
+    ends = np.array([at.min(), at.max()])
+    axes.plot(ends, ends, color=AFTER, linewidth=2.0, label="as the effect says")
+    axes.errorbar(at, mean, error, fmt="o", markersize=4.0, color=MEASURED_COLOUR, linewidth=1.0, label="measured")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(6))
+    axes.set_xlabel("the effect's trace, mm/s")
+    axes.set_ylabel("measured, mm/s")
+    legend_above(axes)
+    return figure
+
 
 # a line over time is a running mean over this share of the run, and at least this number of seconds
 WINDOW_SHARE, WINDOW_S = 1.0 / 50.0, 5.0
@@ -51,7 +256,7 @@ def regime_picture(series: DiagnosisSeries, with_effects: bool) -> Picture:
         for i, regime in enumerate(names)
     )
     return picture(
-        "Gap by regime of motion", alt, figures.gap_bars, names, gaps,
+        "Gap by regime of motion", alt, gap_bars, names, gaps,
         caption="Held out."
         + (" Slow and fast: the lowest and the highest third of the speeds." if "slow" in series.regimes else ""),
     )  # fmt: skip
@@ -84,12 +289,12 @@ def trace_pictures(name: str, series: DiagnosisSeries, axes: Mapping[str, str]) 
             lines = {"measured": measured[:, axis], name: trace[:, axis]}
             yield picture(
                 f"{name}, {where}", f"Measured trace {where} and the trace of {name}, running mean in mm/s",
-                figures.over_time, time, stamps_ns, lines, points, f"{where}, mm/s",
+                over_time, time, stamps_ns, lines, points, f"{where}, mm/s",
             )  # fmt: skip
     drawn = energy > AXIS_SHARE * energy.sum()
     yield picture(
         f"Measured against {name}", f"Means of what was measured in groups of what {name} adds, with 95 % intervals",
-        figures.measured_against_effect, trace[:, drawn].ravel(), measured[:, drawn].ravel(),
+        measured_against_effect, trace[:, drawn].ravel(), measured[:, drawn].ravel(),
         caption="Points on the line: the measurement equals the effect's contribution.",
     )  # fmt: skip
 
@@ -112,27 +317,27 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
         lines = {name: values[:, "xyz".index(letter)] for name, values in found.items()}
         yield picture(
             f"{twin.name}: recorded less twin {where}", f"Recorded less twin {where} over time, {names}, in mm/s",
-            figures.over_time, time, stamps_ns, lines, points, f"recorded − twin {where}, mm/s",
+            over_time, time, stamps_ns, lines, points, f"recorded − twin {where}, mm/s",
             caption=f"Means over {points * interval:.0f} s.",
         )  # fmt: skip
     measured = ["xyz".index(letter) for letter in axes]
-    spectra = {name: spectrum(twin, values[:, measured]) for name, values in found.items()}
-    frequency = next(iter(spectra.values()))[0]
+    by_name = {name: spectrum(twin, values[:, measured]) for name, values in found.items()}
+    frequency = next(iter(by_name.values()))[0]
     noise = float(np.sqrt(2.0 * interval * (twin.noise**2).sum()))
-    densities = {name: density for name, (_, density) in spectra.items()} | {"noise": np.full(len(frequency), noise)}
+    densities = {name: density for name, (_, density) in by_name.items()} | {"noise": np.full(len(frequency), noise)}
     yield picture(
         f"{twin.name}: by frequency", f"Amplitude spectral density of recorded less twin, {names}, and the noise",
-        figures.spectra, frequency, densities, "recorded − twin, mm/s/√Hz",
+        spectra, frequency, densities, "recorded − twin, mm/s/√Hz",
     )  # fmt: skip
     pooled = {name: values[:, measured].ravel() for name, values in found.items()}
     yield picture(
         f"{twin.name}: distribution", f"Histogram of recorded less twin, {names}, and of the noise",
-        figures.histogram, pooled, twin.noise[measured],
+        histogram, pooled, twin.noise[measured],
         caption="All axes together; what lies beyond the ends is in the last bins.",
     )  # fmt: skip
     yield picture(
         f"{twin.name}: against normal noise", f"Quantiles of recorded less twin, {names}, against the noise",
-        figures.quantiles, pooled, twin.noise[measured],
+        quantiles, pooled, twin.noise[measured],
         caption="On the line, the distribution equals the noise; larger outliers are outside the picture.",
     )  # fmt: skip
     parts = twin_errors(twin, has_effects)
@@ -141,9 +346,7 @@ def twin_pictures(twin: HeldOutTwin, axes: Mapping[str, str], has_effects: bool)
         f"{each.regime}: " + ", ".join(f"{name} {mm(error)} mm/s" for name, error in each.errors.items())
         for each in parts
     )
-    yield picture(
-        f"{twin.name}: error by regime", alt, figures.error_bars, [each.regime for each in parts], errors, twin.level
-    )
+    yield picture(f"{twin.name}: error by regime", alt, error_bars, [each.regime for each in parts], errors, twin.level)
 
 
 def spectrum(twin: HeldOutTwin, values: Array) -> tuple[Array, Array]:

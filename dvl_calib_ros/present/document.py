@@ -215,7 +215,7 @@ def figures(function: str, *given: Any) -> Figures:
 
 
 def figure(function: str, title: str, alt: str, *given: Any, caption: str = "") -> Figures:
-    """Return the figure drawn by a function, such as ``diagnosis_figures.closure_bars``; see `Picture`."""
+    """Return the figure drawn by a function, such as ``diagnosis_pictures.closure_bars``; see `Picture`."""
     return replace(figures(function, *given), title=title, alt=alt, caption=caption)
 
 

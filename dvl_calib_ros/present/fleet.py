@@ -9,8 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.comparison.mounting_change import ANSWERS, POWER, Comparison, fused
-from ..calibration.comparison.mounting_change_reasons import reasons
+from ..calibration.comparison.mounting_change import ANSWERS, POWER, Comparison, fused, reasons
 from ..calibration.results.extrinsics import SCALE, Extrinsics
 from ..calibration.results.mounting_quantities import date
 from ..fleet_catalogue.update import WORDS, Fleet

@@ -214,7 +214,7 @@ def replayed(
             section("Data", table_by(STREAMS, streams), where=where),
             section(
                 "",
-                figures("replay_pictures.data_pictures", result, history, shown) if history else None,
+                figures("replay_figures.data_pictures", result, history, shown) if history else None,
                 where=Where.PAGE,
             ),
         ],
@@ -340,13 +340,13 @@ def _over_time(run: Replayed, shown: Sequence[str]) -> Iterator[Section]:
     for aided, title in FAMILIES:
         models = [name for name in shown if MODELS[name].aided == aided and result.estimates[name].used]
         if models:
-            drawn = figures("replay_pictures.estimate_pictures", result, history, models)
+            drawn = figures("replay_figures.estimate_pictures", result, history, models)
             yield section(title, Legend(models, result.selected), drawn, where=Where.PAGE)
     by = f"Body frame. Velocities are of the DVL's own place, corrected with the final estimate of {result.selected}"
     yield section(
         "Velocity before and after correction",
         Sentence(by + (NO_RESIDUALS if run.navigation is None else RESIDUALS), soft=True),
-        figures("replay_pictures.velocity_pictures", run, history),
+        figures("replay_figures.velocity_pictures", run, history),
         where=Where.PAGE,
     )
 

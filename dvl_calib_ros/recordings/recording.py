@@ -7,7 +7,7 @@ descriptions; nothing of other topics.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence, Set
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -21,21 +21,21 @@ from ..bags.columns import windows
 from ..bags.reader import BagReader
 from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.samples import Stamps, Stream, Streams, no_samples
+from ..calibration.numerics.frames import Array
+from ..calibration.numerics.samples import Mask, Stamps, Stream, Streams, VelocityFrame, no_samples
 from ..calibration.registration.registration import Registration
 from ..errors import InputError
 from ..messages.decode import RESTAMP_ALL, MessageDecoder
-from ..messages.drivers import IMU_TYPE, KNOWN_DEFINITIONS, VELOCITY_TYPES
-from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, suggested
-from ..messages.type_recognition import recognised
+from ..messages.drivers import DVL_TYPES, IMU_TYPE, KNOWN_DEFINITIONS, POSE_TYPES, REFERENCE_TYPES, VELOCITY_TYPES
+from ..messages.field_map import forget_mapped, mapped_type, may_be_mapped, misfit, recognised, suggested
 from ..messages.water_properties import OfWater, WaterCollector, readers, water_of
-from .columns import Collector, TopicColumns, is_kept
+from ..verdict.reasons import Reason, finding
+from .columns import Collector, Laid, TopicColumns, is_kept
 from .far_stamps import without_far
-from .pose_orientation import hold_orientations, orientations_of
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, recorded
 from .topic_preview import Survey, look_of
-from .topics import Topics, spelled
+from .topics import ORIENTATION, Topics, spelled
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
 # static transforms and descriptions are few, so the first ones of a recording that repeats them are enough
@@ -422,3 +422,140 @@ def _map_types(bag: BagReader, text: str, where: str) -> None:
         # a type with a suggested field map is the most likely one
         nearest = min(misfits, key=lambda kind: not suggested(stores[kind], kind), default="")
         raise InputError(f"{where}: dvl_fields: {misfits.get(nearest) or 'no topic is of a type that is not listed'}")
+
+
+# Orientations of poses as IMU data, for recordings without an IMU that has an orientation.
+#
+# A motion capture measures orientation and position of a vehicle; the turn rates are the orientation's derivative.
+
+# Turn rates are means over this time (s), so that noise of 0.1° per pose gives less than 1 °/s.
+RATE_WINDOW_S = 0.2
+# orientations whose components differ by no more than this are a constant filled in by the driver
+LEAST_CHANGE = 1e-4
+
+
+def orientations_of(poses: TopicColumns) -> TopicColumns | None:
+    """Return the orientations of a topic of poses as an IMU's; None for another type or without orientations."""
+    if poses.msgtype not in POSE_TYPES or len(poses) < 3:
+        return None
+    values = np.full((len(poses), 7), np.nan)
+    for row, (_, _, message, _) in enumerate(poses.singles.messages()):
+        if message is not None:
+            q = getattr(message.pose, "pose", message.pose).orientation
+            values[row, :4] = q.x, q.y, q.z, q.w
+    values[~_are_unit(values)] = np.nan
+    if not hold_orientations(values):
+        return None
+    good = np.flatnonzero(np.isfinite(values[:, 0]))
+    (arrival, log_ns), stamps_ns = poses.arrivals, poses.stamps_ns
+    values[good, 4:] = _turn_rates(stamps_ns[good], values[good, :4])
+    n = len(poses)
+    laid = Laid(
+        arrival, log_ns, stamps_ns, values, np.zeros(n, dtype=np.int32), np.full(n, -1, dtype=np.int32),
+        np.zeros(n, dtype=np.uint8), np.full((n, 3), np.nan), frames=("",),
+    )  # fmt: skip
+    nothing = poses.singles.part(np.zeros(0, dtype=np.intp))
+    return TopicColumns(poses.topic + ORIENTATION, IMU_TYPE, laid, nothing)
+
+
+def hold_orientations(values: Array) -> bool:
+    """Return whether quaternions (N, 4 or more) are orientations that change; nan is ignored."""
+    given = values[_are_unit(values), :4]
+    return len(given) > 2 and float(np.ptp(given, axis=0).max()) > LEAST_CHANGE
+
+
+def _are_unit(values: Array) -> Mask:
+    return np.asarray(np.abs(np.einsum("ni,ni->n", values[:, :4], values[:, :4]) - 1.0) < 0.02)
+
+
+def _turn_rates(stamps_ns: Stamps, quaternions: Array) -> Array:
+    """Return angular velocities (N, 3), rad/s, in the body, of orientations (N, 4); nan if stamps do not advance."""
+    from scipy.spatial.transform import Rotation
+
+    order = np.argsort(stamps_ns, kind="stable")
+    time = 1e-9 * (stamps_ns[order] - stamps_ns.min())
+    first = np.searchsorted(time, time - 0.5 * RATE_WINDOW_S)
+    last = np.searchsorted(time, time + 0.5 * RATE_WINDOW_S, side="right") - 1
+    alone = first == last  # in slow streams, difference to the neighbours
+    first, last = np.where(alone, first - 1, first).clip(0), np.where(alone, last + 1, last).clip(max=len(time) - 1)
+    turns = Rotation.from_quat(quaternions[order])
+    seconds = (time[last] - time[first])[:, None]
+    rates = np.empty((len(time), 3))
+    rates[order] = (turns[first].inv() * turns[last]).as_rotvec() / np.where(seconds > 0.0, seconds, np.nan)
+    return rates
+
+
+def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> None:
+    """Raise InputError unless there is a readable DVL; other missing data are added to `found`."""
+    present, where = recording.types, recording.where
+    if not present:
+        raise InputError(f"{where}: the bag is empty, it has no topics; record it again")
+    if len({topics.dvl, topics.gnss, topics.imu}) < 3:
+        raise InputError("--dvl-topic, --gnss-topic and --imu-topic must be different topics")
+    if topics.dvl not in present:
+        listing = ", ".join(f"{name} ({kind})" for name, kind in sorted(present.items()))
+        option = " or ".join(f"--dvl-topic {name}" for name in _likely_dvl_topics(topics, present)) or "--dvl-topic"
+        raise InputError(f"{where}: no topic {topics.dvl!r}; set {option}. The bag has: {listing}")
+    _check_types(recording, topics, found)
+    if not recording.counts[topics.dvl]:
+        raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
+    if topics.gnss not in present:
+        found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
+
+
+def missing_imu(recording: Recording, topics: Topics, frame: VelocityFrame | None) -> list[Reason]:
+    """Return the consequences of a missing IMU. frame: of the reference's messages, None if unknown."""
+    if topics.imu in recording.types:
+        return []
+    if topics.gnss not in recording.types:
+        what = "the heading is unknown"
+    elif frame is VelocityFrame.BODY:
+        what = "no lever arm is corrected or estimated"
+    else:
+        what = "a reference in the earth's frame cannot be compared with the DVL; no lever arm is estimated"
+    return [finding("BAG_NO_IMU", what=what)]
+
+
+def _check_types(recording: Recording, topics: Topics, found: list[Reason]) -> None:
+    for role, wanted in _WANTED.items():
+        name = getattr(topics, role)
+        held = recording.held.get(name)
+        if held is None:
+            continue
+        types = " and ".join(sorted(held.types))
+        if held.types - wanted:
+            expected = " or ".join(wanted)
+            raise InputError(f"{recording.where}: topic {name} holds {types}, expected {expected}; set --{role}-topic")
+        if len(held.types) > 1:
+            raise InputError(f"{recording.where}: topic {name} holds {types}; replay bags of one type together")
+        if held.lacks_definition:
+            found.append(finding("BAG_NO_DEFINITION", type=types))
+
+
+_WANTED: Mapping[str, Set[str]] = {"dvl": DVL_TYPES.keys(), "gnss": REFERENCE_TYPES.keys(), "imu": {IMU_TYPE}}
+
+
+def _likely_dvl_topics(topics: Topics, present: Mapping[str, str]) -> list[str]:
+    """Return the likely DVL topics: by a type that only DVLs have, else by name, else any fitting one."""
+    fitting = sorted(name for name, kind in present.items() if kind in DVL_TYPES and name != topics.gnss)
+    only_dvl = [name for name in fitting if present[name] not in REFERENCE_TYPES]
+    return only_dvl or [name for name in fitting if "dvl" in name.lower()] or fitting
+
+
+def hold_the_same(one: Recorded, other: Recorded) -> bool:
+    """Return whether half of one recording's DVL velocities are in the other, at the same stamps."""
+    (stamps, values), (its_stamps, its_values) = _velocities(one), _velocities(other)
+    if not len(stamps) or not len(its_stamps):
+        return False
+    at = np.minimum(np.searchsorted(its_stamps, stamps), len(its_stamps) - 1)
+    same = (its_stamps[at] == stamps) & (its_values[at] == values).all(axis=1)
+    return bool(2 * np.count_nonzero(same) > min(len(stamps), len(its_stamps)))
+
+
+def _velocities(topic: Recorded) -> tuple[Stamps, Array]:
+    """Return stamps (N,) in order and velocities (N, 3), the first of each stamp."""
+    kept = np.flatnonzero(np.isfinite(topic.values).all(axis=1))
+    stamps = np.where(topic.stamps_ns == 0, topic.log_ns, topic.stamps_ns)[kept]
+    order = np.argsort(stamps, kind="stable")
+    first = np.concatenate([[True], np.diff(stamps[order]) > 0])[: len(order)]
+    return stamps[order][first], topic.values[kept[order][first]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-# suffix that a topic of poses gets as a topic of orientations (pose_orientation.py)
+# suffix that a topic of poses gets as a topic of orientations (recording.py)
 ORIENTATION = "/orientation"
 
 

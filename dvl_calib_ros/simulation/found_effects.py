@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from ..effects.base import AnyEffect
-from ..effects.composition import Injection
+from ..effects.base import AnyEffect, Injection
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
 from ..simulator_export.dvl_description import NOT_EXPLAINED, DvlDescription, Other

@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..calibration.numerics.frames import Array
-from ..effects.base import ActsOn, AnyEffect, EffectInput, NoiseEffect
-from ..effects.composition import Injection
+from ..effects.base import ActsOn, AnyEffect, EffectInput, Injection, NoiseEffect
 from ..effects.registry import EFFECTS, NOISE_EFFECTS
 from ..errors import InputError
 

@@ -20,7 +20,6 @@ import numpy as np
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from ..effects.base import ActsOn, EffectInput, NoiseEffect
-from ..effects.composition import Injection
 from .scenario import GNSS_PHASE_S, START_NS, Run, Scenario, Seeds, dvl_at, gnss_at, imu_at, world_of
 from .trajectories import Motion
 
@@ -68,7 +67,8 @@ class Follower:
             for make, rate, seed in zip(makers, rates, (seeds.dvl, seeds.gnss, seeds.imu), strict=True)
             if rate
         ]
-        self._memory_s = REMEMBERED_CONSTANTS * _longest_time_constant(scenario.effects)
+        constants = (each.values.get("time_constant_s", 0.0) for each in scenario.effects)
+        self._memory_s = REMEMBERED_CONSTANTS * max(constants, default=0.0)
         self._window: deque[MotionSample] = deque()
         self._pending: list[tuple[int, int, Sample]] = []
         self._number = itertools.count()
@@ -133,10 +133,6 @@ class _Sensor:
             at.append(time)
             self.taken += 1
         return np.array(at)
-
-
-def _longest_time_constant(effects: tuple[Injection, ...]) -> float:
-    return max((each.values.get("time_constant_s", 0.0) for each in effects), default=0.0)
 
 
 def in_order(run: Run) -> list[Sample]:

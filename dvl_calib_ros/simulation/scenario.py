@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..bags.writer import BagWriter, Compression, Storage
 from ..calibration.numerics.frames import Array, quaternion_from_rotation, rotation_from_rpy
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from ..effects.base import ActsOn, EffectInput
-from ..effects.composition import Injection, at_dvl, late, traces, turns
+from ..effects.base import ActsOn, EffectInput, Injection, at_dvl, late, traces, turns
 from ..messages.encode import SampleWriter
 from ..version import __version__
 from .injection import disturbed, injection_document

@@ -154,46 +154,13 @@ def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
         "verdict": comparison.verdict.value,
         "sentence": comparison.sentence,
         "reasons": [reason.as_dict() for reason in comparison.reasons],
-        "effects": [
-            {
-                "name": each.name,
-                "status": each.status.value,
-                "equivalent_to": list(each.equivalent_to),
-                "vehicle": _parameters(each.vehicle),
-                "simulator": _parameters(each.simulator),
-                "p_adjusted": each.p,
-                "adds_mps": each.adds_mps,
-                "where": None if each.lies is None else _lies(each.lies),
-                "needs": each.needs,
-            }
-            for each in comparison.effects
-        ],
-        "noise": [
-            {
-                "name": each.name,
-                "status": each.status.value,
-                "unit": each.unit,
-                "vehicle": _value(each.vehicle),
-                "simulator": _value(each.simulator),
-                "p_adjusted": each.p,
-                "note": each.note,
-            }
-            for each in comparison.noise
-        ],
+        "effects": [_row(each, p="p_adjusted", lies="where") for each in comparison.effects],
+        "noise": [_row(each, p="p_adjusted") for each in comparison.noise],
         "noise_level_mps": {
             regime: {"vehicle": vehicle, "simulator": simulator}
             for regime, (vehicle, simulator) in comparison.levels.items()
         },
-        "shrinks": [
-            {
-                "model": rung.name,
-                "error_mps": rung.error_mps,
-                "energy_distance": rung.distance,
-                "null95": rung.null95,
-                "p": rung.p,
-            }
-            for rung in comparison.rungs
-        ],
+        "shrinks": [_row(each, name="model", distance="energy_distance") for each in comparison.rungs],
         "noise_floor_mps": comparison.floor_mps,
         "not_shown": {side: dict(names) for side, names in comparison.not_shown.items()},
         "notes": list(comparison.notes),
@@ -202,21 +169,22 @@ def unpaired_document(comparison: UnpairedComparison) -> dict[str, Any]:
     }
 
 
-def _lies(lies: Lies) -> dict[str, Any]:
-    return {
-        "axis": lies.axis,
-        "axis_share": lies.axis_share,
-        "regime": lies.regime,
-        "regime_share": lies.regime_share,
-        "band_hz": list(lies.band_hz),
-        "band_share": lies.band_share,
-    }
+def _row(compared: ComparedEffect | ComparedNoise | Rung | Lies, **renamed: str) -> dict[str, Any]:
+    """Return the fields of one result as plain data. renamed: field -> its name in the JSON."""
+    return {renamed.get(name, name): _plain(value) for name, value in vars(compared).items()}
 
 
-def _parameters(parameters: Mapping[str, Triple]) -> dict[str, Any]:
-    return {name: _value(each) for name, each in parameters.items()}
-
-
-def _value(each: Triple) -> dict[str, Any]:
-    value, low, high = map(float, each)
-    return {"value": value, "ci95": [low, high]}
+def _plain(value: Any) -> Any:
+    """Return plain data; a value with its interval by names."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, Lies):
+        return _row(value)
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    if not isinstance(value, tuple):
+        return value
+    if len(value) != 3 or isinstance(value[0], str):
+        return list(value)
+    middle, low, high = map(float, value)
+    return {"value": middle, "ci95": [low, high]}

@@ -6,463 +6,561 @@ entry here and a call of `finding` in the code that detects it.
 
 from __future__ import annotations
 
-from .kinds import Kind, Severity
+from .kinds import error, on_page, warning
 
 FINDINGS = (
     # no data
-    Kind(
+    error(
         "DVL_NO_MESSAGE",
         "no DVL message yet",
-        "Nothing has come on the DVL's topic: driver off, cable, another topic or domain.",
-        "check the sensor, its driver and the topic {topic} (ros2 topic hz), remap it, compare ROS_DOMAIN_ID",
-        Severity.ERROR,
+        means="Nothing has come on the DVL's topic: driver off, cable, another topic or domain.",
+        remedy="check the sensor, its driver and the topic {topic} (ros2 topic hz), remap it, compare ROS_DOMAIN_ID",
     ),
-    Kind(
+    warning(
         "TOPICS_FOUND",
         "{own} had no publisher; found and used instead: {found}",
-        "They may be another vehicle's.",
-        "remap the topics to these names or the right ones, or set discover to false",
+        means="They may be another vehicle's.",
+        remedy="remap the topics to these names or the right ones, or set discover to false",
     ),
-    Kind(
+    error(
         "DVL_SILENT",
         "no usable DVL message for {seconds:.0f} s",
-        "Other findings can say why.",
-        "check the sensor, its driver and the topic {topic}",
-        Severity.ERROR,
+        means="Other findings can say why.",
+        remedy="check the sensor, its driver and the topic {topic}",
     ),
-    Kind(
+    warning(
         "IMU_SILENT",
         "no usable IMU message for {seconds:.0f} s",
-        "Models that need attitude or angular velocity learn nothing.",
-        "check the IMU's driver and the topic {topic}",
+        means="Models that need attitude or angular velocity learn nothing.",
+        remedy="check the IMU's driver and the topic {topic}",
     ),
-    Kind(
+    warning(
         "DVL_NONE_USABLE",
         "none of {count} DVL messages can be used: {reasons}",
-        "",
-        "look the reasons up in docs/reference.md#drivers",
+        remedy="look the reasons up in docs/reference.md#drivers",
     ),
     # clocks and stamps
-    Kind(
+    warning(
         "CLOCKS_DIFFER",
         "{stream} stamps are {seconds:.0f} s {side} the {other}'s and cannot be paired",
-        "",
-        "set both clocks by the same source (PTP, NTP or GNSS)",
+        remedy="set both clocks by the same source (PTP, NTP or GNSS)",
     ),
-    Kind(
+    warning(
         "CLOCK_TAKEN_OFF",
         "{clock}: subtracted ({parameter}: {value:g}); the calibration restarted with it",
-        "",
-        "correct that clock, or set this value as a parameter, which is then kept",
+        remedy="correct that clock, or set this value as a parameter, which is then kept",
     ),
-    Kind(
+    warning(
         "DVL_NO_REFERENCE",
         "no DVL sample has a reference velocity at its time, though both come",
-        "Usually the DVL has its own clock.",
-        "compare the header stamps of both; a DVL with its own clock must be synchronised (NTP)",
+        means="Usually the DVL has its own clock.",
+        remedy="compare the header stamps of both; a DVL with its own clock must be synchronised (NTP)",
     ),
-    Kind(
+    warning(
         "CLOCK_WENT_BACK",
         "DVL stamps jumped and the calibration restarted",
-        "A clock was set back, a bag looped, or the first stamp was a week early.",
-        "set clocks before the node is started",
+        means="A clock was set back, a bag looped, or the first stamp was a week early.",
+        remedy="set clocks before the node is started",
     ),
-    Kind(
+    warning(
         "STAMP_MISSING",
         "{stream}: messages without a header stamp, the time of reception is used",
-        "`header.stamp` is zero; the time of reception is late.",
-        "let the driver fill header.stamp",
+        means="`header.stamp` is zero; the time of reception is late.",
+        remedy="let the driver fill header.stamp",
     ),
-    Kind(
+    warning(
         "STAMPS_MISSING_IN_BAG",
         "{count} messages had no header stamp, the time at which they were recorded is used",
-        "",
-        "let the driver fill header.stamp",
+        remedy="let the driver fill header.stamp",
     ),
-    Kind(
+    warning(
         "STAMPS_FAR",
         "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, absurdly far from the others",
-        "A computer without a clock battery.",
-        "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording",
+        means="A computer without a clock battery.",
+        remedy=(
+            "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording"
+        ),
     ),
-    Kind(
+    warning(
         "STAMP_STRAY",
         "{count} {stream} samples have stamps more than max_time_jump from their neighbours'; they are not used",
-        "Single stamps are wrong. A jump that the next sample confirms is followed.",
-        "check the clock of the driver",
+        means="Single stamps are wrong. A jump that the next sample confirms is followed.",
+        remedy="check the clock of the driver",
     ),
-    Kind(
+    warning(
         "SAMPLES_BEFORE_RESTART",
         "{count} {stream} samples were from before the clock was set back or the bag looped; they are not used",
-        "",
-        "nothing, unless clocks are set during a run",
+        remedy="nothing, unless clocks are set during a run",
     ),
-    Kind(
+    warning(
         "SAMPLES_LATE",
         "{count} {stream} samples came after the DVL sample that they belong to had been used; they are not used",
-        "",
-        "raise max_latency, in proportion when a bag is played faster than recorded",
+        remedy="raise max_latency, in proportion when a bag is played faster than recorded",
     ),
-    Kind(
+    warning(
         "MODEL_RESTARTED",
         "{model}: the filter diverged {count} times and went on from its last good state",
-        "Data and parameters contradict each other, for instance a wrong mounting without a gate.",
-        "check mounting_rpy and lever_arm, and leave gate_probability on",
+        means="Data and parameters contradict each other, for instance a wrong mounting without a gate.",
+        remedy="check mounting_rpy and lever_arm, and leave gate_probability on",
     ),
     # two publishers, wrong types, quality of service
-    Kind(
+    warning(
         "STAMP_REPEATED",
         "{count} {stream} samples repeat the stamp of the one before; they are not used",
-        "Two publishers on one topic, or a driver that sends twice.",
-        "stop the second publisher (ros2 topic info -v)",
+        means="Two publishers on one topic, or a driver that sends twice.",
+        remedy="stop the second publisher (ros2 topic info -v)",
     ),
-    Kind(
+    warning(
         "STAMP_OUT_OF_ORDER",
         "{count} {stream} samples are older than the one before; they are not used",
-        "Two publishers on one topic, or a clock set back by less than `max_time_jump`.",
-        "stop the second publisher (ros2 topic info -v), set clocks before the run",
+        means="Two publishers on one topic, or a clock set back by less than `max_time_jump`.",
+        remedy="stop the second publisher (ros2 topic info -v), set clocks before the run",
     ),
-    Kind(
+    warning(
         "TOPIC_SEVERAL_PUBLISHERS",
         "{topic}: {count} publishers ({names}), where one is expected",
-        "Two drivers, or a bag next to the driver: samples mix.",
-        "stop the others",
+        means="Two drivers, or a bag next to the driver: samples mix.",
+        remedy="stop the others",
     ),
-    Kind(
+    warning(
         "TOPIC_OTHER_TYPE",
         "{topic}: {name} publishes {type}, where {expected} is expected, and is not heard",
-        "The warning names the parameter.",
-        "{remedy}",
+        means="The warning names the parameter.",
+        remedy="{remedy}",
     ),
-    Kind(
+    warning(
         "TOPIC_QOS",
         "{topic}: the QoS of {name} is incompatible, it is not heard ({reason})",
-        "The publisher offers less than the node asks for.",
-        "set the publisher's durability to volatile, its reliability to either",
+        means="The publisher offers less than the node asks for.",
+        remedy="set the publisher's durability to volatile, its reliability to either",
     ),
-    Kind(
+    warning(
         "OUTPUT_QOS",
         "{topic}: {name} asks for an incompatible QoS and does not hear it ({reason})",
-        "",
-        "change the QoS of the subscriber",
+        remedy="change the QoS of the subscriber",
     ),
-    Kind(
+    warning(
         "SECOND_NODE",
         "{topic}: {count} publishers ({names})",
-        "Two calibration nodes, or a bag with recorded estimates.",
-        "stop the second node, or give one a namespace (--ros-args -r __ns:=/port) and its own result_file",
+        means="Two calibration nodes, or a bag with recorded estimates.",
+        remedy="stop the second node, or give one a namespace (--ros-args -r __ns:=/port) and its own result_file",
     ),
-    Kind(
+    warning(
         "TF_TWICE",
         "another node publishes a transform to {frame!r}, in addition to publish_tf",
-        "Usually robot_state_publisher with the nominal mounting.",
-        "turn publish_tf off, and write the calibration into the URDF instead (dvl-calib apply --urdf)",
+        means="Usually robot_state_publisher with the nominal mounting.",
+        remedy="turn publish_tf off, and write the calibration into the URDF instead (dvl-calib apply --urdf)",
     ),
-    Kind(
+    warning(
         "POSITION_UNKNOWN",
         "publish_tf is set, but the position of the reference point in {base} is unknown, and so is the DVL's; no "
         "transform is published",
-        "",
-        "set reference_position, and dvl_position to from_reference; or publish the transform of the reference's frame",
+        remedy=(
+            "set reference_position, and dvl_position to from_reference; or publish the transform of the reference's "
+            "frame"
+        ),
     ),
-    Kind(
+    warning(
         "TF_NOT_THERE",
         "publish_tf is set, but tf2_ros is not installed; ~/mounting is published, a transform is not",
-        "",
-        "install ros-$ROS_DISTRO-tf2-ros-py, and source its setup.bash",
+        remedy="install ros-$ROS_DISTRO-tf2-ros-py, and source its setup.bash",
     ),
     # frames
-    Kind(
+    warning(
         "DVL_FRAME",
         "dvl: a message has frame_id {frame_id!r} where {expected!r} is expected; it is not used",
-        "Another frame than configured, or the body's.",
-        "let the driver publish in the DVL's own frame, or set parameter dvl_frame to {frame_id!r} if that is its name",
+        means="Another frame than configured, or the body's.",
+        remedy=(
+            "let the driver publish in the DVL's own frame, or set parameter dvl_frame to {frame_id!r} if that is "
+            "its name"
+        ),
     ),
-    Kind(
+    warning(
         "DVL_TURNED_TWICE",
         "dvl: data in frame {frame_id!r} are turned from forward-right-down to forward-left-up, and mounting_rpy "
         "turns the DVL upside down as well",
-        "Right only for a DVL that looks up.",
-        "if mounting_rpy describes a frame whose z points down, set dvl_axes to flu",
+        means="Right only for a DVL that looks up.",
+        remedy="if mounting_rpy describes a frame whose z points down, set dvl_axes to flu",
     ),
-    Kind(
+    warning(
         "REFERENCE_FRAME",
         "reference: frame_id {frame_id!r} says neither body ({base}) nor earth ({earth}); its messages are not used",
-        "",
-        "set parameter gnss_frame to body, enu or ned",
+        remedy="set parameter gnss_frame to body, enu or ned",
     ),
-    Kind(
+    warning(
         "REFERENCE_NO_ATTITUDE",
         "{count} DVL samples have an earth-frame reference but no attitude; the models with GNSS cannot use them",
-        "",
-        "check that the IMU topic has messages with an orientation; or publish the reference in the body frame",
+        remedy="check that the IMU topic has messages with an orientation; or publish the reference in the body frame",
     ),
-    Kind(
+    warning(
         "IMU_FRAME",
         "imu: data is in frame {frame_id!r}; it is taken as the orientation and angular velocity of {base}",
-        "",
-        "if the IMU is mounted rotated, give its orientation in parameter imu_rpy",
+        remedy="if the IMU is mounted rotated, give its orientation in parameter imu_rpy",
     ),
     # messages that cannot be used
-    Kind(
+    warning(
         "MESSAGE_UNDECODABLE",
         "{stream}: a message could not be decoded ({reason}); it is skipped",
-        "Truncated, or of another version of its package.",
-        "rebuild the driver's messages; ros2 bag convert where the package is installed",
+        means="Truncated, or of another version of its package.",
+        remedy="rebuild the driver's messages; ros2 bag convert where the package is installed",
     ),
-    Kind(
+    warning(
         "SAMPLES_INVALID",
         "{count} {stream} samples are invalid (not finite, above max_speed, or with an impossible covariance); they "
         "are not used",
-        "",
-        "check the sensor, its bottom lock or fix, and its driver",
+        remedy="check the sensor, its bottom lock or fix, and its driver",
     ),
-    Kind(
+    warning(
         "DVL_REFUSED",
         "{count} DVL messages are not used: {reason}",
-        "The driver marks the velocity as not valid ([rules](reference.md#drivers)).",
-        "{remedy}",
+        means="The driver marks the velocity as not valid ([rules](reference.md#drivers)).",
+        remedy="{remedy}",
     ),
-    Kind(
+    warning(
         "DVL_DROPOUTS",
         "the DVL dropped out {count} times",
-        "",
-        "check its power, cable and bottom lock (altitude, speed)",
+        remedy="check its power, cable and bottom lock (altitude, speed)",
     ),
-    Kind(
+    warning(
         "PROCESS_PAUSED",
         "this process was not running for {seconds:.0f} s",
-        "The node was stopped, or the machine slept or was overloaded.",
-        "let it run in the background (bg), keep the machine awake, give it more of a core",
+        means="The node was stopped, or the machine slept or was overloaded.",
+        remedy="let it run in the background (bg), keep the machine awake, give it more of a core",
     ),
-    Kind(
+    warning(
         "DVL_FROZEN",
         "{count} DVL samples repeat one velocity more than max_repeats times; they are not used",
-        "",
-        "restart the driver",
+        remedy="restart the driver",
     ),
-    Kind(
+    warning(
         "DVL_REPEATS",
         "{count} DVL samples repeat the velocity before exactly and are used",
-        "Only a simulated velocity without noise repeats exactly.",
-        "if its driver hangs, set max_repeats",
+        means="Only a simulated velocity without noise repeats exactly.",
+        remedy="if its driver hangs, set max_repeats",
     ),
     # GNSS
-    Kind(
+    warning(
         "GNSS_OUTAGE",
         "no GNSS for {seconds:.0f} s: {model} still corrects with its last estimate, but learns nothing more",
-        "",
-        "surface, check the receiver and the topic {topic}, or select a model without GNSS (gnss_free_model)",
+        remedy="surface, check the receiver and the topic {topic}, or select a model without GNSS (gnss_free_model)",
     ),
-    Kind(
+    warning(
         "GNSS_OUTAGE_WITHOUT",
         "no GNSS for {seconds:.0f} s: {model} continues, but learns nothing that needs GNSS, such as the scale",
-        "",
-        "surface, or check the receiver and the topic {topic}",
+        remedy="surface, or check the receiver and the topic {topic}",
     ),
-    Kind(
+    warning(
         "GNSS_LOSSES",
         "GNSS was lost {count} times",
-        "Antenna under water or shaded.",
-        "check its antenna; if models switch to and fro, raise gnss_hysteresis",
+        means="Antenna under water or shaded.",
+        remedy="check its antenna; if models switch to and fro, raise gnss_hysteresis",
     ),
-    Kind(
+    warning(
         "BAG_NO_IMU",
         "no IMU in the bag: {what}",
-        "",
-        "record sensor_msgs/Imu with an orientation, or name its topic: --imu-topic",
+        remedy="record sensor_msgs/Imu with an orientation, or name its topic: --imu-topic",
     ),
-    Kind(
+    warning(
         "BAG_NO_GNSS",
         "no topic {topic!r} in the bag: only the models without GNSS can run",
-        "",
-        "if there is one under another name, set --gnss-topic",
+        remedy="if there is one under another name, set --gnss-topic",
     ),
-    Kind(
+    warning(
         "BAG_NO_DEFINITION",
         "the bag does not say how {type} is laid out (recorded before ROS 2 Iron?); it is read by the definitions "
         "known here",
-        "",
-        "if it cannot be decoded, run ros2 bag convert to MCAP where the package is installed",
+        remedy="if it cannot be decoded, run ros2 bag convert to MCAP where the package is installed",
     ),
     # motion and configuration
-    Kind(
+    warning(
         "NO_TURN_RATE",
         "{count} samples have no angular velocity for max_turn_rate and are not used",
-        "",
-        "check the IMU topic, or set max_turn_rate to 0",
+        remedy="check the IMU topic, or set max_turn_rate to 0",
     ),
-    Kind(
+    warning(
         "LEVER_ARM_NOT_COMPENSATED",
         "lever_arm is not compensated in {count} samples: no angular velocity",
-        "",
-        "check the IMU topic, or set max_turn_rate so that turns are left out",
+        remedy="check the IMU topic, or set max_turn_rate so that turns are left out",
     ),
-    Kind(
-        "ALL_SLOW",
-        "every sample is slower than min_speed, nothing is learnt",
-        "",
-        "drive, at 1 m/s or more",
-    ),
-    Kind(
+    warning("ALL_SLOW", "every sample is slower than min_speed, nothing is learnt", remedy="drive, at 1 m/s or more"),
+    warning(
         "SAMPLES_GATED",
         "{model}: {gated} of {given} samples are gated",
-        "",
-        "check mounting_rpy and the frames before believing it: does the vehicle drive ahead in the DVL's x?",
+        remedy="check mounting_rpy and the frames before believing it: does the vehicle drive ahead in the DVL's x?",
     ),
-    Kind(
+    error(
         "CONFIGURATION_WRONG",
         "the data contradict the configuration: {says}",
-        "",
-        "correct the configuration and start again",
-        Severity.ERROR,
+        remedy="correct the configuration and start again",
     ),
-    Kind(
+    warning(
         "HEADING_DEVIATION",
         "the heading error changes with the heading: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
         "{least:+.1f}° at {least_at:.0f}°; it costs {cost:.0f} m per km",
-        "A compass deviates with the heading, a gyro drifts.",
-        "{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
+        means="A compass deviates with the heading, a gyro drifts.",
+        remedy="{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
     ),
-    Kind(
+    warning(
         "HEADING_DRIFTS",
         "the heading error changes by {degrees:+.1f}° ± {std:.1f}° from start to end, so the yaw is uncertain by "
         "{off:.1f}°",
-        "A gyro or a heading without a compass drifts.",
-        "let the heading settle, or aid it with a compass or GNSS",
+        means="A gyro or a heading without a compass drifts.",
+        remedy="let the heading settle, or aid it with a compass or GNSS",
     ),
-    Kind(
+    warning(
         "IMU_LEVEL",
         "the IMU's orientation is a heading alone (roll and pitch are 0 in every message), so the DVL's roll and pitch "
         "are not known",
-        "",
-        "record an IMU that gives roll and pitch",
+        remedy="record an IMU that gives roll and pitch",
     ),
-    Kind(
+    warning(
         "TILT_NOT_FOLLOWED",
         "the DVL's velocity does not follow the vehicle's {axis}: {share:.1f} ± {std:.1f} times the {axis} remains, "
         "which looks like {off:.1f}° of mounting",
-        "Factor 1: the driver levels the velocity. 2 or -2: wrong sign of an IMU angle or a DVL axis.",
-        "have the driver send the velocity in the DVL's own axes; check the sign of the IMU's roll and pitch",
+        means="Factor 1: the driver levels the velocity. 2 or -2: wrong sign of an IMU angle or a DVL axis.",
+        remedy="have the driver send the velocity in the DVL's own axes; check the sign of the IMU's roll and pitch",
     ),
-    Kind(
+    warning(
         "TILT_NOT_SHOWN",
         "the vehicle hardly tilts, so nothing shows whether the DVL's driver levels its velocity: if it does, the "
         "vehicle's mean {axis} is in the mounting ({lean:.1f}° of {axis})",
-        "",
-        "look into the driver's settings, or record in waves or with dives",
+        remedy="look into the driver's settings, or record in waves or with dives",
     ),
-    Kind(
+    warning(
         "ONE_SPEED",
         "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes what dvl_bias_std says of it",
-        "",
-        "drive at two speeds, one twice the other; set dvl_bias_std, if you know the DVL's",
+        remedy="drive at two speeds, one twice the other; set dvl_bias_std, if you know the DVL's",
     ),
-    Kind(
+    warning(
         "DVL_BIAS",
         "the DVL has the same velocity error at every speed, {axes} mm/s in the body, which "
         "looks like {degrees:.1f}° of mounting at the usual speed",
-        "A bias of the DVL's electronics, a rounding, or water that moves in its shell.",
-        "subtract the bias in the driver, or have the DVL serviced",
+        means="A bias of the DVL's electronics, a rounding, or water that moves in its shell.",
+        remedy="subtract the bias in the driver, or have the DVL serviced",
     ),
-    Kind(
+    warning(
         "BEAM_OFF",
         "one beam of the DVL is off by {percent:.0f} ± {std:.0f} %: that at {azimuth:.0f}° from its x axis to port "
         "reads low, or the opposite one high",
-        "A fouled or damaged transducer, or bubbles before it; roll and yaw of the mounting are then wrong.",
-        "look at that transducer; a DVL that gives beam velocities can solve without it",
+        means="A fouled or damaged transducer, or bubbles before it; roll and yaw of the mounting are then wrong.",
+        remedy="look at that transducer; a DVL that gives beam velocities can solve without it",
     ),
-    Kind(
+    warning(
         "BED_MOVES",
         "moving bed: over ground the reference is {millimetres:.0f} mm/s faster than the DVL towards {course:.0f}°, "
         "on every heading",
-        "Bottom track follows moving sediment or the water's layer.",
-        "calibrate where the bed is still; to estimate that velocity as well: -p reference_offset_std:={std:g}",
+        means="Bottom track follows moving sediment or the water's layer.",
+        remedy="calibrate where the bed is still; to estimate that velocity as well: -p reference_offset_std:={std:g}",
     ),
-    Kind(
+    warning(
         "VELOCITY_SMOOTHED",
         "the {name} is smoothed over {seconds:.1f} s",
-        "A smoothed velocity is late in turns, which looks like roll, lever arm and delay.",
-        "record the velocity before it is filtered",
+        means="A smoothed velocity is late in turns, which looks like roll, lever arm and delay.",
+        remedy="record the velocity before it is filtered",
     ),
-    Kind(
+    warning(
         "CIRCULAR_REFERENCE",
         "the reference follows the DVL's own noise for {seconds:.1f} s: a filter made it from this DVL",
-        "",
-        "use the velocity or positions of GNSS alone",
+        remedy="use the velocity or positions of GNSS alone",
     ),
-    Kind(
+    warning(
         "FILTER_FINDS_NOTHING",
         "the reference lags by {late:.1f} s, is smoothed over as long, and shows no error of the DVL: a filter may "
         "have made it from this DVL",
-        "",
-        "use the velocity or positions of GNSS alone",
+        remedy="use the velocity or positions of GNSS alone",
     ),
-    Kind(
+    warning(
         "LEVER_ARM_CONTRADICTED",
         "the data show another lever arm than the configured one: {axes}",
-        "Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",
-        "measure the positions of DVL and reference point (lever_arm, reference_position), then check the IMU's axes, "
-        "clock",
+        means="Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",
+        remedy=(
+            "measure the positions of DVL and reference point (lever_arm, reference_position), then check the IMU's "
+            "axes, clock"
+        ),
     ),
-    Kind(
+    warning(
         "CLOCK_OR_ARM",
         "at one speed a delayed reference looks like a lever arm, and in a steady turn like a yaw: {metres:.1f} m, "
         "{degrees:.1f}° and {seconds:.1f} s of delay cannot be distinguished; σ includes them",
-        "",
-        "drive turns to both sides at two speeds",
+        remedy="drive turns to both sides at two speeds",
     ),
-    Kind(
+    warning(
         "CLOCK_ON_TURN",
         "in a steady turn a delayed reference or IMU looks like a yaw: {degrees:.1f}° cannot be distinguished; σ "
         "includes it",
-        "",
-        "drive turns to both sides, or a straight leg",
+        remedy="drive turns to both sides, or a straight leg",
     ),
-    Kind(
+    warning(
         "REFERENCE_OFFSET",
         "the reference has a constant error of {millimetres:.0f} mm/s towards {course:.0f}°{where}",
-        "A constant error of an inertial navigation, or a current in water track. `full` estimates it.",
-        "judge the drift by another reference",
+        means="A constant error of an inertial navigation, or a current in water track. `full` estimates it.",
+        remedy="judge the drift by another reference",
     ),
-    Kind(
+    warning(
         "ONE_HEADING",
         "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes that of the reference",
-        "",
-        "drive the opposite heading as well, at two speeds; or set reference_offset_std to the reference's accuracy "
-        "(σ includes four times that)",
+        remedy=(
+            "drive the opposite heading as well, at two speeds; or set reference_offset_std to the reference's "
+            "accuracy (σ includes four times that)"
+        ),
     ),
-    Kind(
+    warning(
         "INNOVATIONS_LARGE",
         "{model}: innovations are larger than R and P allow (mean NIS {nis:.1f}, at most {limit:.1f}), σ is too small",
-        "",
-        "raise gnss_aided_std or gnss_free_std, or find the effect with dvl-calib diagnose",
+        remedy="raise gnss_aided_std or gnss_free_std, or find the effect with dvl-calib diagnose",
     ),
-    Kind(
+    warning(
         "PRIOR_HOLDS_ERROR",
         "prior_source initial_window: the mean of the DVL's own first seconds already holds the misalignment, so M5 "
         "and M6 gain nothing over no calibration",
-        "",
-        "prefer prior_source fixed",
+        remedy="prefer prior_source fixed",
     ),
-    Kind(
+    warning(
         "INITIAL_CONTRADICTED",
         "the data contradict initial_calibration {file}: the mounting has moved {difference} since, so it is left out",
-        "",
-        "inspect the mounting; if it is right, save this result and start from that",
+        remedy="inspect the mounting; if it is right, save this result and start from that",
     ),
-    Kind(
+    warning(
         "RESULT_WORSE",
         "{path} is kept, which is better ({before}); the newer result ({now}) is {beside}",
-        "",
-        "to use the newer all the same, rename it, or call ~/save_anyway",
+        remedy="to use the newer all the same, rename it, or call ~/save_anyway",
     ),
-    Kind(
+    warning(
         "RESULT_NOT_SAVED",
         "the result was not saved: {reason}",
-        "The previous file is untouched.",
-        "free space, or set result_file elsewhere and call ~/save",
+        means="The previous file is untouched.",
+        remedy="free space, or set result_file elsewhere and call ~/save",
+    ),
+)
+
+
+# Faults of a recording that the doctor finds: code, sentence, meaning and remedy.
+
+DOCTOR = on_page(
+    "troubleshooting.md#what-the-doctor-finds",
+    warning(
+        "DOCTOR_STAMP_ZERO",
+        "{topic}: {share:.0%} of the messages have no stamp",
+        remedy="let the driver fill header.stamp with the time of measurement",
+    ),
+    warning(
+        "DOCTOR_STAMP_RECEPTION",
+        "{topic}: stamps jitter with the reception ({jitter_ms:.0f} ms about {period_ms:.0f} ms), not with the sensor",
+        remedy="let the driver take the sensor's own time; then dvl-calib diagnose BAG estimates the remaining delay",
+    ),
+    warning(
+        "DOCTOR_STAMP_BACK",
+        "{topic}: stamps go back {count} times, by up to {seconds:.1f} s",
+        means="A clock was set, two publishers share the topic, or the bag looped.",
+        remedy="set clocks before the recording; one publisher per topic",
+    ),
+    error(
+        "DOCTOR_STAMP_JUMP",
+        "{topic}: stamps jump ahead by {seconds:.1f} s while recording went on",
+        remedy="set clocks before the recording, or cut the recording there",
+    ),
+    error(
+        "DOCTOR_CLOCKS",
+        "{topic}: stamps are {seconds:.2f} s {side} those of {other}",
+        remedy="synchronise clocks (PTP, NTP or GNSS); for this bag: {here}",
+    ),
+    error(
+        "DOCTOR_APART",
+        "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
+        remedy="record both together; if they were, check the clocks, and for import the times of both files",
+    ),
+    warning(
+        "DOCTOR_REPEATED_STAMP",
+        "{topic}: {share:.0%} of the stamps repeat the one before",
+        means="Two publishers, or a driver that sends twice.",
+        remedy="stop the second publisher (ros2 topic info -v {topic})",
+    ),
+    error(
+        "DOCTOR_STANDING_STAMP",
+        "{topic}: {share:.0%} of the stamps repeat the one before, so hardly a message can be used",
+        remedy="let the driver stamp every message with its time of measurement",
+    ),
+    error("DOCTOR_TOO_FEW", "{topic}: {count} messages are too few", remedy="record all topics for some minutes"),
+    warning(
+        "DOCTOR_UNDECODABLE",
+        "{topic}: {count} of {total} messages cannot be decoded: {reason}",
+        remedy="rebuild the driver's messages, or record with ros2 bag record",
+    ),
+    warning(
+        "DOCTOR_GAPS",
+        "{topic}: silent for {seconds:.1f} s in all (gaps: {count}), the longest at {at_s:.0f} s",
+        remedy="check power, cable, bottom lock and fix at that time",
+    ),
+    warning(
+        "DOCTOR_ZEROS",
+        "{topic}: {share:.0%} of the velocities are exactly zero",
+        remedy="let the driver send nothing, or mark it invalid; these are not used",
+    ),
+    warning(
+        "DOCTOR_REFUSED",
+        "{topic}: {share:.0%} of the messages are refused: {reason}",
+        means="The message marks itself as not valid.",
+        remedy="{remedy}",
+    ),
+    warning(
+        "DOCTOR_FROZEN",
+        "{topic}: {share:.0%} of the velocities repeat the one before exactly",
+        remedy="let the driver send new measurements only; -p max_repeats:=1 skips the repeats",
+    ),
+    warning(
+        "DOCTOR_COVARIANCE",
+        "{topic}: claims a noise of {claimed:.3g} m/s in every message, the data show {shown:.3g} m/s",
+        means="The driver sends a constant, and weights and σ follow it.",
+        remedy="let the driver send the sensor's figure; for this bag: -p use_message_covariance:=false",
+    ),
+    warning(
+        "DOCTOR_AXIS",
+        "{topic}: {axes} is exactly zero in every message: not measured",
+        means="Course and speed have no vertical.",
+        remedy="use a receiver's own velocity (three axes) if pitch matters",
+    ),
+    warning(
+        "DOCTOR_NOT_FINITE",
+        "{topic}: {share:.0%} of the velocities are not finite",
+        remedy="check lock or fix at that time; these are not used",
+    ),
+    error(
+        "DOCTOR_NO_ORIENTATION",
+        "{topic}: no orientation ({why})",
+        remedy="record the IMU's or INS's filtered topic, or a reference in the body frame",
+    ),
+    warning(
+        "DOCTOR_NO_IMU",
+        "no IMU in the bag: {what}",
+        remedy="record sensor_msgs/Imu with an orientation, or name its topic: --imu-topic",
+    ),
+    error(
+        "DOCTOR_NO_IMU_EARTH",
+        "no IMU in the bag: the reference is not in the body's frame, so it cannot be compared with the DVL",
+        remedy="record sensor_msgs/Imu with an orientation, or name its topic: --imu-topic",
+    ),
+    error(
+        "DOCTOR_UNITS",
+        "DVL and reference differ by a factor of {factor:.4g}{guess}",
+        remedy="let its driver convert to m/s",
+    ),
+    error(
+        "DOCTOR_DISAGREE",
+        "DVL and reference do not agree in any frames: {left:.0%} of the speed stays unexplained",
+        means="A wrong heading, clocks that differ by seconds, another vehicle's data, or water track.",
+        remedy="check the IMU's heading (yaw 0 is east and counts to the left), the stamps, and the DVL's bottom lock",
+    ),
+    warning("DOCTOR_FRAMES", "{says}", remedy="check frames and transforms"),
+    warning(
+        "DOCTOR_SLOW_REFERENCE",
+        "{topic}: {rate_hz:.2g} Hz is too slow for turns",
+        remedy="set the receiver to 1 Hz or more, better 5 Hz",
+    ),
+    error(
+        "DOCTOR_NOT_MOVING",
+        "{topic}: the vehicle does not move faster than min_speed ({min_speed:g} m/s)",
+        remedy="record a run at 0.5 m/s or more",
     ),
 )

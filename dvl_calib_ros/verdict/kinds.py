@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 
 
 class Severity(Enum):
@@ -55,8 +56,8 @@ class Kind:
 
     code: str
     says: str
-    means: str
-    remedy: str
+    means: str = ""
+    remedy: str = ""
     severity: Severity = Severity.WARNING
     page: str = "troubleshooting.md#all-warnings"
 
@@ -70,3 +71,16 @@ class Kind:
     def is_finding(self) -> bool:
         """Whether it is a warning or error, listed with its remedy, rather than a reason of a verdict."""
         return self.severity in (Severity.ERROR, Severity.WARNING)
+
+
+# Entries of one severity
+error = partial(Kind, severity=Severity.ERROR)
+warning = partial(Kind, severity=Severity.WARNING)
+reject = partial(Kind, severity=Severity.REJECT)
+marginal = partial(Kind, severity=Severity.MARGINAL)
+accept = partial(Kind, severity=Severity.ACCEPT)
+
+
+def on_page(page: str, *kinds: Kind) -> tuple[Kind, ...]:
+    """Return a table whose entries one page of docs/ explains."""
+    return tuple(replace(kind, page=page) for kind in kinds)

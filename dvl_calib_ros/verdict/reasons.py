@@ -12,12 +12,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from .conclusions import COMPARISONS, DIAGNOSES, UNPAIRED
 from .configurations import CONFIGURATIONS, DISCOVERIES
-from .doctor import DOCTOR
-from .findings import FINDINGS
+from .findings import DOCTOR, FINDINGS
 from .kinds import Kind, Severity
-from .verdicts import MANOEUVRES, SELECTIONS, VERDICTS
+from .verdicts import COMPARISONS, DIAGNOSES, MANOEUVRES, SELECTIONS, UNPAIRED, VERDICTS
 
 _FIELD = re.compile(r"\{[^{}]*\}")
 # tables by name

@@ -2,297 +2,360 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
-
-from .kinds import Kind, Severity
+from .kinds import accept, marginal, on_page, reject, warning
 
 _HELD_OUT = (
     "on {samples} held-out samples the velocity error is {uncorrected:.3f} m/s rms without correction, "
     "{corrected:.3f} with it, {predicted:.3f} predicted"
 )
-_KINDS = (
+VERDICTS = on_page(
+    "troubleshooting.md#reasons-of-a-verdict",
     # use of the samples
-    Kind(
+    reject(
         "NO_SAMPLE_USED",
         "no sample was used",
-        "No reference, no attitude, or every sample was refused.",
-        "there is nothing to apply",
-        Severity.REJECT,
+        means="No reference, no attitude, or every sample was refused.",
+        remedy="there is nothing to apply",
     ),
-    Kind(
+    reject(
         "MOST_SAMPLES_GATED",
         "{gated} of {given} samples were rejected as outliers; the estimate describes only the other {used}",
-        "Most data contradict the estimate: check the configuration.",
-        "",
-        Severity.REJECT,
+        means="Most data contradict the estimate: check the configuration.",
     ),
-    Kind(
+    reject(
         "NOTHING_COMPARED",
         "there is no IMU, so no DVL sample can be compared with the reference",
-        "",
-        "record the IMU's topic, with orientation",
-        Severity.REJECT,
+        remedy="record the IMU's topic, with orientation",
     ),
-    Kind(
+    reject(
         "NO_ANGLE_SHOWN",
         "none of the angles is observable in the data yet",
-        "σ of each angle is still that of the prior: drive more.",
-        "",
-        Severity.REJECT,
+        means="σ of each angle is still that of the prior: drive more.",
     ),
-    Kind(
+    marginal(
         "DRIFT_OPEN",
         "the calibration leaves {open:.0f} m of drift per km open (1σ), more than {limit:.0f}",
-        "Up to five times `target_drift` is accepted.",
-        "drive on: other headings, other speeds, turns to both sides",
-        Severity.MARGINAL,
+        means="Up to five times `target_drift` is accepted.",
+        remedy="drive on: other headings, other speeds, turns to both sides",
     ),
     # estimated values
-    Kind(
+    reject(
         "MISALIGNMENT_LARGE",
         "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
-        "Seldom the bracket.",
-        "is mounting_rpy right, and are the frames?",
-        Severity.REJECT,
+        means="Seldom the bracket.",
+        remedy="is mounting_rpy right, and are the frames?",
     ),
-    Kind(
+    reject(
         "SCALE_LARGE",
         "a scale is {percent:.1f} % off, more than {limit:.1f} %",
-        "Wrong units, speed of sound or reference (`max_scale_error`).",
-        "",
-        Severity.REJECT,
+        means="Wrong units, speed of sound or reference (`max_scale_error`).",
     ),
-    Kind(
+    accept(
         "MOUNTING_FAR",
         "inspect the mounting: it is {degrees:.1f}° from mounting_rpy, which is much (from {limit:.1f}° on)",
-        "The calibration may be good and the bracket bent (`accept_misalignment`).",
-        "",
-        Severity.ACCEPT,
+        means="The calibration may be good and the bracket bent (`accept_misalignment`).",
     ),
-    Kind(
+    marginal(
         "LEVER_ARM_NOT_SHOWN",
         "the lever arm is poorly observable, and {turns}",
-        "σ includes it.",
-        "give lever_arm and initial_std_lever_arm, or go straight and turn both ways",
-        Severity.MARGINAL,
+        means="σ includes it.",
+        remedy="give lever_arm and initial_std_lever_arm, or go straight and turn both ways",
     ),
-    Kind(
+    reject(
         "LEVER_ARM_TURNS_ANGLE",
         "the lever arm is known to ±{std:.2g} m, and {turns}",
-        "This model assumes the arm.",
-        "give lever_arm and initial_std_lever_arm, or go straight and turn both ways",
-        Severity.REJECT,
+        means="This model assumes the arm.",
+        remedy="give lever_arm and initial_std_lever_arm, or go straight and turn both ways",
     ),
     # errors on held-out data
-    Kind(
-        "HELD_OUT",
-        _HELD_OUT,
-        "",
-        "",
-        Severity.ACCEPT,
-    ),
-    Kind(
+    accept("HELD_OUT", _HELD_OUT),
+    marginal(
         "HELD_OUT_TOO_FEW",
         "too few samples with a reference velocity to verify it on held-out data",
-        "Fewer than 20 samples, or all in one stretch.",
-        "",
-        Severity.MARGINAL,
+        means="Fewer than 20 samples, or all in one stretch.",
     ),
-    Kind(
-        "HELD_OUT_OUTLIERS",
-        _HELD_OUT + ", {typical:.3f} without outliers: there are many of them",
-        "",
-        "",
-        Severity.MARGINAL,
-    ),
-    Kind(
-        "HELD_OUT_WORSE",
-        _HELD_OUT + ": the calibration makes it worse",
-        "",
-        "",
-        Severity.REJECT,
-    ),
-    Kind(
-        "HELD_OUT_NO_BETTER",
-        _HELD_OUT + ": the calibration makes no difference, perhaps for lack of data",
-        "",
-        "",
-        Severity.MARGINAL,
-    ),
-    Kind(
+    marginal("HELD_OUT_OUTLIERS", _HELD_OUT + ", {typical:.3f} without outliers: there are many of them"),
+    reject("HELD_OUT_WORSE", _HELD_OUT + ": the calibration makes it worse"),
+    marginal("HELD_OUT_NO_BETTER", _HELD_OUT + ": the calibration makes no difference, perhaps for lack of data"),
+    reject(
         "HELD_OUT_SEVERAL_TIMES",
         _HELD_OUT + ": the error is several times the predicted one",
-        "More than three times.",
-        "the configuration is wrong, or an effect is missing from the model (dvl-calib diagnose looks for it)",
-        Severity.REJECT,
+        means="More than three times.",
+        remedy="the configuration is wrong, or an effect is missing from the model (dvl-calib diagnose looks for it)",
     ),
-    Kind(
+    reject(
         "HELD_OUT_IMPLAUSIBLE",
         _HELD_OUT + ": implausibly small, as if the DVL were fused into the reference, which then cannot judge it",
-        "",
-        "take GNSS alone",
-        Severity.REJECT,
+        remedy="take GNSS alone",
     ),
-    Kind(
+    marginal(
         "HELD_OUT_NOISIER",
         _HELD_OUT + ": the reference is noisier than it says, or an effect is missing from the model",
-        "Limit: `max_error_ratio`.",
-        "",
-        Severity.MARGINAL,
+        means="Limit: `max_error_ratio`.",
     ),
     # dead reckoning
-    Kind(
+    marginal(
         "DRIFT_NO_BETTER",
         "on data held out dead reckoning gets no better: {after:.1f} m per km with it, {before:.1f} as mounted",
-        "The velocity fits better, but a lasting error remains.",
-        "",
-        Severity.MARGINAL,
+        means="The velocity fits better, but a lasting error remains.",
     ),
-    Kind(
+    reject(
         "DRIFT_WORSE",
         "on data held out dead reckoning drifts by {after:.1f} m per km with it, by {before:.1f} as mounted",
-        "",
-        "an effect is missing from the model (dvl-calib diagnose looks for it)",
-        Severity.REJECT,
+        remedy="an effect is missing from the model (dvl-calib diagnose looks for it)",
     ),
     # clocks
-    Kind(
+    reject(
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
-        "",
-        "set the clocks by one source; this recording: --restamp log (recording times)",
-        Severity.REJECT,
+        remedy="set the clocks by one source; this recording: --restamp log (recording times)",
     ),
     # several recordings
-    Kind(
+    reject(
         "BAGS_OVERLAP",
         "{first} and {second} hold the DVL at the same time, so of many samples only the first is used",
-        "One recording twice, or two DVLs.",
-        "replay each by itself, and compare them",
-        Severity.REJECT,
+        means="One recording twice, or two DVLs.",
+        remedy="replay each by itself, and compare them",
     ),
-    Kind(
+    reject(
         "BAGS_MOUNTING_DIFFERS",
         "the mounting differs {moved} {between}: the average of all is the mounting of none",
-        "",
-        "",
-        Severity.REJECT,
     ),
-    Kind(
+    reject(
         "BAGS_DELAY_CHANGED",
         "the delay of the DVL's stamps differs between recordings, but one delay is used for recordings that follow "
         "each other so closely",
-        "",
-        "calibrate each by itself",
-        Severity.REJECT,
+        remedy="calibrate each by itself",
     ),
 )
-VERDICTS = tuple(replace(kind, page="troubleshooting.md#reasons-of-a-verdict") for kind in _KINDS)
 
 
-_Said = partial(Kind, page="troubleshooting.md#what-to-drive-next", severity=Severity.ACCEPT, remedy="")
-MANOEUVRES = (
-    _Said(
-        "NEXT_LEG", "drive straight, {name} ({compass:.0f}°)", "Another heading separates a current from the mounting."
+MANOEUVRES = on_page(
+    "troubleshooting.md#what-to-drive-next",
+    accept(
+        "NEXT_LEG",
+        "drive straight, {name} ({compass:.0f}°)",
+        means="Another heading separates a current from the mounting.",
     ),
-    _Said("NEXT_AHEAD", "drive straight ahead", "Motion ahead makes yaw, pitch and scale observable."),
-    _Said("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", "Angles show in proportion to the speed."),
-    _Said("NEXT_SPEEDS", "speed up and slow down by half", "Accelerations show a delay, two speeds a bias."),
-    _Said("NEXT_CIRCLE", "circle to {side}", "Turns show the lever arm and average earth-fixed errors."),
-    _Said("NEXT_EIGHT", "drive a figure eight", "Turns to both sides separate lever arm and yaw."),
-    _Said("NEXT_DIVE", "dive and rise by 10° of pitch", "Pitching shows the vertical axis."),
-    _Said("NEXT_WAIT", "keep on: nothing is learnt yet", ""),
-    _Said(
-        "NEXT_REJECTED",
-        "nothing: the findings say why this calibration is not to be used",
-        "",
-    ),
-    _Said(
-        "NEXT_STANDS",
-        "keep on: the goal is reached, if it stays so",
-        "",
-    ),
-    _Said("NEXT_IS_GOOD", "good enough: save", ""),
-    _Said(
-        "NEXT_IS_GOOD_BUT_SCALE",
-        "as good as it gets without a reference: save; the scale stays unknown",
-        "",
-    ),
-    _Said(
+    accept("NEXT_AHEAD", "drive straight ahead", means="Motion ahead makes yaw, pitch and scale observable."),
+    accept("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", means="Angles show in proportion to the speed."),
+    accept("NEXT_SPEEDS", "speed up and slow down by half", means="Accelerations show a delay, two speeds a bias."),
+    accept("NEXT_CIRCLE", "circle to {side}", means="Turns show the lever arm and average earth-fixed errors."),
+    accept("NEXT_EIGHT", "drive a figure eight", means="Turns to both sides separate lever arm and yaw."),
+    accept("NEXT_DIVE", "dive and rise by 10° of pitch", means="Pitching shows the vertical axis."),
+    accept("NEXT_WAIT", "keep on: nothing is learnt yet"),
+    accept("NEXT_REJECTED", "nothing: the findings say why this calibration is not to be used"),
+    accept("NEXT_STANDS", "keep on: the goal is reached, if it stays so"),
+    accept("NEXT_IS_GOOD", "good enough: save"),
+    accept("NEXT_IS_GOOD_BUT_SCALE", "as good as it gets without a reference: save; the scale stays unknown"),
+    accept(
         "LONGER_AS_DRIFT_GREW",
         "it takes longer than promised: the predicted drift has grown from {before:.1f} to {now:.1f} m per km",
-        "",
     ),
-    _Said(
+    accept(
         "LONGER_AS_LITTLE_SHOWN",
         "it takes longer than promised: the motion since then was less informative than the suggested one "
         "({before:.1f} m per km then, {now:.1f} now)",
-        "",
     ),
-    _Said(
+    accept(
         "WORTH_OF_ANOTHER_MODEL",
         "no longer good enough: the model is {model} now",
-        "`auto` follows the reference; in an outage it uses a model without one.",
+        means="`auto` follows the reference; in an outage it uses a model without one.",
         remedy="Wait for the reference, or name the model.",
     ),
-    _Said(
+    accept(
         "WORTH_HAS_FALLEN",
         "no longer good enough: the predicted drift has grown to {worth:.1f} m per km",
-        "",
         remedy="Drive on. If it happens again, look for the cause with `dvl-calib doctor`.",
     ),
 )
 
 
-_Selected = partial(Kind, page="troubleshooting.md#why-a-model-is-selected", severity=Severity.ACCEPT)
-SELECTIONS = (
-    _Selected("MODEL_NAMED", "set by parameter model", "", ""),
-    _Selected("MODEL_CHOSEN", "{by}: {gnss}", "", ""),
-    _Selected("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}", "", ""),
-    _Selected("GNSS_AVAILABLE", "GNSS is available", "", ""),
-    _Selected("GNSS_NOT_AVAILABLE", "GNSS is not available", "No reference for `gnss_timeout`.", ""),
-    _Selected(
-        "GNSS_GOING",
-        "GNSS has stopped; the model changes if it stays away for gnss_hysteresis",
-        "",
-        "",
-    ),
-    _Selected(
-        "GNSS_COMING",
-        "GNSS is back; the model changes if it stays for gnss_hysteresis",
-        "",
-        "",
-    ),
-    _Selected(
-        "HEADINGS_TELL_CURRENT",
-        "headings distinguish a current from the mounting",
-        "",
-        "",
-    ),
-    _Selected(
+SELECTIONS = on_page(
+    "troubleshooting.md#why-a-model-is-selected",
+    accept("MODEL_NAMED", "set by parameter model"),
+    accept("MODEL_CHOSEN", "{by}: {gnss}"),
+    accept("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}"),
+    accept("GNSS_AVAILABLE", "GNSS is available"),
+    accept("GNSS_NOT_AVAILABLE", "GNSS is not available", means="No reference for `gnss_timeout`."),
+    accept("GNSS_GOING", "GNSS has stopped; the model changes if it stays away for gnss_hysteresis"),
+    accept("GNSS_COMING", "GNSS is back; the model changes if it stays for gnss_hysteresis"),
+    accept("HEADINGS_TELL_CURRENT", "headings distinguish a current from the mounting"),
+    accept(
         "HEADINGS_TOO_FEW",
         "no attitude over headings that would distinguish a current from the mounting",
-        "On one heading, or without an IMU, a current looks like a mounting.",
-        "",
+        means="On one heading, or without an IMU, a current looks like a mounting.",
     ),
-    _Selected("TRIM_KNOWN", "the trim is known", "The IMU gives roll and pitch.", ""),
-    _Selected(
+    accept("TRIM_KNOWN", "the trim is known", means="The IMU gives roll and pitch."),
+    accept(
         "ARM_LOOKS_LIKE_ANGLE",
         "on this track a {metres:g} m error of the lever arm looks like {degrees:.1f}° of {angle}",
-        "Turns to one side at one speed confuse lever arm and angle.",
-        "",
+        means="Turns to one side at one speed confuse lever arm and angle.",
     ),
-    _Selected(
+    accept(
         "POSITIONS_NOISY",
         "velocities from the positions would have {noise:.1f} m/s of noise, so positions are compared over legs",
-        "",
-        "",
     ),
-    _Selected(
+    accept(
         "POSITIONS_SELDOM",
         "positions are too infrequent for velocities, so they are compared over legs",
-        "Positions more than three `position_window` apart are compared over legs.",
-        "",
+        means="Positions more than three `position_window` apart are compared over legs.",
+    ),
+)
+
+
+# Conclusions of comparisons and diagnoses.
+
+COMPARISONS = on_page(
+    "troubleshooting.md#what-a-comparison-says",
+    accept(
+        "MOUNTING_SAME",
+        "no movement found; smaller than {smallest:.1f}° is not detectable ({angles}; {power:.0f} of 100 such "
+        "movements are found){unseen}",
+    ),
+    accept(
+        "MOUNTING_SCATTERS",
+        "the calibrations differ, but no single date explains it: {count} calibrations differ by at most {apart:.2f}° "
+        "in any angle (χ² {chi_square:.1f} of {freedom}, p {p:.2g})",
+        means="σ is too small, or the mounting moves all the time.",
+    ),
+    reject("MOUNTING_MOVED", "the mounting has moved {moved} {between}"),
+    marginal(
+        "MOUNTING_SUSPECTED",
+        "suspected move: {name} is rejected ({why}), and differs from {other} {moved}",
+        means="A mounting that moved far is often rejected; σ of a reject does not hold.",
+        remedy="inspect the mounting, and calibrate once more",
+    ),
+    marginal(
+        "MOUNTING_SUSPICIOUS",
+        "the mounting may have moved {moved} {between}; without a movement, 1 of {often:.0f} comparisons "
+        "differs this much",
+        remedy="calibrate once more before you rely on either",
+    ),
+    marginal(
+        "SCALE_CHANGED",
+        "the scale has changed by {percent:+.2f} % ± {std:.2f} % {between}",
+        remedy="the speed of sound, or the DVL's settings",
+    ),
+    marginal(
+        "DELAY_CHANGED",
+        "the DVL's stamps come {seconds:.2f} s ± {std:.2f} s {way} {between}",
+        remedy="a clock, not the mounting",
+    ),
+    marginal(
+        "SCATTER_BESIDE_MOVES",
+        "apart from that, the calibrations scatter by {by:.1f} times their σ, so the size of the move is as uncertain",
+    ),
+    marginal(
+        "SCATTER",
+        "the calibrations scatter by {by:.1f} times their σ, and no single date explains it: σ is too small",
+    ),
+    # remarks that weaken a comparison
+    warning("CALIBRATION_DOUBTED", "{name}: {remark}", remedy="calibrate again, or leave it out of the comparison"),
+    warning(
+        "MODELS_DIFFER",
+        "the models differ ({models}): so may their errors",
+        remedy="calibrate all with one model (-p model:=full)",
+    ),
+    warning(
+        "ARMS_DIFFER",
+        "{name} was calibrated with another lever arm than {other} {verb} ({arm} m); the wrong one turns its angles",
+        remedy="if that one is right, calibrate {name} again with -p lever_arm:=[{arm}]",
+    ),
+)
+
+
+_FALLS = "the error falls from {before:.1f} to {after:.1f} mm/s on held-out data, where the noise is {noise:.1f} mm/s"
+DIAGNOSES = on_page(
+    "troubleshooting.md#what-a-diagnosis-says",
+    accept("GAP_EXPLAINED", "the gap is {explained} by {names}: " + _FALLS),
+    marginal("GAP_AMBIGUOUS", "the gap is {explained} by {names}: " + _FALLS + "; this data cannot tell which it is"),
+    reject(
+        "GAP_PARTLY_UNKNOWN",
+        "the gap is {explained} by {names}, and no effect of the library explains the rest: " + _FALLS,
+    ),
+    reject(
+        "GAP_UNKNOWN",
+        "no effect of the library explains the error of {before:.1f} mm/s, where the noise is {noise:.1f} mm/s",
+    ),
+    accept(
+        "NO_GAP",
+        "no gap beyond the noise of {noise:.1f} mm/s; {visible} of {tested} effects would have been found at sizes "
+        "that matter",
+    ),
+    marginal(
+        "GAP_NOT_TESTABLE",
+        "this recording cannot rule out a gap: only {visible} of {tested} effects would have been found in it",
+    ),
+    marginal(
+        "GAP_TOO_SHORT",
+        "this recording cannot show a gap: {samples} samples over {seconds:.0f} s are too few",
+        means="Samples with DVL, reference and attitude count.",
+        remedy="record {wanted:.0f} s at least, better 600 s",
+    ),
+    marginal(
+        "GAP_REFERENCE_CONSTANT",
+        "this recording cannot show a gap: the reference velocity is constant to the last digit",
+        remedy="check the receiver",
+    ),
+    marginal(
+        "GAP_REFERENCE_VERTICAL",
+        "this recording cannot show a gap: the reference does not measure the horizontal velocity",
+        remedy="record a horizontal reference velocity",
+    ),
+    accept("REST_UNEXPLAINED", "{rest:.1f} mm/s are not explained"),
+    accept("REST_FOLLOWS", "the residual follows {about}"),
+    accept("REST_FOLLOWS_PERIOD", "the residual follows a period of {seconds:.0f} s"),
+    accept("REST_FOLLOWS_NOTHING", "the residual follows neither motion nor time"),
+    # what to record next
+    accept("NEXT_TELL_APART", "to tell {name} from {others}: {manoeuvre}"),
+    accept("NEXT_SHOW", "to see {name}: {manoeuvre}"),
+    accept("NEXT_SAME_ROUTE", "the same route again, to see whether the residual follows place, time or motion"),
+    accept("NEXT_RECORD", "record {needs} as well, to test {names}"),
+    accept("NEXT_NOTHING", "nothing: all effects show"),
+    accept("NEXT_ANYTHING", "straight legs on several headings and at several speeds, with turns to both sides"),
+)
+
+
+UNPAIRED = on_page(
+    "troubleshooting.md#what-a-comparison-with-a-simulator-says",
+    reject("SIMULATOR_LACKS", "the simulator lacks {names}"),
+    reject("SIMULATOR_OTHER_SIZE", "the simulator has {names} of another size"),
+    reject("SIMULATOR_ALONE_HAS", "the simulator has {names} which the vehicle has not"),
+    accept(
+        "SIMULATOR_PUT_RIGHT",
+        "put right, its error on the vehicle's own motion falls from {before:.1f} to {after:.1f} mm/s, held out",
+    ),
+    accept(
+        "SIMULATOR_ROUNDS",
+        "after round {round} the simulator's error on the vehicle's own motion is {after:.1f} mm/s instead of "
+        "{before:.1f}, held out; noise alone makes {floor:.1f}",
+    ),
+    marginal(
+        "SIMULATOR_ROUNDS_IN_VAIN",
+        "put right, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
+        "held out; noise alone makes {floor:.1f}",
+        means="No round is better than the simulator as recorded.",
+    ),
+    accept(
+        "SIMULATOR_NO_ROUNDS",
+        "nothing differs that could be put right, so no round was made",
+        means="The comparison claims no difference.",
+    ),
+    marginal(
+        "SIMULATOR_NOT_SHOWN",
+        "these recordings show no difference in effects, and could not have shown some that matter",
+    ),
+    accept("SIMULATOR_ALIKE", "the simulator lacks no effect that these recordings show"),
+    marginal("SIMULATOR_NOISE", "the noise differs in {names}"),
+    marginal(
+        "SIMULATOR_UNKNOWN_REST",
+        "something in the log of the {sides} follows no effect of the library",
+        means="The diagnosis of that side says `unknown`.",
+    ),
+    marginal(
+        "SIMULATOR_NOTHING_COMPARED",
+        "nothing can be compared: of the {side}, {why}",
+        means="That side's recordings cannot be diagnosed.",
     ),
 )

@@ -34,23 +34,21 @@ from dvl_calib_ros.bags.salvage.damage import DamagedError
 from dvl_calib_ros.bags.salvage.mcap_file import salvage_mcap_stream
 from dvl_calib_ros.bags.salvage.sqlite_file import salvage_sqlite_stream
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
-from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import ParameterError, Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import Stream
 from dvl_calib_ros.calibration.streams.stream_order import SEGMENT_GAP_NS
-from dvl_calib_ros.disk.yaml_files import parse_scalar
+from dvl_calib_ros.disk.text_files import parse_scalar
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration
 from dvl_calib_ros.files.urdf import read_urdf
-from dvl_calib_ros.fleet_catalogue.parquet_parts import ASIDE, Catalogue, CataloguePart
 from dvl_calib_ros.fleet_catalogue.recording_entry import Entry
-from dvl_calib_ros.logs.column_map import read_table
+from dvl_calib_ros.fleet_catalogue.update import ASIDE, Catalogue, CataloguePart
 from dvl_calib_ros.logs.dvl_log import DvlLog
 from dvl_calib_ros.logs.dvl_logs import read_dvl_log
-from dvl_calib_ros.logs.nmea import read_rmc
-from dvl_calib_ros.logs.trajectories import read_attitude, read_columns
+from dvl_calib_ros.logs.pd0_nmea import read_rmc
+from dvl_calib_ros.logs.trajectories import read_attitude, read_columns, read_table
 from dvl_calib_ros.messages.decode import MessageDecoder, Refusal
 from dvl_calib_ros.messages.drivers import IMU_TYPE, TWIST_TYPE
 from dvl_calib_ros.messages.live_feed import MessageFeed

@@ -18,8 +18,7 @@ from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import MODELS
-from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
-from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import ParameterError, Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from dvl_calib_ros.diagnosis.diagnose import diagnose
 from dvl_calib_ros.disk.atomic import backup_of, check_writable, save_bytes

@@ -32,7 +32,7 @@ from dvl_calib_ros.examination.examine import Examination, _units, examine
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
-from dvl_calib_ros.verdict.doctor import DOCTOR
+from dvl_calib_ros.verdict.findings import DOCTOR
 from dvl_calib_ros.verdict.kinds import Severity
 
 SECOND = 1_000_000_000

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from io_fixtures import JAZZY
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
-from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
+from dvl_calib_ros.calibration.models.parameters import SCHEMA, ParameterError, Parameters
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.files.parameter_files import load_parameters

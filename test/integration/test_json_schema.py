@@ -13,7 +13,7 @@ from conftest import ROOT
 from report_fixtures import comparison, cross_checked, diagnosis, evaluation
 
 import dvl_calib_ros as dc
-from dvl_calib_ros.calibration.comparison.mounting_change_reasons import comparison_document
+from dvl_calib_ros.calibration.comparison.mounting_change import comparison_document
 from dvl_calib_ros.diagnosis.answer.results import diagnosis_document
 from dvl_calib_ros.disk.text_files import write_json
 from dvl_calib_ros.evaluation.cross_check import cross_check_document

@@ -19,12 +19,12 @@ from report_fixtures import drawn
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.errors import as_cell
 from dvl_calib_ros.evaluation import documents
 from dvl_calib_ros.files.result_file import result_text
-from dvl_calib_ros.fleet_catalogue.parquet_parts import Catalogue, CataloguePart
 from dvl_calib_ros.fleet_catalogue.recording_entry import Entry
+from dvl_calib_ros.fleet_catalogue.update import Catalogue, CataloguePart
 
 # Clears the screen, sets the title, turns what follows around, begins a line that looks like one of ours, ends a style
 EVIL = "x\x1b[2J\x1b]0;y\x07\u202ey\x9b2J\r\nnote: forged[/red][bold]<b>"

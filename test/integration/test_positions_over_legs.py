@@ -18,8 +18,7 @@ import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import WITH_POSITIONS
-from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
-from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.models.parameters import ParameterError, Parameters
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.examination.examine import examine
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording

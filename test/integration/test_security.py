@@ -25,7 +25,7 @@ from dvl_calib_ros.bags.channels import Definition, DefinitionError, typestore
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.disk.atomic import check_writable, save_text
-from dvl_calib_ros.disk.yaml_files import _Loader, load_yaml
+from dvl_calib_ros.disk.text_files import _Loader, load_yaml
 from dvl_calib_ros.errors import InputError, printable
 from dvl_calib_ros.files.result_file import check_in_folder
 from dvl_calib_ros.messages.drivers import TWIST_TYPE

@@ -16,7 +16,7 @@ from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.demo.player import BagPlayer
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors

@@ -21,7 +21,7 @@ from ros import PATIENCE_S, until
 from stress_ending import stress
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.node.main import parameter_files
 from dvl_calib_ros.node.shutdown import ENDING, Ending
 from dvl_calib_ros.simulation.scenario import Scenario, simulate

@@ -21,7 +21,7 @@ from test_node import Publisher, node_here, received, twist
 
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.demo.player import BagPlayer
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.node.transforms import Transforms
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag

@@ -35,7 +35,7 @@ from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.demo.player import BagPlayer
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.files.result_file import result_document, save_result
 from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag

@@ -26,7 +26,7 @@ from dvl_calib_ros.calibration.estimators.estimator import AtOnce
 from dvl_calib_ros.calibration.models import WITH_POSITIONS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.drivers import POSE_TYPES, VELOCITY_TYPES
 from dvl_calib_ros.messages.live_feed import MessageFeed

@@ -16,7 +16,7 @@ from water_fixtures import with_water
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.demo.player import BagPlayer
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 
 TOPICS = ("dvl/twist", "gnss/twist", "imu/data", "dvl/temperature", "dvl/salinity", "dvl/sound_speed")
 

@@ -11,9 +11,8 @@ from benchmarks import DifferentWorkError, Measurement, batch, check_same, evalu
 from benchmarks.__main__ import PARTS, main
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.evaluation import protocol
-from dvl_calib_ros.evaluation.procedure import Procedure, run_seed
 from dvl_calib_ros.evaluation.protocol import own_trajectories
-from dvl_calib_ros.evaluation.validation_study import DEFAULTS
+from dvl_calib_ros.evaluation.validation_study import DEFAULTS, Procedure, run_seed
 
 
 def measured(ratio: float, what: str = "speed", higher_is_better: bool = False):

@@ -21,7 +21,7 @@ from typing import Any, Protocol
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.disk.atomic import save_text
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.parallel import outcomes_on_cores
+from dvl_calib_ros.parallel import Lost, Workers, outcomes_as_done
 
 from .cases import NotDrawnError
 from .generator import record
@@ -133,7 +133,10 @@ class Trial:
     def _answered(self, cases: Sequence[Identified], until: float) -> Iterator[Document]:
         work = partial(_answer, trial=self)
         begun = itertools.takewhile(lambda _: time.monotonic() < until, cases)
-        return map(work, begun) if self.jobs == 1 else outcomes_on_cores(work, begun, self.jobs)
+        for _, answer in outcomes_as_done(work, begun, Workers(self.jobs)):
+            if isinstance(answer, Lost):
+                raise InputError("a worker process was killed, perhaps for want of memory; use fewer --jobs")
+            yield answer
 
     def prepare(self) -> None:
         """Make the folder, or check that what is in it is of this trial. Raises InputError."""

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from ..batches import Batch, one_batch, times
 from ..channels import Channel
-from ..raw_file import holes_in, open_raw
+from ..files import holes_in, open_raw
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 from .mcap_records import (
     CHANNEL,

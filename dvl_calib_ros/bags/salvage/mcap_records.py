@@ -22,7 +22,7 @@ from mcap.records import Channel, ChunkIndex, Schema
 from mcap.summary import Summary
 from numpy.typing import NDArray
 
-from ..raw_file import Hole, holes_in
+from ..files import Hole, holes_in
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
 
 # plain integers, because they are compared for every message

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from ..raw_file import holes_in, open_raw
+from ..files import holes_in, open_raw
 from .damage import LARGEST_RECORD, DamagedError, Salvaged
 
 SQLITE_MAGIC = b"SQLite format 3\x00"

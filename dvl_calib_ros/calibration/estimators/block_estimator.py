@@ -11,8 +11,8 @@ import copy
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
-from typing import ClassVar
 
 import numpy as np
 
@@ -27,16 +27,15 @@ from ..models.own import BIAS, DELAY, LEVER_ARM, N_STATE, PHI, REFERENCE_ERROR
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, SampleUse, Stamps
-from ..numerics.tables import RowTable
+from ..numerics.tables import RowTable, column
 from ..registration.registration import Registration
-from ..results.bias_covariance import BiasCovariance
-from ..results.results import Day
+from ..results.results import BiasCovariance, Day
 from ..results.thinned_recording import NO_TERMS, Terms, ThinnedBlock, ThinnedRecording
 from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
 from .block_preprocessing import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .block_solver import BlockSolver, Outcome
-from .estimator import AtOnce, Estimator, EstimatorSetup, Rest, Solved
+from .estimator import AtOnce, Estimator, EstimatorSetup, Rest
 from .full_forward_model import deviation_of
 
 BLOCK_NS = 10_000_000_000  # length of a block
@@ -60,14 +59,9 @@ class _PendingDvl(RowTable):
     """Usable DVL samples that later blocks need."""
 
     IS_REUSED = True  # blocks have copies
-    LAYOUT: ClassVar = {
-        "stamps_ns": (np.int64, ()),
-        "velocity": (np.float64, (3,)),
-        "covariance": (np.float64, (3, 3)),
-    }
-    stamps_ns: Stamps
-    velocity: Array
-    covariance: Array
+    stamps_ns: Stamps = column(np.int64)
+    velocity: Array = column(np.float64, 3)
+    covariance: Array = column(np.float64, 3, 3)
 
 
 class FullEstimator(Estimator):
@@ -98,7 +92,7 @@ class FullEstimator(Estimator):
         self._together = given.together
         self._gathered: list[Block] = []
         # blocks being solved: stamp of effect, result, index in the result
-        self._coming: deque[tuple[int, Solved[list[Outcome]], int]] = deque()
+        self._coming: deque[tuple[int, Future[list[Outcome]], int]] = deque()
         self._gathered_ns: list[int] = []  # stamps of effect of the gathered blocks
         self._is_telling = self._is_settled = False
         self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # cached for each model's verification

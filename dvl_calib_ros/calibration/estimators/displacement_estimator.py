@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -36,7 +37,7 @@ from .displacement_least_squares import (
     solve,
     white_noise,
 )
-from .estimator import NEVER, AtOnce, Estimator, EstimatorSetup, Solved
+from .estimator import NEVER, AtOnce, Estimator, EstimatorSetup
 
 # Time of the first solution, s, and growth of the run between solutions.
 FIRST_LOOK_S, GROWN = 60.0, 1.2
@@ -71,7 +72,7 @@ class Displacements(Estimator):
         self._n_taken = 0
         self._first_ns: int | None = None
         self._next_ns = self._oriented_ns = 0
-        self._coming: deque[tuple[int, Solved[_Look]]] = deque()
+        self._coming: deque[tuple[int, Future[_Look]]] = deque()
         self._told = NO_LOOK
         self._n_told = 0
         self._newest: tuple[int, DisplacementFit | None] = (0, None)  # of all legs, with their number

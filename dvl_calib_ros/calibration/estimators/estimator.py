@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,15 +22,13 @@ from ..filters.cross_validation import HeldOutError, Moments, held_out_error
 from ..filters.filter_bank import Group, ModelCounts
 from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models import Model
-from ..models.parameter_spec import ParameterError
-from ..models.parameters import Parameters
+from ..models.parameters import ParameterError, Parameters
 from ..models.plugins import load
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, Stamps
 from ..registration.registration import Registration
-from ..results.bias_covariance import BiasCovariance
-from ..results.results import Day
+from ..results.results import BiasCovariance, Day
 from ..results.thinned_recording import Terms, ThinnedRecording
 from ..streams.aligner import Aligner
 
@@ -41,9 +40,9 @@ class EstimatorSetup:
     """Arguments for making an estimator.
 
     initial: initial state of the model. on_evidence: called when a result takes effect, with the stamp of the first DVL
-    sample that it may affect. verified: keep what hold-out verification needs. worker: runs slow work in a thread so
-    that live messages do not wait; None runs it immediately. together: number of blocks gathered before they are
-    solved, unless a result is requested. registration: registration of clocks and frames, if already computed.
+    sample that it may affect. verified: keep what hold-out verification needs. worker: runs slow work in order, in
+    one thread, so that live messages do not wait; None runs it immediately. together: number of blocks gathered before
+    they are solved, unless a result is requested. registration: of clocks and frames, if already computed.
     """
 
     model: Model
@@ -52,7 +51,7 @@ class EstimatorSetup:
     initial: GaussianState | None
     on_evidence: Callable[[int], None]
     verified: bool
-    worker: Worker | None
+    worker: Executor | None
     together: int
     registration: Registration | None = None
 
@@ -291,41 +290,14 @@ def kind_of(model: Model) -> Callable[[EstimatorSetup], Estimator]:
     return make
 
 
-Found = TypeVar("Found")
-Given = TypeVar("Given", covariant=True)
-
-
-class Solved(Protocol[Given]):
-    """Result of work given to a worker, with the interface of `concurrent.futures.Future`."""
-
-    def result(self) -> Given:
-        """Wait for the result and return it; raise what the work raised."""
-
-
-class Worker(Protocol):
-    """Executor of work in order, like a `concurrent.futures.ThreadPoolExecutor` with one thread."""
-
-    def submit(self, work: Callable[[], Found], /) -> Solved[Found]:
-        """Run this after all work submitted before."""
-
-
-class _Now(Generic[Found]):
-    """Result of work that is done."""
-
-    def __init__(self, found: Found) -> None:
-        self._found = found
-
-    def result(self) -> Found:
-        """Return the result."""
-        return self._found
-
-
-class AtOnce:
+class AtOnce(Executor):
     """Worker that runs work immediately in the calling thread."""
 
-    def submit(self, work: Callable[[], Found], /) -> Solved[Found]:
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Run the work now."""
-        return _Now(work())
+        done: Future[Any] = Future()
+        done.set_result(fn(*args, **kwargs))
+        return done
 
 
 class Rest(NamedTuple):

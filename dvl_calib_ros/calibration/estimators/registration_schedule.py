@@ -7,7 +7,7 @@ A reference delay pairs velocities with attitudes of another time, which looks a
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ..filters.cross_validation import folds_of
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.samples import FRAMES, Codes, Mask
-from ..numerics.tables import RowTable
+from ..numerics.tables import RowTable, column
 from ..registration.configuration_check import fitting_configuration
 from ..registration.motion_streams import MotionStreams, make_motion
 from ..registration.registration import Registration, register
@@ -47,42 +47,29 @@ class _DvlVelocities(RowTable):
     """DVL times s, velocities m/s, and trace of the noise covariance, (m/s)²."""
 
     IS_REUSED = True  # a motion has copies
-    LAYOUT: ClassVar = {"times": (np.float64, ()), "velocity": (np.float64, (3,)), "noise": (np.float64, ())}
-    times: Array
-    velocity: Array
-    noise: Array
+    times: Array = column(np.float64)
+    velocity: Array = column(np.float64, 3)
+    noise: Array = column(np.float64)
 
 
 class _Reference(RowTable):
     """Reference times s, velocities m/s, variances (m/s)² of each axis, see `ReferenceColumns`."""
 
     IS_REUSED = True  # a motion has copies
-    LAYOUT: ClassVar = {
-        "times": (np.float64, ()),
-        "velocity": (np.float64, (3,)),
-        "variance": (np.float64, (3,)),
-        "in_body": (np.bool_, ()),
-        "claimed": (np.bool_, ()),
-    }
-    times: Array
-    velocity: Array
-    variance: Array
-    in_body: Mask
-    claimed: Mask
+    times: Array = column(np.float64)
+    velocity: Array = column(np.float64, 3)
+    variance: Array = column(np.float64, 3)
+    in_body: Mask = column(np.bool_)
+    claimed: Mask = column(np.bool_)
 
 
 class _Imu(RowTable):
     """IMU times s, attitudes and rates, see `ImuColumns`."""
 
     IS_REUSED = True  # a motion has copies
-    LAYOUT: ClassVar = {
-        "times": (np.float64, ()),
-        "orientation": (np.float64, (4,)),
-        "angular_velocity": (np.float64, (3,)),
-    }
-    times: Array
-    orientation: Array
-    angular_velocity: Array
+    times: Array = column(np.float64)
+    orientation: Array = column(np.float64, 4)
+    angular_velocity: Array = column(np.float64, 3)
 
 
 class _Registered:
@@ -108,8 +95,8 @@ class _Registered:
         columns = (*kept.dvl, own_noise), (r.times, r.velocity, variance, r.in_body, r.claimed), kept.imu
         for stream, own in zip(self._streams, columns, strict=True):
             at = stream.extend(len(own[0]))
-            for name, column in zip(stream.LAYOUT, own, strict=True):
-                getattr(stream, name)[at] = column
+            for name, values in zip(stream.LAYOUT, own, strict=True):
+                getattr(stream, name)[at] = values
         self._blocks.append(tuple(len(own[0]) for own in columns))
         if len(self._blocks) > MOST:
             for stream, n in zip(self._streams, self._blocks.popleft(), strict=True):

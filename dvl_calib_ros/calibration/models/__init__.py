@@ -14,7 +14,7 @@ from .plugins import plugged_models
 from .published import PUBLISHED
 
 __all__ = [
-    "BROKEN", "BY_VELOCITY", "LINEAR_MODELS", "MODELS", "N_MEASUREMENT", "REPLACED", "WITH_HEADINGS",
+    "BROKEN", "BY_VELOCITY", "LINEAR_MODELS", "MODELS", "N_MEASUREMENT", "WITH_HEADINGS",
     "WITH_POSITIONS", "Linearised", "Model", "Needs", "Nuisance",
 ]  # fmt: skip
 
@@ -23,8 +23,6 @@ _PLUGGED, _PROBLEMS = plugged_models(_OWN)
 MODELS: Mapping[str, Model] = _OWN | _PLUGGED
 # Why models of other packages cannot be used.
 BROKEN: tuple[str, ...] = tuple(_PROBLEMS)
-# Successors of models of earlier versions, which parameter and result files still name.
-REPLACED: Mapping[str, str] = {"G1": FULL.name, "G2": FULL.name}
 # Models of the linear filter, updated per sample.
 LINEAR_MODELS: tuple[Model, ...] = tuple(model for model in MODELS.values() if not model.estimator)
 # Replacement of a model once the headings make the current observable, by the name of the replaced model.

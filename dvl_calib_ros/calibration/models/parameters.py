@@ -14,11 +14,79 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import numpy as np
+
 from ..numerics.frames import Array, rotation_from_rpy
 from ..numerics.samples import VelocityFrame
-from . import MODELS, REPLACED
+from . import MODELS
 from .base import ASSUMPTIONS
-from .parameter_spec import ParameterError, ParameterSpec, _parameter
+
+
+class ParameterError(ValueError):
+    """Unknown parameter or unusable value; the message names it and the accepted values."""
+
+
+@dataclass(frozen=True)
+class ParameterSpec:
+    """Specification of a parameter apart from its name."""
+
+    default: Any
+    description: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+    read_only: bool = True
+
+    @property
+    def kind(self) -> str:
+        """ROS 2 type: string, bool, double or double_array."""
+        names = {str: "string", bool: "bool", float: "double", tuple: "double_array"}
+        return names[type(self.default)]
+
+    @property
+    def length(self) -> int:
+        """Number of elements of an array."""
+        return len(self.default)
+
+    def check(self, name: str, value: Any) -> Any:
+        """Return the value in its own type (integers as doubles, arrays as tuples), or raise ParameterError."""
+        if self.kind == "double_array":
+            if isinstance(value, str | bytes) or not hasattr(value, "__len__") or len(value) != self.length:
+                raise ParameterError(f"{name}: expected an array of {self.length} numbers, got {value!r}")
+            return tuple(self._number(f"{name}[{i}]", element) for i, element in enumerate(value))
+        if self.kind == "double":
+            return self._number(name, value)
+        if self.kind == "bool":
+            if not isinstance(value, bool):
+                raise ParameterError(f"{name}: expected true or false, got {value!r}")
+            return value
+        if not isinstance(value, str):
+            raise ParameterError(f"{name}: expected text, got {value!r}")
+        if self.choices and value not in self.choices:
+            raise ParameterError(f"{name}: {value!r} is not one of {', '.join(self.choices)}")
+        return value
+
+    def _number(self, name: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+            raise ParameterError(f"{name}: expected a number, got {value!r}")
+        try:
+            number = float(value)
+        except OverflowError:
+            raise ParameterError(f"{name}: the whole number is too large") from None
+        if not math.isfinite(number):
+            raise ParameterError(f"{name}: {number} is not finite")
+        if (self.low is not None and number < self.low) or (self.high is not None and number > self.high):
+            raise ParameterError(f"{name}: {number:g} is outside {self.low:g} .. {self.high:g} {self.unit}".rstrip())
+        return number
+
+
+def _parameter(default: Any, description: str, within: tuple[float, float] | None = None, **known: Any) -> Any:
+    """Return the field of a parameter. within: its smallest and largest value."""
+    low, high = within or (None, None)
+    spec = ParameterSpec(default, description, low=low, high=high, **known)
+    return dataclasses.field(default=default, metadata={"spec": spec})
+
 
 AUTO = "auto"
 IAC = "iac"
@@ -43,14 +111,12 @@ class Parameters:
         AUTO,
         "Published model: auto (recommended), iac (the paper's selection), or a name.",
         choices=(AUTO, IAC, *MODELS),
-        replaced=REPLACED,
         read_only=False,
     )
     gnss_model: str = _parameter(
         "full",
         "Model of auto with GNSS. iac: M3, or M4 if set here.",
         choices=_AIDED,
-        replaced=REPLACED,
         read_only=False,
     )
     gnss_free_model: str = _parameter(
@@ -64,15 +130,13 @@ class Parameters:
         2.0,
         "Age of the last paired reference sample from which GNSS counts as lost; longest interpolated gap.",
         unit="s",
-        low=0.05,
-        high=60.0,
+        within=(0.05, 60.0),
     )
     gnss_hysteresis: float = _parameter(
         3.0,
         "How long GNSS must be present (or absent) before auto changes the model.",
         unit="s",
-        low=0.0,
-        high=600.0,
+        within=(0.0, 600.0),
         read_only=False,
     )
     gnss_frame: str = _parameter(
@@ -88,10 +152,7 @@ class Parameters:
         "1000 (m/s)² and more, marks an axis as not measured.",
         choices=(AUTO, XYZ, XY),
     )
-    base_frame: str = _parameter(
-        "base_link",
-        "Name of the body frame.",
-    )
+    base_frame: str = _parameter("base_link", "Name of the body frame.")
     base_axes: str = _parameter(
         FLU,
         "Axes of base_frame and all results: forward-left-up (REP-103) or forward-right-down.",
@@ -114,10 +175,7 @@ class Parameters:
         "Axes of the DVL's data. from_message: by a frame_id ending in _frd or _flu, else by message type.",
         choices=(FROM_MESSAGE, FLU, FRD),
     )
-    dvl_type: str = _parameter(
-        "geometry_msgs/msg/TwistWithCovarianceStamped",
-        "Message type of the DVL's topic, live.",
-    )
+    dvl_type: str = _parameter("geometry_msgs/msg/TwistWithCovarianceStamped", "Message type of the DVL's topic, live.")
     dvl_fields: str = _parameter(
         "",
         "Fields of an unlisted message type: velocity=vel.x,vel.y,vel.z,valid=lock; or beams=list,direction,velocity; "
@@ -131,29 +189,25 @@ class Parameters:
         1.0,
         "Time between two positions that are differenced to a velocity. Longer: less noise, wrong in turns.",
         unit="s",
-        low=0.1,
-        high=30.0,
+        within=(0.1, 30.0),
     )
     mounting_rpy: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
         "Nominal orientation of the DVL in the body, as in a URDF origin.",
         unit="rad",
-        low=-2 * math.pi,
-        high=2 * math.pi,
+        within=(-2 * math.pi, 2 * math.pi),
     )
     lever_arm: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
         "Position of the DVL from the reference point, body frame; compensated with the angular velocity.",
         unit="m",
-        low=-100.0,
-        high=100.0,
+        within=(-100.0, 100.0),
     )
     reference_position: tuple[float, ...] = _parameter(
         (0.0, 0.0, 0.0),
         "Position of the reference point (antenna, INS) in base_frame; plus the lever arm it is the DVL's.",
         unit="m",
-        low=-100.0,
-        high=100.0,
+        within=(-100.0, 100.0),
     )
     dvl_position: str = _parameter(
         UNKNOWN,
@@ -165,8 +219,7 @@ class Parameters:
         (0.0, 0.0, 0.0),
         "Orientation of the IMU's axes in the body, as in a URDF origin. Forward-right-down: pi 0 0.",
         unit="rad",
-        low=-2 * math.pi,
-        high=2 * math.pi,
+        within=(-2 * math.pi, 2 * math.pi),
     )
     imu_frame: str = _parameter(
         IMU_ENU,
@@ -174,180 +227,124 @@ class Parameters:
         "(nwu).",
         choices=(IMU_ENU, IMU_NED, NWU),
     )
-    restamp: str = _parameter(
-        "",
-        "Topics whose stamps are replaced by recording times, with commas between; log: all.",
-    )
+    restamp: str = _parameter("", "Topics whose stamps are replaced by recording times, with commas between; log: all.")
     dvl_time_offset: float = _parameter(
         0.0,
         "Delay of DVL stamps (positive: late), corrected before pairing.",
         unit="s",
-        low=-60.0,
-        high=60.0,
+        within=(-60.0, 60.0),
     )
     reference_time_offset: float = _parameter(
-        0.0,
-        "As dvl_time_offset, for the reference.",
-        unit="s",
-        low=-60.0,
-        high=60.0,
+        0.0, "As dvl_time_offset, for the reference.", unit="s", within=(-60.0, 60.0)
     )
     reference_velocity_offset: tuple[float, ...] = _parameter(
         (0.0, 0.0),
         "Constant error (east, north) of a reference in ENU or NED, or a current in water track. Corrected.",
         unit="m/s",
-        low=-5.0,
-        high=5.0,
+        within=(-5.0, 5.0),
     )
-    imu_time_offset: float = _parameter(
-        0.0,
-        "As dvl_time_offset, for the IMU.",
-        unit="s",
-        low=-60.0,
-        high=60.0,
-    )
+    imu_time_offset: float = _parameter(0.0, "As dvl_time_offset, for the IMU.", unit="s", within=(-60.0, 60.0))
     dvl_clock_drift: float = _parameter(
         0.0,
         "Growth of the delay of DVL stamps per second since the first. Corrected.",
         unit="s/s",
-        low=-0.01,
-        high=0.01,
+        within=(-0.01, 0.01),
     )
     dvl_time_jump: float = _parameter(
         0.0,
         "Additional delay of DVL stamps from dvl_time_jump_at on. Corrected.",
         unit="s",
-        low=-10.0,
-        high=10.0,
+        within=(-10.0, 10.0),
     )
     dvl_time_jump_at: float = _parameter(
         0.0,
         "DVL stamp (s since 1970) at which dvl_time_jump begins.",
         unit="s",
-        low=0.0,
-        high=2.0**31,
+        within=(0.0, 2.0**31),
     )
     initial_std_misalignment: float = _parameter(
-        0.05,
-        "Prior σ of each misalignment angle.",
-        unit="rad",
-        low=1e-6,
-        high=1.0,
+        0.05, "Prior σ of each misalignment angle.", unit="rad", within=(1e-6, 1.0)
     )
-    initial_std_scale: float = _parameter(
-        0.006,
-        "Prior σ of the scale error.",
-        low=1e-7,
-        high=0.5,
-    )
+    initial_std_scale: float = _parameter(0.006, "Prior σ of the scale error.", within=(1e-7, 0.5))
     initial_std_lever_arm: float = _parameter(
         2.0,
         "Prior σ of the lever arm (full). A configured arm has 0.05 m, or with probability 0.1 this.",
         unit="m",
-        low=1e-4,
-        high=100.0,
+        within=(1e-4, 100.0),
     )
     initial_std_time_offset: float = _parameter(
-        1.0,
-        "Prior σ of the DVL's delay (full, within 3.2 s).",
-        unit="s",
-        low=1e-4,
-        high=10.0,
+        1.0, "Prior σ of the DVL's delay (full, within 3.2 s).", unit="s", within=(1e-4, 10.0)
     )
     process_std_misalignment: float = _parameter(
-        0.0,
-        "Random walk of each misalignment angle.",
-        unit="rad/√s",
-        low=0.0,
-        high=0.1,
+        0.0, "Random walk of each misalignment angle.", unit="rad/√s", within=(0.0, 0.1)
     )
-    process_std_scale: float = _parameter(
-        0.0,
-        "Random walk of the scale error.",
-        unit="1/√s",
-        low=0.0,
-        high=0.1,
-    )
-    use_message_covariance: bool = _parameter(
-        True,
-        "R of the GNSS models from message covariances.",
-    )
+    process_std_scale: float = _parameter(0.0, "Random walk of the scale error.", unit="1/√s", within=(0.0, 0.1))
+    use_message_covariance: bool = _parameter(True, "R of the GNSS models from message covariances.")
     gnss_aided_std: float = _parameter(
         0.2,
         "σ per axis of R of the GNSS models, if the reference has no covariance.",
         unit="m/s",
-        low=1e-4,
-        high=10.0,
+        within=(1e-4, 10.0),
     )
     gnss_free_std: float = _parameter(
         0.025,
         "σ per axis of R of the GNSS-free models, and of a DVL without covariance.",
         unit="m/s",
-        low=1e-4,
-        high=10.0,
+        within=(1e-4, 10.0),
     )
     motion_std: float = _parameter(
         ASSUMPTIONS.motion_std,
         "σ of sway and heave about the model, straight ahead (A1, F1).",
         unit="m/s",
-        low=1e-4,
-        high=10.0,
+        within=(1e-4, 10.0),
     )
     motion_correlation_time: float = _parameter(
         ASSUMPTIONS.motion_correlation_time,
         "Correlation time of sway and heave (A1, F1). 0: none.",
         unit="s",
-        low=0.0,
-        high=600.0,
+        within=(0.0, 600.0),
     )
     heave_offset_std: float = _parameter(
         ASSUMPTIONS.heave_offset_std,
         "Prior σ of a constant heave, such as trim (A1, F1).",
         unit="m/s",
-        low=1e-6,
-        high=10.0,
+        within=(1e-6, 10.0),
     )
     reference_offset_std: float = _parameter(
         0.005,
         "Prior σ per axis of a constant error of an earth-frame reference (full).",
         unit="m/s",
-        low=1e-6,
-        high=10.0,
+        within=(1e-6, 10.0),
     )
     heading_deviation_std: float = _parameter(
         math.radians(0.5),
         "Prior σ of the heading error, one and two cycles (compass). 0: exact.",
         unit="rad",
-        low=0.0,
-        high=0.5,
+        within=(0.0, 0.5),
     )
     dvl_bias_std: float = _parameter(
         0.008,
         "Prior σ of the DVL's velocity bias per axis (full). 0: no bias.",
         unit="m/s",
-        low=0.0,
-        high=1.0,
+        within=(0.0, 1.0),
     )
     day_std_heading: float = _parameter(
         math.radians(0.1),
         "Heading error that differs by day, in σ of yaw (0.1°: gyrocompass; magnetic compass: 1° and more).",
         unit="rad",
-        low=0.0,
-        high=0.5,
+        within=(0.0, 0.5),
     )
     day_std_scale: float = _parameter(
         0.003,
         "Scale difference between days, in σ of scale (0.3 %: 4.5 m/s of the speed of sound, or 1.5 °C).",
-        low=0.0,
-        high=0.5,
+        within=(0.0, 0.5),
     )
     current_std: float = _parameter(
         ASSUMPTIONS.current_std,
         "Prior σ of the current per axis (A1, F1). On one heading it sets the share of sway that counts as "
         "misalignment.",
         unit="m/s",
-        low=1e-6,
-        high=10.0,
+        within=(1e-6, 10.0),
     )
     prior_source: str = _parameter(
         "fixed",
@@ -355,88 +352,63 @@ class Parameters:
         "(gains nothing) or the reference (replay only).",
         choices=("fixed", "initial_window", "reference"),
     )
-    prior_window: float = _parameter(
-        2.0,
-        "Window that prior_source averages.",
-        unit="s",
-        low=0.1,
-        high=600.0,
-    )
+    prior_window: float = _parameter(2.0, "Window that prior_source averages.", unit="s", within=(0.1, 600.0))
     prior_sway_heave: tuple[float, ...] = _parameter(
         (0.0, 0.0),
         "Sway and heave of prior_source fixed, body frame.",
         unit="m/s",
-        low=-10.0,
-        high=10.0,
+        within=(-10.0, 10.0),
     )
     gate_probability: float = _parameter(
         0.999,
         "Share of good samples that pass the gate (chi-square). 0 or 1: off.",
-        low=0.0,
-        high=1.0,
+        within=(0.0, 1.0),
     )
-    min_speed: float = _parameter(
-        0.3,
-        "Slower samples are not used. 0: off.",
-        unit="m/s",
-        low=0.0,
-        high=10.0,
-    )
+    min_speed: float = _parameter(0.3, "Slower samples are not used. 0: off.", unit="m/s", within=(0.0, 10.0))
     max_turn_rate: float = _parameter(
         0.0,
         "Samples above it, or without angular velocity, are not used. 0: off.",
         unit="rad/s",
-        low=0.0,
-        high=10.0,
+        within=(0.0, 10.0),
     )
     max_repeats: float = _parameter(
         0.0,
         "A DVL velocity that repeats exactly more often in a row is not used. 0: off.",
-        low=0.0,
-        high=1e6,
+        within=(0.0, 1e6),
         read_only=False,
     )
     max_speed: float = _parameter(
-        10.0,
-        "A DVL or reference velocity above this is invalid.",
-        unit="m/s",
-        low=0.1,
-        high=100.0,
+        10.0, "A DVL or reference velocity above this is invalid.", unit="m/s", within=(0.1, 100.0)
     )
     max_fom: float = _parameter(
         0.4,
         "A figure of merit above this is invalid (dvl_msgs/DVL).",
         unit="m/s",
-        low=0.0,
-        high=100.0,
+        within=(0.0, 100.0),
     )
     imu_timeout: float = _parameter(
         1.5,
         "Longest gap between two IMU samples that is interpolated.",
         unit="s",
-        low=0.01,
-        high=60.0,
+        within=(0.01, 60.0),
     )
     max_latency: float = _parameter(
         1.0,
         "Stamp difference by which a topic may lag before a DVL sample continues without it.",
         unit="s",
-        low=0.0,
-        high=600.0,
+        within=(0.0, 600.0),
     )
     max_time_jump: float = _parameter(
         10.0,
         "A larger step between stamps needs a second sample; backward it restarts the calibration.",
         unit="s",
-        low=0.1,
-        high=86400.0,
+        within=(0.1, 86400.0),
     )
     new_day_after: float = _parameter(
         3600.0,
         "DVL pause that starts a new recording, with its own delay, reference offset and current.",
         unit="s",
-        low=15.0,
-        high=1e9,
+        within=(15.0, 1e9),
     )
     discover: bool = _parameter(
         True,
@@ -446,42 +418,26 @@ class Parameters:
         2.0,
         "Predicted drift of a fine calibration: good enough. Up to five times it is accepted.",
         unit="m/km",
-        low=0.01,
-        high=1000.0,
+        within=(0.01, 1000.0),
         read_only=False,
     )
     verification_block: float = _parameter(
-        10.0,
-        "Length of the blocks of hold-out verification.",
-        unit="s",
-        low=0.1,
-        high=3600.0,
+        10.0, "Length of the blocks of hold-out verification.", unit="s", within=(0.1, 3600.0)
     )
     accept_misalignment: float = _parameter(
         math.radians(2.0),
         "A misalignment above this (2°) is marginal ...",
         unit="rad",
-        low=0.0,
-        high=math.pi,
+        within=(0.0, math.pi),
     )
     reject_misalignment: float = _parameter(
-        math.radians(5.0),
-        "... and from this (5°) on rejected.",
-        unit="rad",
-        low=0.0,
-        high=math.pi,
+        math.radians(5.0), "... and from this (5°) on rejected.", unit="rad", within=(0.0, math.pi)
     )
-    max_scale_error: float = _parameter(
-        0.05,
-        "A larger scale error is rejected.",
-        low=0.0,
-        high=1.0,
-    )
+    max_scale_error: float = _parameter(0.05, "A larger scale error is rejected.", within=(0.0, 1.0))
     max_error_ratio: float = _parameter(
         1.0,
         "Significantly above this ratio of held-out to predicted error a calibration is marginal.",
-        low=0.1,
-        high=100.0,
+        within=(0.1, 100.0),
     )
     result_file: str = _parameter(
         "",
@@ -491,13 +447,10 @@ class Parameters:
     result_backups: float = _parameter(
         3.0,
         "Earlier results kept: .bak is the last, .bak.2 and on the best converged.",
-        low=1.0,
-        high=100.0,
+        within=(1.0, 100.0),
         read_only=False,
     )
-    initial_calibration: str = _parameter(
-        "", "Result file whose states and covariances are the prior.",
-    )  # fmt: skip
+    initial_calibration: str = _parameter("", "Result file whose states and covariances are the prior.")
 
     def __post_init__(self) -> None:
         for name, spec in SCHEMA.items():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +14,31 @@ SMALLEST = 128
 FULL = 0.75
 
 
+class _Column(NamedTuple):
+    """A column of a table: its dtype, and the shape of one element."""
+
+    dtype: Any
+    shape: tuple[int, ...]
+
+
+def column(dtype: Any, *shape: int) -> Any:
+    """Declare an attribute of a `RowTable` as one of its columns. shape: of one element."""
+    return _Column(dtype, shape)
+
+
 class RowTable:
-    """Rows with a column per entry of `LAYOUT` (dtype, shape of one element), an attribute of that name.
+    """Rows with an array per attribute that is declared as a `column`.
 
     Rows are in the slots begin .. size - 1 of longer arrays. The number of a row since the start is slot + base, and
     constant. If memory `IS_REUSED`, discarded rows may be overwritten, so no views of them may be kept.
     """
 
-    LAYOUT: ClassVar[Mapping[str, tuple[Any, tuple[int, ...]]]]
+    LAYOUT: ClassVar[Mapping[str, _Column]]
     IS_REUSED: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        own = {name: each for name, each in vars(cls).items() if isinstance(each, _Column)}
+        cls.LAYOUT = {**getattr(cls, "LAYOUT", {}), **own}
 
     def __init__(self) -> None:
         self.begin = self.size = self.base = 0

@@ -31,8 +31,7 @@ from ..numerics.frames import (
 from ..numerics.samples import VelocityFrame
 from ..streams.imu_frame import ENU_FROM, quaternion_product
 from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
-from .configuration_check import DRAWN, angle_between, misfit, nearest
-from .earth_frame_velocity import Directions
+from .configuration_check import DRAWN, Directions, angle_between, misfit, nearest
 from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
 from .motion_streams import GAP_S, Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at

@@ -14,14 +14,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..filters.day_to_day_covariance import day_covariance
 from ..filters.observability import OBSERVED_SHARE
 from ..models import Model
 from ..models.parameters import FLU, FRD, Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
-from .results import corrected_rpy, rpy_jacobian, scale_and_delay
-from .velocity_correction import lever_arm
+from .results import corrected_rpy, lever_arm, rpy_jacobian, scale_and_delay
+
+
+def day_covariance(model: Model, parameters: Parameters) -> Array:
+    """Return the addition (n, n) to the covariance of a model; zero for models without a reference.
+
+    `day_std_heading` acts about the body's vertical, `day_std_scale` on all scales alike.
+    """
+    found = np.zeros((model.n_state, model.n_state))
+    if model.aided:
+        upwards = parameters.rotation_dvl_from_body[:, 2]
+        found[:3, :3] = parameters.day_std_heading**2 * np.outer(upwards, upwards)
+        found[3 : model.n_errors, 3 : model.n_errors] = parameters.day_std_scale**2
+    return found
+
 
 COMPONENTS = ("roll", "pitch", "yaw", "lever_arm_x", "lever_arm_y", "lever_arm_z", "scale", "time_offset")
 N_COMPONENTS, N_AXES = len(COMPONENTS), 3

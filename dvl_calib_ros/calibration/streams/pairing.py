@@ -10,7 +10,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import ClassVar
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from ..models import Needs
 from ..models.parameters import Parameters
 from ..numerics.frames import Array, Vector, slerps
 from ..numerics.samples import FRAME_CODES, AlignedBlock, Codes, Mask, Pairing, SampleUse, Stamps, VelocityFrame
-from ..numerics.tables import RowTable
+from ..numerics.tables import RowTable, column
 from .stream_order import LONG_AGO_NS, Track
 
 BODY = FRAME_CODES[VelocityFrame.BODY]
@@ -155,36 +154,20 @@ class Pairer:
 class Rows(RowTable):
     """Growing columns of `AlignedBlock`."""
 
-    LAYOUT: ClassVar = {
-        "stamps_ns": (np.int64, ()),
-        "row": (np.int64, ()),
-        "velocity_dvl": (np.float64, (3,)),
-        "covariance": (np.float64, (3, 3)),
-        "interval_ns": (np.int64, ()),
-        "verdict": (np.uint8, ()),
-        "prior_known": (np.bool_, ()),
-        "attitude": (np.float64, (7,)),
-        "pairing": (np.uint8, ()),
-        "reference": (np.float64, (12,)),
-        "frames": (np.uint8, ()),
-        "unmeasured": (np.uint8, ()),
-        "weight": (np.float64, ()),
-        "late": (np.bool_, ()),
-    }
-    stamps_ns: Stamps
-    row: Stamps
-    velocity_dvl: Array
-    covariance: Array
-    interval_ns: Stamps
-    verdict: Codes
-    prior_known: Mask
-    attitude: Array
-    pairing: Codes
-    reference: Array
-    frames: Codes
-    unmeasured: Codes
-    weight: Array
-    late: Mask
+    stamps_ns: Stamps = column(np.int64)
+    row: Stamps = column(np.int64)
+    velocity_dvl: Array = column(np.float64, 3)
+    covariance: Array = column(np.float64, 3, 3)
+    interval_ns: Stamps = column(np.int64)
+    verdict: Codes = column(np.uint8)
+    prior_known: Mask = column(np.bool_)
+    attitude: Array = column(np.float64, 7)
+    pairing: Codes = column(np.uint8)
+    reference: Array = column(np.float64, 12)
+    frames: Codes = column(np.uint8)
+    unmeasured: Codes = column(np.uint8)
+    weight: Array = column(np.float64)
+    late: Mask = column(np.bool_)
 
     def await_partners(self, at: int | slice) -> None:
         """Mark rows as undecided."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..models import WITH_POSITIONS
-from ..models.parameter_spec import ParameterError
-from ..models.parameters import Parameters
+from ..models.parameters import ParameterError, Parameters
 from ..numerics.frames import Array
 
 # Noise from which velocities derived from positions are useless, m/s.

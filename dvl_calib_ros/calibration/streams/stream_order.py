@@ -13,13 +13,13 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from enum import Enum
 from itertools import pairwise
-from typing import ClassVar, Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
 from ..numerics.frames import Array
 from ..numerics.samples import Codes, Index, Mask, Stamps
-from ..numerics.tables import RowTable
+from ..numerics.tables import RowTable, column
 from .clock_correction import SECOND_NS
 
 # Earlier than any stamp; adding a timeout cannot overflow 64 bits.
@@ -187,18 +187,11 @@ class Track(RowTable):
     limit.
     """
 
-    LAYOUT: ClassVar = {
-        "stamps_ns": (np.int64, ()),
-        "values": (np.float64, (12,)),
-        "frames": (np.uint8, ()),
-        "unmeasured": (np.uint8, ()),
-        "late": (np.bool_, ()),
-    }
-    stamps_ns: Stamps
-    values: Array
-    frames: Codes
-    unmeasured: Codes
-    late: Mask
+    stamps_ns: Stamps = column(np.int64)
+    values: Array = column(np.float64, 12)
+    frames: Codes = column(np.uint8)
+    unmeasured: Codes = column(np.uint8)
+    late: Mask = column(np.bool_)
 
     def __init__(self, max_gap_ns: int, max_latency_ns: int, retention_ns: int) -> None:
         """Make an empty track.

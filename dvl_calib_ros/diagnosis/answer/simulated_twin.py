@@ -10,8 +10,7 @@ import numpy as np
 from ...bags.writer import BagWriter, Compression, Storage
 from ...calibration.numerics.frames import Array, cross
 from ...calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from ...effects.base import ActsOn, EffectInput
-from ...effects.composition import at_dvl, late, traces, turns
+from ...effects.base import ActsOn, EffectInput, at_dvl, late, traces, turns
 from ...messages.encode import SampleWriter
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis

@@ -16,8 +16,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.samples import VelocityFrame
-from ...effects.base import ActsOn
-from ...effects.composition import late
+from ...effects.base import ActsOn, late
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.recorded_streams import RecordedStreams

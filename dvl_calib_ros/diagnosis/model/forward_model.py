@@ -1,6 +1,6 @@
 """The composed model: residual of DVL and reference under any effects of any size.
 
-It inverts the physics of `effects.composition`. At a true time s, with the stamp of each clock,
+It inverts the physics of `effects.base`. At a true time s, with the stamp of each clock,
 
     u = D⁻¹ (v_dvl - T traces on DVL(u))        v = u - traces on MOTION(v)        e = v - g - traces on REFERENCE(v)
 
@@ -25,9 +25,18 @@ from numpy.typing import NDArray
 
 from ...calibration.numerics.frames import Array, cross
 from ...calibration.numerics.samples import VelocityFrame
-from ...effects.base import ActsOn, ClockEffect, Effect, EffectInput, EffectNeeds, EffectWithMemory, MountingEffect
-from ...effects.composition import late, turns
-from ...effects.recursion import slopes
+from ...effects.base import (
+    ActsOn,
+    ClockEffect,
+    Effect,
+    EffectInput,
+    EffectNeeds,
+    EffectWithMemory,
+    MountingEffect,
+    late,
+    slopes,
+    turns,
+)
 from .hypothesis import OF_EVERY, Hypothesis, Values, amplitudes, no_effect, whose_parameters
 from .recorded_streams import RecordedStreams
 from .seen import (

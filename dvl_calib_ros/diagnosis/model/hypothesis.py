@@ -9,8 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...calibration.numerics.frames import Array
-from ...effects.base import Effect, EffectParameter, EffectWithMemory
-from ...effects.composition import Injection
+from ...effects.base import Effect, EffectParameter, EffectWithMemory, Injection
 
 Values = Mapping[str, float]
 # Effects that every vehicle has to a small degree: lever arm and velocity bias

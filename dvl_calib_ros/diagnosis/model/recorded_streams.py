@@ -26,8 +26,7 @@ from ...errors import InputError
 from ...messages.decode import MessageDecoder
 from ...messages.drivers import VELOCITY_TYPES
 from ...recordings.recording import Recording as Opened
-from ...recordings.recording import open_recording
-from ...recordings.requirements import check_topics, hold_the_same, missing_imu
+from ...recordings.recording import check_topics, hold_the_same, missing_imu, open_recording
 from ...recordings.topic_messages import Recorded
 from ...recordings.topics import Topics
 from ...verdict.reasons import Reason

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...calibration.numerics.frames import Array
-from ...effects.base import ActsOn
-from ...effects.composition import Injection, late
+from ...effects.base import ActsOn, Injection, late
 from .recorded_streams import RecordedStreams
 from .settings import SETTINGS
 from .stream_curve import FAST_ENOUGH_S

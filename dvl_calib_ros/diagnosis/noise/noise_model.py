@@ -16,7 +16,7 @@ from scipy.fft import fft
 
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
-from ...effects.recursion import recursion
+from ...effects.base import recursion
 from .whitened_least_squares import root_of_inverse
 
 # Standard deviations from which innovations have constant influence (Huber)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ...calibration.numerics.frames import Array
-from ...effects.recursion import recursion
+from ...effects.base import recursion
 from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.time_grid import Grid

@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...calibration.numerics.frames import Array
-from ...effects.base import ActsOn, Effect
-from ...effects.composition import late
+from ...effects.base import ActsOn, Effect, late
 from ..fit.gauss_newton import OF_A_TIME, Fit, Fitter
 from ..fit.selection_criteria import step_of_times
 from ..model.hypothesis import Hypothesis, Values

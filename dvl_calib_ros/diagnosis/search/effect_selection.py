@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.samples import VelocityFrame
-from ...effects.base import ActsOn, Effect
-from ...effects.composition import late
+from ...effects.base import ActsOn, Effect, late
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.selection_criteria import best_of, finer_steps, price_of_a_time
 from ..model.forward_model import Problem, make_problem

@@ -13,8 +13,7 @@ from ...calibration.registration.motion_streams import MotionStreams, make_motio
 from ...calibration.registration.registration import Registration, register
 from ...calibration.registration.unregistrable_clocks import far_clocks
 from ...calibration.streams.interpolation import ImuColumns
-from ...effects.base import ActsOn, EffectNeeds
-from ...effects.composition import Injection, late
+from ...effects.base import ActsOn, EffectNeeds, Injection, late
 from ...errors import InputError
 from ..model.recorded_streams import RecordedStreams
 from ..model.stream_curve import Curve

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from dvl_calib_ros.bags import sources
-from dvl_calib_ros.bags.raw_file import SECTOR, holes_in, open_raw, unreadable
+from dvl_calib_ros.bags.files import SECTOR, holes_in, open_raw, unreadable
 from dvl_calib_ros.bags.sources import Database
 from dvl_calib_ros.cli.main import main
 

@@ -10,12 +10,12 @@ from runs import ONE_HERTZ, START_NS, MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.checks.data_warnings import one_heading_warnings
-from dvl_calib_ros.calibration.filters.day_to_day_covariance import day_covariance
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
+from dvl_calib_ros.calibration.results.extrinsics import day_covariance
 from dvl_calib_ros.files.result_file import result_document
 
 # σ of the recording itself, with an exact heading and DVL: what another day, a compass or a bias makes of it is no

@@ -16,8 +16,7 @@ from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.checks.data_warnings import recording_warnings
 from dvl_calib_ros.calibration.filters import filter_bank
 from dvl_calib_ros.calibration.models import BY_VELOCITY, LINEAR_MODELS, MODELS, Needs
-from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
-from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
+from dvl_calib_ros.calibration.models.parameters import SCHEMA, ParameterError, Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.calibration.streams.aligner import whereabouts
 

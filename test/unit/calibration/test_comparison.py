@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.comparison import mounting_change
-from dvl_calib_ros.calibration.comparison.mounting_change import Difference, compare, fused
-from dvl_calib_ros.calibration.comparison.mounting_change_reasons import (
+from dvl_calib_ros.calibration.comparison.mounting_change import (
+    Difference,
+    compare,
     comparison_document,
+    fused,
     reasons,
     remarks,
 )

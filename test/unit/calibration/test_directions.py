@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, rotation_from_rpy
-from dvl_calib_ros.calibration.registration.earth_frame_velocity import Directions
+from dvl_calib_ros.calibration.registration.configuration_check import Directions
 
 SURVEY = np.repeat(np.radians([20.0, 110.0, 200.0, 110.0]), 100)
 WANDERS = np.radians(20.0) + 0.05 * np.sin(np.arange(400) / 9.0)

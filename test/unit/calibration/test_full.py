@@ -22,7 +22,7 @@ from dvl_calib_ros.calibration.numerics.block_covariance import MOST, TimeBlocks
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from dvl_calib_ros.calibration.results.velocity_correction import lever_arm
+from dvl_calib_ros.calibration.results.results import lever_arm
 from dvl_calib_ros.calibration.streams.interpolation import local_fit, reach_at, spacing_at
 from dvl_calib_ros.simulation.trajectories import body_rates
 from dvl_calib_ros.verdict.kinds import Severity

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.filters.relative_height import LONGEST_STEP_S, MEMORY_S, RelativeHeight
+from dvl_calib_ros.calibration.filters.filter_bank import LONGEST_STEP_S, MEMORY_S, RelativeHeight
 
 SECOND = 1_000_000_000
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from dvl_calib_ros.calibration.filters.filter_bank import groups_of
+from dvl_calib_ros.calibration.filters.filter_bank import RelativeHeight, groups_of
 from dvl_calib_ros.calibration.filters.filter_setup import Assembler
-from dvl_calib_ros.calibration.filters.relative_height import RelativeHeight
 from dvl_calib_ros.calibration.models import LINEAR_MODELS, MODELS
 from dvl_calib_ros.calibration.models.base import Observations
 from dvl_calib_ros.calibration.models.parameters import Parameters

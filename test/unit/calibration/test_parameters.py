@@ -6,8 +6,7 @@ import pytest
 from conftest import ROOT
 from documentation import section
 
-from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
-from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
+from dvl_calib_ros.calibration.models.parameters import SCHEMA, ParameterError, Parameters
 from dvl_calib_ros.files.parameter_files import load_parameters, model_table, parameter_file_text, parameter_table
 
 # interfaces.md, "Parameters that scripts rely on by name"

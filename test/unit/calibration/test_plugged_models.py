@@ -13,7 +13,7 @@ import pytest
 
 from dvl_calib_ros.calibration.estimators.estimator import kind_of
 from dvl_calib_ros.calibration.models import MODELS, plugins
-from dvl_calib_ros.calibration.models.parameter_spec import ParameterError
+from dvl_calib_ros.calibration.models.parameters import ParameterError
 
 ROOT = Path(__file__).parents[3]
 PLUGIN = ROOT / "test" / "model_plugin"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from dvl_calib_ros.calibration.estimators.block_estimator import FullEstimator
 from dvl_calib_ros.calibration.estimators.registration_schedule import MOST, MOST_OF_A_BLOCK, KeptClocks
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample
-from dvl_calib_ros.calibration.numerics.tables import RowTable
+from dvl_calib_ros.calibration.numerics.tables import RowTable, column
 from dvl_calib_ros.calibration.results.thinned_recording import KEPT_EVERY_S, ThinnedBlock
 from dvl_calib_ros.calibration.streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 
@@ -20,9 +18,8 @@ from dvl_calib_ros.calibration.streams.interpolation import DvlColumns, ImuColum
 class Numbers(RowTable):
     """One column."""
 
-    LAYOUT: ClassVar = {"number": (np.int64, ())}
     IS_REUSED = True
-    number: np.ndarray
+    number: np.ndarray = column(np.int64)
 
 
 class KeptNumbers(Numbers):

@@ -8,7 +8,7 @@ from scipy.signal import lfilter, savgol_filter
 
 from dvl_calib_ros.diagnosis.model.stream_curve import SMOOTH_SAMPLES, Curve
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise
-from dvl_calib_ros.effects.recursion import recursion, slopes
+from dvl_calib_ros.effects.base import recursion, slopes
 
 
 def test_a_recursion_of_any_decay_is_that_of_a_loop(rng):

@@ -11,7 +11,7 @@ from dvl_calib_ros.diagnosis.model.forward_model import make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import Hypothesis
 from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
-from dvl_calib_ros.effects.composition import Injection
+from dvl_calib_ros.effects.base import Injection
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.scenario import Run, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors

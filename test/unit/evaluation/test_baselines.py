@@ -10,9 +10,8 @@ from dvl_calib_ros.calibration.numerics.frames import nearest_rotation, rotation
 from dvl_calib_ros.evaluation import protocol
 from dvl_calib_ros.evaluation.convergence import TIMES_S, curve_keys, curves, squared_errors
 from dvl_calib_ros.evaluation.metrics import BASELINES
-from dvl_calib_ros.evaluation.procedure import dvl_velocities, references
 from dvl_calib_ros.evaluation.protocol import own_trajectories
-from dvl_calib_ros.evaluation.validation_study import DEFAULTS
+from dvl_calib_ros.evaluation.validation_study import DEFAULTS, dvl_velocities, references
 
 MODELS = ("M3", "A1")
 

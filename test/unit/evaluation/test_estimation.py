@@ -16,9 +16,8 @@ from dvl_calib_ros.calibration.models import MODELS, Needs
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import SampleUse
 from dvl_calib_ros.evaluation.estimation import SensorData, aligned, estimate, streams_of, true_prior
-from dvl_calib_ros.evaluation.procedure import sensor_data
 from dvl_calib_ros.evaluation.protocol import own_trajectories
-from dvl_calib_ros.evaluation.validation_study import EVALUATED
+from dvl_calib_ros.evaluation.validation_study import EVALUATED, sensor_data
 
 N_SAMPLES, N_VARIANTS = 80, 3
 HELD = slice(30, 35)  # five equal samples

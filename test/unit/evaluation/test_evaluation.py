@@ -23,17 +23,19 @@ from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation import metrics, protocol, validation_study
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
-from dvl_calib_ros.evaluation.procedure import (
+from dvl_calib_ros.evaluation.protocol import Trajectory, load_folder, own_trajectories
+from dvl_calib_ros.evaluation.results import UNCALIBRATED, Improvement
+from dvl_calib_ros.evaluation.validation_study import (
+    DEFAULTS,
+    EVALUATED,
     Procedure,
     dvl_velocities,
+    evaluate,
     references,
     run_seed,
     sensor_data,
     true_state,
 )
-from dvl_calib_ros.evaluation.protocol import Trajectory, load_folder, own_trajectories
-from dvl_calib_ros.evaluation.results import UNCALIBRATED, Improvement
-from dvl_calib_ros.evaluation.validation_study import DEFAULTS, EVALUATED, evaluate
 from dvl_calib_ros.logs.dvl_log import angular_velocities
 from dvl_calib_ros.logs.trajectories import ImportOptions, import_recording
 from dvl_calib_ros.parallel import Workers, run_all

@@ -10,12 +10,11 @@ from report_fixtures import drawn
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.evaluation import estimation, procedure, validation_study
+from dvl_calib_ros.evaluation import estimation, validation_study
 from dvl_calib_ros.evaluation.estimation import SensorData, estimate
-from dvl_calib_ros.evaluation.procedure import sensor_data
 from dvl_calib_ros.evaluation.protocol import own_trajectories
 from dvl_calib_ros.evaluation.results import Failure
-from dvl_calib_ros.evaluation.validation_study import DEFAULTS, evaluate
+from dvl_calib_ros.evaluation.validation_study import DEFAULTS, evaluate, sensor_data
 
 N_SAMPLES, ENDS = 60, (20, 60)
 MODELS = ("M4", "M3", "A1")
@@ -85,7 +84,7 @@ def test_the_command_counts_what_raised_says_which_and_why_and_goes_on(monkeypat
 
 @pytest.mark.slow
 def test_a_seed_and_a_combination_that_raise_are_left_out(monkeypatch):
-    real = procedure.run_seed
+    real = validation_study.run_seed
 
     def refusing(asked, seed):
         if seed == 1:
@@ -95,7 +94,7 @@ def test_a_seed_and_a_combination_that_raise_are_left_out(monkeypatch):
     def none(*_, **__):
         raise FloatingPointError
 
-    monkeypatch.setattr(procedure, "run_seed", refusing)
+    monkeypatch.setattr(validation_study, "run_seed", refusing)
     monkeypatch.setattr(validation_study, "Calibrator", none)
     found = evaluate(None, Parameters(**DEFAULTS), models=("M4",), sets=("E4",), n_seeds=2)
     assert found.seeds == (0,) and found.avg_vrmse.shape == (1, 2, 1) and np.isfinite(found.avg_vrmse).all()
@@ -111,7 +110,7 @@ def test_where_nothing_comes_out_the_command_says_why_in_one_line(monkeypatch, c
     def none(*_):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr(procedure, "run_seed", none)
+    monkeypatch.setattr(validation_study, "run_seed", none)
     assert main([*COMMAND]) == 2
     error = capsys.readouterr().err
     assert "no model has an estimate" in error and "everything, seed 0: LinAlgError: Singular matrix" in error

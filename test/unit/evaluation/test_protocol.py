@@ -7,10 +7,9 @@ import pytest
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.evaluation import protocol
-from dvl_calib_ros.evaluation.procedure import Procedure, run_seed
 from dvl_calib_ros.evaluation.protocol import load_folder
 from dvl_calib_ros.evaluation.results import UNCALIBRATED
-from dvl_calib_ros.evaluation.validation_study import DEFAULTS, EVALUATED
+from dvl_calib_ros.evaluation.validation_study import DEFAULTS, EVALUATED, Procedure, run_seed
 
 N_SEEDS = 5
 

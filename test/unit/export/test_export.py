@@ -16,7 +16,7 @@ from other_simulators import READERS, mt19937_doubles
 from scipy.spatial.transform import Rotation
 from yaml_text import parsed, written
 
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.simulator_export.dvl_description import DvlDescription, Other, load_description
 from dvl_calib_ros.simulator_export.registry import SIMULATORS
 from dvl_calib_ros.simulator_export.writer import export

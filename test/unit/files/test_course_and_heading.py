@@ -11,7 +11,7 @@ from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.logs.course_and_heading import names_columns, read_course, read_heading
+from dvl_calib_ros.logs.trajectories import names_columns, read_course, read_heading
 
 
 def test_course_and_speed_become_a_velocity_without_a_vertical(tmp_path):

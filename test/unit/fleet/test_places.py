@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.fleet_catalogue.recording_search import recordings_in, vehicle_pattern
+from dvl_calib_ros.fleet_catalogue.recording_entry import recordings_in, vehicle_pattern
 
 
 def made(folder: Path, *names: str) -> Path:

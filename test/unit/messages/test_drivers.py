@@ -37,13 +37,13 @@ from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSampl
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.diagnosis.model.recorded_streams import load_recordings
 from dvl_calib_ros.discovery.discovery import Given
-from dvl_calib_ros.disk.yaml_files import load_yaml
+from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.evaluation.cross_check import cross_check
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.messages.drivers import DVL_TYPES, VELOCITY_TYPES, driver_table, velocity_type
+from dvl_calib_ros.messages.field_map import recognised
 from dvl_calib_ros.messages.live_feed import MessageFeed
-from dvl_calib_ros.messages.type_recognition import recognised
 from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.recordings.topics import Topics
 from dvl_calib_ros.simulation.recorded_motion import MotionSource, recorded_motion

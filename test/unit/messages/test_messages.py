@@ -9,7 +9,7 @@ import pytest
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import Stream, VelocityFrame
 from dvl_calib_ros.messages.decode import LinearCovariance, stamp_ns
 from dvl_calib_ros.messages.live_feed import MessageFeed
 
@@ -175,7 +175,8 @@ def test_ever_new_wrong_frames_and_garbage_are_counted_but_told_of_once():
     for i in range(50):
         feed.feed.dvl(twist(SECOND + i, f"frame{i % 2}"), 0)
         feed.feed.reference(twist(SECOND + i, f"frame{i}"), 0)
-        feed.feed.undecodable("dvl", f"byte {i}")
+        refusal = feed.feed.decoder.undecodable(Stream.DVL, f"byte {i}")
+        feed.feed.calibrator.refuse("dvl", refusal.reason)
     assert feed.counts("dvl")["wrong_frame"] == feed.counts("reference")["wrong_frame"] == 50
     assert feed.counts("dvl")["invalid"] == 50
     assert len(feed.said) == 3

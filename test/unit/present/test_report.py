@@ -17,8 +17,7 @@ from command_line import fail, in_fresh_process, succeed
 from io_fixtures import run, steady_run, write_bag
 from report_fixtures import FEW, Page, assert_described, drawn, evaluation, recorded, replay_page
 
-from dvl_calib_ros.bag_replay.replay import replay
-from dvl_calib_ros.bag_replay.run_history import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned
+from dvl_calib_ros.bag_replay.replay import KEPT_STATES, KEPT_VELOCITIES, Recorder, Thinned, replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models import BY_VELOCITY, MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters

@@ -18,8 +18,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, rotation_from_quaternion, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import ImuSample, VelocityFrame
-from dvl_calib_ros.effects.base import ActsOn, ClockEffect, Effect, EffectInput
-from dvl_calib_ros.effects.composition import Injection
+from dvl_calib_ros.effects.base import ActsOn, ClockEffect, Effect, EffectInput, Injection
 from dvl_calib_ros.effects.registry import EFFECTS, OWN
 from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.simulation.injection import injection

@@ -29,8 +29,8 @@ from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.simulator_export.dvl_description import load_description
-from dvl_calib_ros.unpaired.both_sides import Log, RecordedSide, is_copied, read_log
-from dvl_calib_ros.unpaired.comparison import compare, compare_logs
+from dvl_calib_ros.unpaired.both_sides import Log, RecordedSide, facts_of, is_copied, read_log
+from dvl_calib_ros.unpaired.comparison import Scatter, at_one_motion, block_levels, compare, compare_logs, slopes_of
 from dvl_calib_ros.unpaired.effect_comparison import Size, compared_names, is_there, p_alike, smallest_difference
 from dvl_calib_ros.unpaired.gap_ladder import (
     AS_IT_IS,
@@ -41,10 +41,8 @@ from dvl_calib_ros.unpaired.gap_ladder import (
     turned_over,
     two_samples,
 )
-from dvl_calib_ros.unpaired.noise_comparison import Scatter, at_one_motion, block_levels, slopes_of
 from dvl_calib_ros.unpaired.results import ComparedEffect, ComparisonStatus, SimulatorVerdict, unpaired_document
 from dvl_calib_ros.unpaired.simulator_rounds import close_gap, closed_gap_document, put_right
-from dvl_calib_ros.unpaired.stream_properties import facts_of
 
 SECOND_NS = 1_000_000_000
 
