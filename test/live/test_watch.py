@@ -384,7 +384,7 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
     from ros import until
 
     saved = tmp_path / "result.yaml"
-    with terminal(world, "run", "--watch", "-p", f"result_file:={saved}") as screen:
+    with terminal(world, "run", "--watch", "-p", f"result_file:={saved}", "-p", "gnss_frame:=enu") as screen:
         publisher = world.node.create_publisher(TwistWithCovarianceStamped, "dvl/twist", 100)
         until(lambda: publisher.get_subscription_count() == 1, "the node's subscription")
         for i in range(20):
@@ -394,6 +394,9 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
             publisher.publish(message)
         for text in ("mounting now", "drift", "next: ", "model auto; parameters", "s save"):
             screen.until(text)
+        seen = pyte.Screen(80, 24)
+        pyte.Stream(seen).feed(screen.text)
+        assert seen.display[0].startswith("model "), "the view begins in the first row"
         assert not saved.exists()
         screen.key(b"s")
         screen.until("saved to ")
