@@ -149,6 +149,7 @@ SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 HEIGHTS = " ▁▂▃▄▅▆▇█"
 GOALS = (("worth", "drift"), ("side", " yaw"), ("ahead", " scale"))
 WORSE = "[RESULT_WORSE]"
+WAITING = "waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)"
 KEYS = "s save  r r forget  w warnings  q quit"
 # width in columns from which a row has three quantities of the mounting and the next manoeuvre fits on one line
 WIDE = 76
@@ -192,7 +193,7 @@ class View:
         width, height = options.max_width, options.size.height
         tail = [Row(_message(line), "dim", most=1) for line in self.log[-LOG_LINES:]]
         fixed, body, warnings = (
-            [Row("waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)", "yellow")],
+            [Row(WAITING, "yellow")],
             tail,
             [],
         )
@@ -243,8 +244,10 @@ def _is_usable(status: Status) -> bool:
 
 def _warnings(status: Status) -> list[str]:
     found = [each for n in range(1, 100) if (each := status.values.get(f"finding {n}"))]
+    found = found or [status.message] * bool(status.level)
+    urgent = found[:1] if status.level > 1 else []  # an error, which comes first
     found_in_status = [status.values.get(name, "") for name in ("taken back", "longer")] if _is_usable(status) else []
-    return [*filter(None, found_in_status), *(found or [status.message] * bool(status.level))]
+    return [*urgent, *filter(None, found_in_status), *found[len(urgent) :]]
 
 
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
@@ -436,9 +439,13 @@ def _message(logged: str) -> str:
 
 def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:
     printed, printed_s = ("", "", ""), 0.0
+    told_s = time.monotonic()
     while is_running():
         status, now_s = statuses(REDRAW_S), time.monotonic()
         if status is None:
+            if now_s - told_s > SILENCE_S:
+                told_s = now_s
+                yield WAITING
             continue
         what = (status.get("model"), status.get("convergence"), str(status.level))
         if what != printed or now_s - printed_s > LINE_S:

@@ -83,6 +83,12 @@ def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_
     assert "not to be used, not observable yet" in early and "next: drive straight" in early
 
 
+def test_a_silent_dvl_comes_before_the_reason_why_it_takes_longer():
+    silent, longer = "no usable DVL message for 13 s", "it takes longer than promised"
+    text = drawn(status(2, silent, longer=longer, **{"finding 1": silent, "finding 2": "another"}), 100.0)
+    assert silent in text and longer not in text and "+2 more (w)" in text
+
+
 def test_the_speed_of_sound_is_said_in_a_line_where_the_water_is_known():
     brief = "1497.3 m/s would take the scale out (the DVL used 1506.6)"
     assert f"speed of sound  {brief}\n" in drawn(status(**{"speed of sound": brief}), 100.0, width=80)
@@ -291,7 +297,7 @@ def test_the_view_fits_any_terminal(width):
 def test_without_a_terminal_a_line_is_written_when_something_changes_and_now_and_then(monkeypatch):
     changes = [None, status(), status(), status(convergence="fine"), status(1, "check", convergence="fine")]
     statuses = iter([*changes, changes[-1], changes[-1]])
-    clock = iter([100.0, 100.5, 101.0, 101.5, 102.0, 102.5, 102.6 + LINE_S])
+    clock = iter([99.5, 100.0, 100.5, 101.0, 101.5, 102.0, 102.5, 102.6 + LINE_S])
     monkeypatch.setattr("dvl_calib_ros.cli.watch.time.monotonic", lambda: next(clock))
     running = iter([True] * 7 + [False])
     out = io.StringIO()
@@ -300,6 +306,14 @@ def test_without_a_terminal_a_line_is_written_when_something_changes_and_now_and
     assert len(lines) == 4
     assert lines[0] == line(status()) and lines[0].startswith("full coarse: roll 0.108 ±1.177°, ")
     assert lines[1].startswith("full fine:") and lines[2].endswith("; check") and lines[3] == lines[2]
+
+
+def test_without_a_terminal_it_is_said_that_no_node_answers(monkeypatch):
+    clock = iter([100.0, 100.5, 105.5, 106.0])
+    monkeypatch.setattr("dvl_calib_ros.cli.watch.time.monotonic", lambda: next(clock))
+    running, out = iter([True] * 3 + [False]), io.StringIO()
+    show(Console(file=out), SimpleNamespace(latest=lambda _: None), lambda: next(running))
+    assert out.getvalue() == "waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)\n"
 
 
 @pytest.mark.parametrize("name", ["M3", "F1"])
