@@ -203,7 +203,7 @@ CONFIGURATIONS = (
     # clocks
     _Said(
         "CLOCK_OFF",
-        "{whose} stamps are {seconds:.2f} ± {std:.2f} s {way}",
+        "{whose} stamps are {seconds:.3f} ± {std:.3f} s {way}",
         "Estimated from velocities and turns, against the IMU's clock.",
         "",
     ),
