@@ -198,7 +198,8 @@ class View:
             [],
         )
         if self.status is not None:
-            fixed, warnings = self._fixed(self.status, width), _warnings(self.status)
+            warnings = _warnings(self.status)
+            fixed = self._fixed(self.status, warnings, width)
             body = [*_body(self.status, warnings, width), *tail]
 
         def folded(rows: Iterable[Row]) -> list[Text]:
@@ -215,7 +216,7 @@ class View:
             lines += folded(body)
         yield from lines[:height]
 
-    def _fixed(self, status: Status, width: int) -> list[Row]:
+    def _fixed(self, status: Status, warnings: Sequence[str], width: int) -> list[Row]:
         """Return the rows that are always shown: model, goal, next step, keys, last event."""
         silent, code = self.now_s - status.received_s, status.get("next code")
         state = Row(f"model {status.get('model')}   {_duration(status.get('elapsed [s]'))}", "bold", most=1)
@@ -234,7 +235,7 @@ class View:
             _goal(status, *GOALS[0], width),
             Row(following, "bold green" if "GOOD" in code else "bold", most=lines, least=lines),
             Row(KEYS, "dim", most=lines),
-            Row(self.event, "cyan", most=4 if "(y/n)" in self.event else 2),
+            Row("" if self.event in warnings else self.event, "cyan", most=4 if "(y/n)" in self.event else 2),
         ]
 
 
@@ -246,8 +247,9 @@ def _warnings(status: Status) -> list[str]:
     found = [each for n in range(1, 100) if (each := status.values.get(f"finding {n}"))]
     found = found or [status.message] * bool(status.level)
     urgent = found[:1] if status.level > 1 else []  # an error, which comes first
-    found_in_status = [status.values.get(name, "") for name in ("taken back", "longer")] if _is_usable(status) else []
-    return [*urgent, *filter(None, found_in_status), *found[len(urgent) :]]
+    taken_back, longer = (status.values.get(n, "") if _is_usable(status) else "" for n in ("taken back", "longer"))
+    # a finding is often why it takes longer
+    return list(filter(None, [*urgent, taken_back, *found[len(urgent) :], longer]))
 
 
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:

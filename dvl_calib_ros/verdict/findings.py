@@ -187,9 +187,9 @@ FINDINGS = (
     ),
     Kind(
         "REFERENCE_FRAME",
-        "reference: frame_id {frame_id!r} says neither body ({base}) nor earth ({earth}); its messages are not used",
-        "",
-        "set parameter gnss_frame to body, enu or ned",
+        "reference not used: its frame_id {frame_id!r} is neither {base} nor an earth frame",
+        "Earth frames are enu, map, odom, world and ned.",
+        "set gnss_frame to body, enu or ned",
     ),
     Kind(
         "REFERENCE_NO_ATTITUDE",

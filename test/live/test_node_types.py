@@ -216,7 +216,7 @@ def test_an_outage_of_gnss_is_said_in_these_words_first_with_what_goes_on(model,
 
 
 def test_a_reference_whose_frame_is_not_known_is_said_first_and_not_as_an_outage_of_gnss():
-    problem = finding("REFERENCE_FRAME", frame_id="gps", base="base_link", earth="enu, ned")
+    problem = finding("REFERENCE_FRAME", frame_id="gps", base="base_link")
     calibrator, silence, recent = Calibrator(Parameters(), worker=AtOnce()), Silence(0.0, {}), RecentCounts()
     feed = MessageFeed(calibrator, lambda _: None)
     for second in range(30):

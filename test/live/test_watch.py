@@ -83,10 +83,18 @@ def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_
     assert "not to be used, not observable yet" in early and "next: drive straight" in early
 
 
-def test_a_silent_dvl_comes_before_the_reason_why_it_takes_longer():
-    silent, longer = "no usable DVL message for 13 s", "it takes longer than promised"
-    text = drawn(status(2, silent, longer=longer, **{"finding 1": silent, "finding 2": "another"}), 100.0)
-    assert silent in text and longer not in text and "+2 more (w)" in text
+@pytest.mark.parametrize(("level", "first"), [(2, "no usable DVL message for 13 s"), (1, "no GNSS for 13 s")])
+def test_a_silent_sensor_comes_before_the_reason_why_it_takes_longer(level, first):
+    longer = "it takes longer than promised"
+    text = drawn(status(level, first, longer=longer, **{"finding 1": first, "finding 2": "another"}), 100.0)
+    assert first in text and longer not in text and "+2 more (w)" in text
+
+
+def test_of_an_unknown_frame_the_remedy_is_read_on_a_small_terminal_and_the_warning_is_there_once():
+    warning = str(finding("REFERENCE_FRAME", frame_id="gps", base="base_link"))
+    text = drawn(status(1, warning, **{"finding 1": warning}), 100.0, [], warning, width=80)
+    said = " ".join(text.split())
+    assert said.count("reference not used") == 1 and "set gnss_frame to body, enu or ned [REFERENCE_FRAME]" in said
 
 
 def test_the_speed_of_sound_is_said_in_a_line_where_the_water_is_known():
