@@ -192,11 +192,7 @@ class View:
         """Yield lines, at most the terminal's height."""
         width, height = options.max_width, options.size.height
         tail = [Row(_message(line), "dim", most=1) for line in self.log[-LOG_LINES:]]
-        fixed, body, warnings = (
-            [Row(WAITING, "yellow")],
-            tail,
-            [],
-        )
+        fixed, body, warnings = [Row(WAITING, "yellow")], tail, list[str]()
         if self.status is not None:
             warnings = _warnings(self.status)
             fixed = self._fixed(self.status, warnings, width)

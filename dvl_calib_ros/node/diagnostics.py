@@ -135,22 +135,17 @@ class Silence:
         """Return the streams that receive samples with stamps far from the DVL's of the same moment."""
         if "dvl" not in coming:
             return {}
-        ahead = {Stream.DVL: 0.0}
-        for stream in coming:
-            ns, dvl_ns = newest_ns[stream], self._seen[stream].dvl_ns
-            if ns is not None and dvl_ns is not None:
-                ahead[Stream(stream)] = 1e-9 * (ns - dvl_ns)
-        # the newest sample of a live stream may be some time old
-        return {
-            each.stream.value: finding(
-                "CLOCKS_DIFFER",
-                stream=_NAMED[each.stream],
-                seconds=abs(each.ahead),
-                side=each.side,
-                other=_NAMED[each.other],
-            )
-            for each in arrival_offset(ahead, parameters, SILENCE_S)
+        ahead = {Stream.DVL: 0.0} | {
+            Stream(stream): 1e-9 * (ns - dvl_ns)
+            for stream in coming
+            if (ns := newest_ns[stream]) is not None and (dvl_ns := self._seen[stream].dvl_ns) is not None
         }
+        # the newest sample of a live stream may be some time old
+        faults = {}
+        for each in arrival_offset(ahead, parameters, SILENCE_S):
+            names = {"stream": _NAMED[each.stream], "side": each.side, "other": _NAMED[each.other]}
+            faults[each.stream.value] = finding("CLOCKS_DIFFER", seconds=abs(each.ahead), **names)
+        return faults
 
 
 def diagnose(
