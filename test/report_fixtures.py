@@ -24,11 +24,13 @@ from dvl_calib_ros.diagnosis.answer.noise_findings import NoiseFinding
 from dvl_calib_ros.diagnosis.answer.plotted_series import DiagnosisSeries, Followed
 from dvl_calib_ros.diagnosis.answer.results import Diagnosis, DiagnosisVerdict, FoundEffect
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
+from dvl_calib_ros.evaluation.convergence import TIMES_S
 from dvl_calib_ros.evaluation.cross_check import CrossCheck
 from dvl_calib_ros.evaluation.results import (
     UNCALIBRATED,
     CalibrationRun,
     CalibrationSet,
+    ConvergenceCurve,
     Coverage,
     EachStudy,
     Evaluation,
@@ -134,6 +136,9 @@ def evaluation(**changes: Any) -> Evaluation:
         )
         for name in models
     )  # fmt: skip
+    methods = [(name, std) for std in (0.2, 0.02) for name in ("M3", "Kinsey-Whitcomb", "Troni-Whitcomb")]
+    methods += [(name, None) for name in ("A1", "F1", "M7")]
+    curves = tuple(ConvergenceCurve(*method, np.full((len(TIMES_S), 3), 0.1)) for method in methods)
     values: dict[str, Any] = {
         "source": "folder <b>$x$</b>",
         "own_generator": False,
@@ -148,6 +153,7 @@ def evaluation(**changes: Any) -> Evaluation:
         "avg_vrmse_by_time": np.tile(avg_vrmse[:, None], (1, len(windows), 1, 1)),
         "published": {"E1": {UNCALIBRATED: 0.121, "M1": 0.0301, "M2": 0.10}},
         "coverage": coverage,
+        "convergence": curves,
         "each": EachStudy(runs, np.tile(level[None, :, None], (2, 1, 2)), np.ones((2, len(models))), coverage),
         "single_heading": None,
         "parameters": Parameters().as_dict(),

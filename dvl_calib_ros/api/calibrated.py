@@ -238,6 +238,7 @@ class Calibration:
         mounting = pandas.DataFrame(quantities(self.replayed.result)).set_index("name")
         mounting.insert(2, "change", mounting["value"] - mounting["nominal"])
         mounting = mounting.rename(columns={"nominal": "configured", "value": "corrected"})
+        mounting["configured"] = mounting["configured"].round(9)  # an angle of 1e-31 prints all others as powers of ten
         named = {key: frames[heading] for key, heading in TABLES.items() if heading in frames}
         return {"mounting": mounting} | {key: each.rename(columns=_column) for key, each in named.items()}
 

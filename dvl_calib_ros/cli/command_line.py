@@ -37,6 +37,14 @@ class _Parser(argparse.ArgumentParser):
 
         self.exit(2, f"{self.prog}: {printable(message)}; see {self.prog} --help\n")
 
+    def parse_args(self, args=None, namespace=None):  # type: ignore[no-untyped-def, override]
+        """Parse. An unknown option is an error of its command, whose help has the known ones."""
+        arguments, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            self.prog = f"{self.prog} {arguments.command}"
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return arguments
+
 
 def build_parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     """Build the parser with all commands; import only the called command and add its arguments."""

@@ -149,6 +149,7 @@ SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 HEIGHTS = " ▁▂▃▄▅▆▇█"
 GOALS = (("worth", "drift"), ("side", " yaw"), ("ahead", " scale"))
 WORSE = "[RESULT_WORSE]"
+WAITING = "waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)"
 KEYS = "s save  r r forget  w warnings  q quit"
 # width in columns from which a row has three quantities of the mounting and the next manoeuvre fits on one line
 WIDE = 76
@@ -191,13 +192,10 @@ class View:
         """Yield lines, at most the terminal's height."""
         width, height = options.max_width, options.size.height
         tail = [Row(_message(line), "dim", most=1) for line in self.log[-LOG_LINES:]]
-        fixed, body, warnings = (
-            [Row("waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)", "yellow")],
-            tail,
-            [],
-        )
+        fixed, body, warnings = [Row(WAITING, "yellow")], tail, list[str]()
         if self.status is not None:
-            fixed, warnings = self._fixed(self.status, width), _warnings(self.status)
+            warnings = _warnings(self.status)
+            fixed = self._fixed(self.status, warnings, width)
             body = [*_body(self.status, warnings, width), *tail]
 
         def folded(rows: Iterable[Row]) -> list[Text]:
@@ -214,7 +212,7 @@ class View:
             lines += folded(body)
         yield from lines[:height]
 
-    def _fixed(self, status: Status, width: int) -> list[Row]:
+    def _fixed(self, status: Status, warnings: Sequence[str], width: int) -> list[Row]:
         """Return the rows that are always shown: model, goal, next step, keys, last event."""
         silent, code = self.now_s - status.received_s, status.get("next code")
         state = Row(f"model {status.get('model')}   {_duration(status.get('elapsed [s]'))}", "bold", most=1)
@@ -233,7 +231,7 @@ class View:
             _goal(status, *GOALS[0], width),
             Row(following, "bold green" if "GOOD" in code else "bold", most=lines, least=lines),
             Row(KEYS, "dim", most=lines),
-            Row(self.event, "cyan", most=4 if "(y/n)" in self.event else 2),
+            Row("" if self.event in warnings else self.event, "cyan", most=4 if "(y/n)" in self.event else 2),
         ]
 
 
@@ -243,8 +241,11 @@ def _is_usable(status: Status) -> bool:
 
 def _warnings(status: Status) -> list[str]:
     found = [each for n in range(1, 100) if (each := status.values.get(f"finding {n}"))]
-    found_in_status = [status.values.get(name, "") for name in ("taken back", "longer")] if _is_usable(status) else []
-    return [*filter(None, found_in_status), *(found or [status.message] * bool(status.level))]
+    found = found or [status.message] * bool(status.level)
+    urgent = found[:1] if status.level > 1 else []  # an error, which comes first
+    taken_back, longer = (status.values.get(n, "") if _is_usable(status) else "" for n in ("taken back", "longer"))
+    # a finding is often why it takes longer
+    return list(filter(None, [*urgent, taken_back, *found[len(urgent) :], longer]))
 
 
 def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
@@ -436,9 +437,13 @@ def _message(logged: str) -> str:
 
 def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:
     printed, printed_s = ("", "", ""), 0.0
+    told_s = time.monotonic()
     while is_running():
         status, now_s = statuses(REDRAW_S), time.monotonic()
         if status is None:
+            if now_s - told_s > SILENCE_S:
+                told_s = now_s
+                yield WAITING
             continue
         what = (status.get("model"), status.get("convergence"), str(status.level))
         if what != printed or now_s - printed_s > LINE_S:

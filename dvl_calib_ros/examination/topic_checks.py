@@ -28,6 +28,9 @@ MOST = 0.95
 JITTER = 0.05
 # ... and with negative correlation of successive intervals, as in reception jitter (white jitter gives -0.5)
 AGAINST_RHYTHM = -0.3
+# ... and with this correlation of intervals of stamps and reception: the way to the recorder adds less than a seventh
+# of the jitter. A sensor that pings unevenly and stamps well has less.
+BY_RECEPTION = 0.99
 # a larger step of the stamps relative to the log means that the clock was set (s)
 SET_CLOCK = 1.0
 # smallest gap, and its smallest number of intervals (s, 1)
@@ -97,7 +100,7 @@ def _reception(name: str, steps: Array, log_steps: Array) -> list[Reason]:
         return []
     rhythm = float(np.corrcoef(e[1:][pairs], e[:-1][pairs])[0, 1])
     together = float(np.corrcoef(steps[steady], log_steps[steady])[0, 1]) if log_steps[steady].std() > 0.0 else 0.0
-    if rhythm > AGAINST_RHYTHM or together < 0.9:
+    if rhythm > AGAINST_RHYTHM or together < BY_RECEPTION:
         return []
     return [finding("DOCTOR_STAMP_RECEPTION", topic=name, jitter_ms=1e3 * jitter, period_ms=1e3 * period)]
 

@@ -361,8 +361,7 @@ class MessageDecoder:
             return DeclaredFrame(self.reference_type.reference_frame)
         frame = frame_named(frame_id, (p.base_frame,))
         if frame is None:
-            known = {"base": p.base_frame, "earth": ", ".join(EARTH_FRAMES)}
-            self._problem("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, **known))
+            self._problem("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, base=p.base_frame))
             return None
         return frame.in_base(p)
 

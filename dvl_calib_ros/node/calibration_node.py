@@ -264,7 +264,7 @@ class CalibrationNode(AnsweringNode):
     def _log_configuration(self) -> None:
         default = Parameters().as_dict()
         given = self._calibrator.parameters.as_dict()
-        changed = {name: value for name, value in given.items() if value != default[name]}
+        changed = ", ".join(f"{name}: {value}" for name, value in given.items() if value != default[name])
         self.info(f"model {given['model']}; parameters not at their default: {changed or 'none'}")
 
     # ------------------------------------------------------------------ input

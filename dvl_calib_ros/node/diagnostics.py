@@ -47,6 +47,8 @@ _SILENT = {
     "reference": ("GNSS_OUTAGE", "gnss/twist"),
     "imu": ("IMU_SILENT", "imu/data"),
 }
+# Warnings that explain others come before them.
+_CAUSES = {"REFERENCE_FRAME", "TOPIC_SEVERAL_PUBLISHERS"}
 # A reference has an outage after this number of its mean intervals: positions may come every ten seconds.
 OUTAGE_INTERVALS = 5.0
 
@@ -73,11 +75,15 @@ class RecentCounts:
 
 
 class _Taken(NamedTuple):
-    """Number of samples taken of a stream, time of its last change (s), and of the first sample (s)."""
+    """Number of samples taken of a stream, time of its last change (s) and of the first sample (s).
+
+    dvl_ns: newest stamp of the DVL at the last change.
+    """
 
     taken: int
     since_s: float
     first_s: float
+    dvl_ns: int | None
 
     @property
     def outage_from_s(self) -> float:
@@ -106,7 +112,8 @@ class Silence:
             taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
             before = self._seen.get(stream)
             if before is None or before.taken != taken:
-                self._seen[stream] = _Taken(taken, now_s, before.first_s if before and before.taken else now_s)
+                first_s = before.first_s if before and before.taken else now_s
+                self._seen[stream] = _Taken(taken, now_s, first_s, newest_ns["dvl"])
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
         faults = {}
         for stream, (code, own_topic) in _SILENT.items():
@@ -120,27 +127,25 @@ class Silence:
                     code = "GNSS_OUTAGE_WITHOUT"
                 faults[stream] = finding(code, seconds=silent_s[stream], topic=topic, model=model.name)
         coming = {stream for stream in newest_ns if silent_s[stream] <= SILENCE_S}
-        return faults | _clock_faults(newest_ns, coming, calibrator.parameters)
+        return faults | self._clock_faults(newest_ns, coming, calibrator.parameters)
 
-
-def _clock_faults(newest_ns: Mapping[str, int | None], coming: set[str], parameters: Parameters) -> dict[str, Reason]:
-    """Return the streams that receive samples with stamps far from the others'."""
-    known = {stream: ns for stream, ns in newest_ns.items() if stream in coming and ns is not None}
-    dvl_ns = known.get("dvl")
-    if dvl_ns is None:
-        return {}
-    # the newest sample of a live stream may be some time old
-    ahead = {Stream.DVL: 0.0} | {Stream(stream): 1e-9 * (ns - dvl_ns) for stream, ns in known.items()}
-    return {
-        each.stream.value: finding(
-            "CLOCKS_DIFFER",
-            stream=_NAMED[each.stream],
-            seconds=abs(each.ahead),
-            side=each.side,
-            other=_NAMED[each.other],
-        )
-        for each in arrival_offset(ahead, parameters, SILENCE_S)
-    }
+    def _clock_faults(
+        self, newest_ns: Mapping[str, int | None], coming: set[str], parameters: Parameters
+    ) -> dict[str, Reason]:
+        """Return the streams that receive samples with stamps far from the DVL's of the same moment."""
+        if "dvl" not in coming:
+            return {}
+        ahead = {Stream.DVL: 0.0} | {
+            Stream(stream): 1e-9 * (ns - dvl_ns)
+            for stream in coming
+            if (ns := newest_ns[stream]) is not None and (dvl_ns := self._seen[stream].dvl_ns) is not None
+        }
+        # the newest sample of a live stream may be some time old
+        faults = {}
+        for each in arrival_offset(ahead, parameters, SILENCE_S):
+            names = {"stream": _NAMED[each.stream], "side": each.side, "other": _NAMED[each.other]}
+            faults[each.stream.value] = finding("CLOCKS_DIFFER", seconds=abs(each.ahead), **names)
+        return faults
 
 
 def diagnose(
@@ -177,7 +182,9 @@ def diagnose(
     found += [each.weighed(Severity.ERROR if each.severity is Severity.REJECT else Severity.WARNING) for each in doubts]
     if verdict is Severity.ACCEPT:
         found = of_consequence(found, calibrator.parameters.target_drift)
-    found.sort(key=lambda each: each.severity is not Severity.ERROR)  # errors first
+    if any(each.code == "REFERENCE_FRAME" for each in problems):  # the receiver works: its messages are refused
+        found = [each for each in found if not each.code.startswith("GNSS_OUTAGE")]
+    found.sort(key=lambda each: (each.severity is not Severity.ERROR, each.code not in _CAUSES))
     status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
     status.message = printable("; ".join(map(str, found))) or f"{estimate.model} {estimate.convergence.value}"
     values = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import sys
 import time
 from typing import Any
 
@@ -35,9 +37,11 @@ class Listener:
 
     def __enter__(self) -> Listener:
         self._context = rclpy.Context()
+        # without the command's own -p NAME:=VALUE, which ROS takes for a remapping and warns of on the view
+        ros_arguments = list(itertools.dropwhile(lambda word: word != "--ros-args", sys.argv))
         try:
-            rclpy.init(context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        except Exception as error:  # rclpy raises its own types for bad --ros-args, which it takes from sys.argv
+            rclpy.init(args=ros_arguments, context=self._context, signal_handler_options=SignalHandlerOptions.NO)
+        except Exception as error:  # rclpy raises its own types for bad --ros-args
             raise InputError(" ".join(str(error).split())) from error
         self._node = AnsweringNode("dvl_calib_watch", context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)

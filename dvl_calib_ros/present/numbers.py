@@ -113,7 +113,8 @@ def typed(command: str, bags: Iterable[Path], *options: object) -> str:
 def options(
     topics: Iterable[tuple[str, str | None]], overrides: Iterable[str], parameters: Path | None = None
 ) -> list[str]:
-    """Return options for topics (role and name, None: found automatically) and parameters."""
+    """Return options for topics (role and name, None: found automatically) and parameters, each with its last value."""
     words = [] if parameters is None else ["--params", str(parameters)]
-    words += [word for override in overrides for word in ("-p", override)]
+    last = {override.partition(":=")[0]: override for override in overrides}
+    words += [word for override in last.values() for word in ("-p", override)]
     return words + [word for role, name in topics if name is not None for word in (f"--{role}-topic", name)]

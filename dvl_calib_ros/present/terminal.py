@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 # Cells up to this width stay on one line; longer ones are sentences, which may break between words.
 SHORT = 20
+# Tables of up to this number of columns break their row names before they are split into more than two.
+FEW = 6
 # two blanks and a line next to a column
 _BESIDE = 3
 
@@ -43,6 +45,11 @@ class Folding:
             yield _shown(console, table.title, "table.title")
         turned = self._transposed
         groups = _groups(table.columns, needed, width - 1)
+        if groups is not None and len(groups) > 2 and len(needed) <= FEW:
+            names = table.columns[0]  # long names may break, so that more columns are next to each other
+            names.no_wrap = False
+            broken = (Measurement.get(console, options, cell).minimum for cell in (names.header, *names.cells))
+            groups = _groups(table.columns, [_BESIDE + max(broken), *needed[1:]], width - 1)
         if turned is not None and sum(_keep_short(console, options, column) for column in turned.columns) + 1 <= width:
             yield turned
         elif groups is None:

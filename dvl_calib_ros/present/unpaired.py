@@ -29,7 +29,7 @@ EFFECTS: Columns[ComparedEffect] = {
     "vehicle (95 %)": lambda each: Cell(intervals(each.vehicle, LIBRARY.get(each.name)), "text"),
     "simulator (95 %)": lambda each: Cell(intervals(each.simulator, LIBRARY.get(each.name)), "text"),
     "adds, mm/s": lambda each: mm(each.adds_mps),
-    "mostly on": lambda each: str(each.lies or "–"),
+    "mostly on": lambda each: Cell(str(each.lies or "–"), "text"),
     "p, adjusted": lambda each: p_value(each.p),
 }
 EFFECTS_NOTE = (

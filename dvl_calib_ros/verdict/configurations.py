@@ -172,7 +172,7 @@ CONFIGURATIONS = on_page(
     # clocks
     reject(
         "CLOCK_OFF",
-        "{whose} stamps are {seconds:.2f} ± {std:.2f} s {way}",
+        "{whose} stamps are {seconds:.3f} ± {std:.3f} s {way}",
         means="Estimated from velocities and turns, against the IMU's clock.",
     ),
     reject(

@@ -184,8 +184,9 @@ FINDINGS = (
     ),
     warning(
         "REFERENCE_FRAME",
-        "reference: frame_id {frame_id!r} says neither body ({base}) nor earth ({earth}); its messages are not used",
-        remedy="set parameter gnss_frame to body, enu or ned",
+        "reference not used: its frame_id {frame_id!r} is neither {base} nor an earth frame",
+        means="Earth frames are enu, map, odom, world and ned.",
+        remedy="set gnss_frame to body, enu or ned",
     ),
     warning(
         "REFERENCE_NO_ATTITUDE",

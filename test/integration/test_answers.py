@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import runpy
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.verdict.kinds import Severity
+from validation.stacks import shared_folder
 from validation.surveys.physics import DVL_BIAS_STD, draw, write_survey
 
 
@@ -369,3 +371,16 @@ def test_on_clean_recordings_nothing_is_warned_of_that_has_no_consequence(seed, 
     assert run.verdict == "accept"
     assert {each.code for each in run.findings} - OF_CONSEQUENCE <= set()
     assert not any("[ONE_SPEED]" in note for note in run.replayed.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(9001, 9011))
+def test_on_ten_clean_recordings_of_a_survey_vehicle_nothing_is_warned_of(seed, tmp_path):
+    """By physics that were made without this package."""
+    script = shared_folder() / "cases" / "survey_vehicle.py"
+    if not script.exists():
+        pytest.skip(f"{script} is not there (set DVL_CALIB_SHARED)")
+    runpy.run_path(str(script))["make"](tmp_path / "bag", seed, T_end=150.0, path=seed % 2)
+    run, examined = dc.replay(tmp_path / "bag", history=False), dc.doctor(tmp_path / "bag")
+    assert (run.verdict, run.findings) == ("accept", ())
+    assert (examined.verdict, list(examined.findings)) == ("yes", [])

@@ -110,6 +110,13 @@ def test_a_user_finds_tables_by_short_names_with_units(calibration):
     assert list(tables["held_out"].columns[1:4]) == ["uncorrected_mps", "corrected_mps", "predicted_mps"]
 
 
+def test_a_printed_mounting_has_no_powers_of_ten(bag):
+    """A quaternion of /tf_static gives a pitch of 6e-33 rad, in which pandas printed every number of the column."""
+    pytest.importorskip("pandas")
+    run = dc.replay(bag, mounting_rpy=(0.1, 6e-33, 0.8), history=False)
+    assert "e-" not in str(run.tables()["mounting"])
+
+
 def test_the_mounting_is_printed_with_arm_and_delay_and_findings_are_of_the_selected_model(calibration):
     said = str(calibration.mounting)
     assert "lever arm x " in said and "stamps late " in said

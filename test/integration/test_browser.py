@@ -16,7 +16,10 @@ from report_fixtures import comparison, cross_checked, diagnosis, evaluation, re
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.discovery.discovery import Given
 from dvl_calib_ros.parallel import Workers
-from dvl_calib_ros.present.page import write_report
+from dvl_calib_ros.present.document import Document, section, table_by
+from dvl_calib_ros.present.page import write_document, write_report
+from dvl_calib_ros.present.unpaired import EFFECTS
+from dvl_calib_ros.unpaired.results import ComparedEffect, ComparisonStatus, Lies
 
 pytestmark = pytest.mark.slow
 
@@ -115,6 +118,20 @@ def test_every_table_is_whole_and_every_value_has_its_heading(browser, any_repor
              [...e.querySelectorAll('td')].every(td => td.dataset.heading !== undefined)])"""
     )
     assert tables and all(whole and headed for whole, headed in tables)
+    page.close()
+
+
+def test_long_names_of_effects_break_where_a_tablet_is_too_narrow(browser, tmp_path):
+    sizes = {name: (-1.875, -1.903, -1.846) for name in ("x_m", "y_m", "z_m")}
+    effect = ComparedEffect(
+        "lever_arm", ComparisonStatus.MISSING, ("velocity_bias",), sizes, sizes, 1e-4, 72.5,
+        Lies("y", 0.9, "accelerating", 0.8, (0.05, 0.2), 0.7),
+    )  # fmt: skip
+    path = tmp_path / "effects.html"
+    write_document(path, Document("Effects", "", None, [], [section("", table_by(EFFECTS, [effect]))]))
+    page = browser.new_page(viewport={"width": 820, "height": 900})
+    page.goto(path.as_uri())
+    assert page.evaluate("(e => e.scrollWidth <= e.clientWidth)(document.querySelector('.scroll'))")
     page.close()
 
 

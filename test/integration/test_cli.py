@@ -140,7 +140,10 @@ def test_the_version_is_that_of_the_package(capsys):
         ([], "required: command"),
         (["replya"], "invalid choice: 'replya'"),
         (["replay"], "dvl-calib replay: the following arguments are required: BAG"),
-        (["replay", "x", "--model", "M3", "--unknown"], "unrecognized arguments: --unknown"),
+        (
+            ["replay", "x", "--model", "M3", "--unknown"],
+            "unrecognized arguments: --unknown; see dvl-calib replay --help",
+        ),
         (["simulate", "x", "--seed", "one"], "--seed: invalid int value: 'one'"),
         (["simulate", "x", "--trajectory", "maze"], "--trajectory: invalid choice: 'maze'"),
         (["import", "x.csv"], "required: -o/--output"),

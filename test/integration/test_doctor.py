@@ -95,6 +95,13 @@ def reception(log: int, message: Any, i: int) -> int:
     return log + late + 200_000
 
 
+def uneven_pings(_: int, message: Any, i: int) -> int:
+    rng = np.random.default_rng(i)
+    measured = stamp_of(message) + int(rng.normal(0.0, 0.012) * SECOND)
+    stamp(message, measured)
+    return measured + int(abs(rng.normal(0.005, 0.003)) * SECOND)
+
+
 def zero_stamps(log: int, message: Any, _: int) -> int:
     stamp(message, 0)
     return log
@@ -233,6 +240,12 @@ def test_a_fault_that_is_put_in_is_named(fault, tmp_path):
     also = {"DOCTOR_UNITS": {"DOCTOR_COVARIANCE"}, "DOCTOR_DISAGREE": {"DOCTOR_FRAMES"}}.get(code, set())
     assert codes(examined) <= {code, *also}
     assert_judged_as_a_replay(examined)
+
+
+def test_a_dvl_that_pings_unevenly_is_not_said_to_be_stamped_at_reception(tmp_path):
+    """Ten of ten clean recordings of a survey vehicle were warned of it."""
+    examined = examine([faulty(tmp_path / "bag", dvl_only(uneven_pings))], Parameters())
+    assert codes(examined) == set()
 
 
 def assert_judged_as_a_replay(examined: Examination) -> None:

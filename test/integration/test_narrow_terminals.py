@@ -78,6 +78,13 @@ def test_a_command_says_every_number_and_name_on_any_terminal(monkeypatch, capsy
         assert [word for word in missing - of_names if len(word) < width] == []
 
 
+def test_on_a_narrow_terminal_the_corrected_mounting_is_next_to_the_configured(monkeypatch, capsys, folder):
+    monkeypatch.chdir(folder)
+    lines = said(monkeypatch, capsys, 40, "replay", "one", "-p", "model:=M3").splitlines()
+    (head,) = [line.split() for line in lines if "configured" in line and "corrected" in line]
+    assert head == ["configured", "corrected"]
+
+
 def on_a_terminal(folder: Path, columns: int, *arguments: str) -> list[str]:
     """The lines of a command on a terminal, as its user sees them, without colours and bars."""
     source, terminal = pty.openpty()

@@ -50,6 +50,12 @@ def test_the_profile_of_the_folder_is_used_and_shown_and_options_win(capsys, fol
     assert "/other" in fail_after_the_profile(capsys, "replay", "bag", "--dvl-topic", "/other")
 
 
+def test_the_next_command_has_each_parameter_once(capsys, folder):
+    (folder / ".dvl-calib.yaml").write_text("parameters: {target_drift: 5}")
+    out, _ = succeed(capsys, "doctor", "bag", "-p", "target_drift:=3")
+    assert "next  dvl-calib replay bag -p target_drift:=3 --save calibration.yaml" in out
+
+
 def fail_after_the_profile(capsys, *arguments: str) -> str:
     from dvl_calib_ros.cli.main import main
 

@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from driver_fixtures import A50, MARINE, ODOMETRY, TWIST, TWIST_STAMPED, Maker, as_plain, write_driver_bag
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from io_fixtures import run
+from live_fixtures import sent
 from nav_msgs.msg import Odometry
 from position_fixtures import write_positions
 from rclpy.parameter import Parameter
@@ -34,6 +35,7 @@ from dvl_calib_ros.node import calibration_node
 from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.node.diagnostics import RecentCounts, Silence, diagnose
 from dvl_calib_ros.node.message_types import message_class
+from dvl_calib_ros.verdict.reasons import finding
 from validation.positions import Truth, driven
 
 WHEREABOUTS = ("refused", "unusable", "unpaired", "waiting", "gathered", "used", "gated")
@@ -185,13 +187,15 @@ def test_what_is_usable_follows_the_verdict(turned):
 
 
 @pytest.mark.parametrize(
-    ("model", "goes_on"),
+    ("model", "rate", "goes_on"),
     [
-        ("auto", "F1 continues, but learns nothing that needs GNSS, such as the scale"),
-        ("M3", "M3 still corrects with its last estimate, but learns nothing more"),
+        ("auto", 1.0, "F1 continues, but learns nothing that needs GNSS, such as the scale"),
+        ("M3", 1.0, "M3 still corrects with its last estimate, but learns nothing more"),
+        ("auto", 4.0, ""),
     ],
 )
-def test_an_outage_of_gnss_is_said_in_these_words_first_with_what_goes_on(model, goes_on):
+def test_an_outage_of_gnss_is_said_in_these_words_first_with_what_goes_on(model, rate, goes_on):
+    """rate: how much faster than recorded a bag is played: no clock differs in it."""
     calibrator, silence, recent = Calibrator(Parameters(model=model), worker=AtOnce()), Silence(0.0, {}), RecentCounts()
     take = {DvlSample: calibrator.feed_dvl, ReferenceSample: calibrator.feed_reference, ImuSample: calibrator.feed_imu}
     said, dvl = {}, 0
@@ -200,12 +204,28 @@ def test_an_outage_of_gnss_is_said_in_these_words_first_with_what_goes_on(model,
         if not (isinstance(sample, ReferenceSample) and 40.0 < at_s < 60.0):
             take[type(sample)](sample)
         dvl += isinstance(sample, DvlSample)
-        if isinstance(sample, DvlSample) and not dvl % 5:
-            status = diagnose(calibrator, VELOCITY_TYPES[TWIST], [], silence, recent, at_s)
+        if isinstance(sample, DvlSample) and not dvl % (5 * rate):
+            status = diagnose(calibrator, VELOCITY_TYPES[TWIST], [], silence, recent, at_s / rate)
             said[round(at_s)] = status.message
+    assert not any("CLOCKS_DIFFER" in message for message in said.values())
+    if rate > 1.0:
+        return
     outage = [at_s for at_s, message in said.items() if "no GNSS for" in message]
     assert 44 <= outage[0] <= 47 and 59 <= outage[-1] <= 62
     assert said[55].startswith(("no GNSS for 14 s", "no GNSS for 15 s")) and goes_on in said[55]
+
+
+def test_a_reference_whose_frame_is_not_known_is_said_first_and_not_as_an_outage_of_gnss():
+    problem = finding("REFERENCE_FRAME", frame_id="gps", base="base_link")
+    calibrator, silence, recent = Calibrator(Parameters(), worker=AtOnce()), Silence(0.0, {}), RecentCounts()
+    feed = MessageFeed(calibrator, lambda _: None)
+    for second in range(30):
+        calibrator.feed_dvl(DvlSample(second * 10**9, (1.5, 0.0, 0.0)))
+        _, message = sent(ReferenceSample(second * 10**9, (1.5, 0.0, 0.0)), "gps")
+        feed.reference(message, 0)
+        others = [finding("TF_NOT_THERE"), *feed.decoder.problems.values()]
+        status = diagnose(calibrator, VELOCITY_TYPES[TWIST], others, silence, recent, float(second))
+    assert status.message.startswith(str(problem)[:40]) and "no GNSS" not in status.message
 
 
 def test_positions_that_come_every_ten_seconds_are_out_only_after_several_that_are_missing():

@@ -83,6 +83,20 @@ def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_
     assert "not to be used, not observable yet" in early and "next: drive straight" in early
 
 
+@pytest.mark.parametrize(("level", "first"), [(2, "no usable DVL message for 13 s"), (1, "no GNSS for 13 s")])
+def test_a_silent_sensor_comes_before_the_reason_why_it_takes_longer(level, first):
+    longer = "it takes longer than promised"
+    text = drawn(status(level, first, longer=longer, **{"finding 1": first, "finding 2": "another"}), 100.0)
+    assert first in text and longer not in text and "+2 more (w)" in text
+
+
+def test_of_an_unknown_frame_the_remedy_is_read_on_a_small_terminal_and_the_warning_is_there_once():
+    warning = str(finding("REFERENCE_FRAME", frame_id="gps", base="base_link"))
+    text = drawn(status(1, warning, **{"finding 1": warning}), 100.0, [], warning, width=80)
+    said = " ".join(text.split())
+    assert said.count("reference not used") == 1 and "set gnss_frame to body, enu or ned [REFERENCE_FRAME]" in said
+
+
 def test_the_speed_of_sound_is_said_in_a_line_where_the_water_is_known():
     brief = "1497.3 m/s would take the scale out (the DVL used 1506.6)"
     assert f"speed of sound  {brief}\n" in drawn(status(**{"speed of sound": brief}), 100.0, width=80)
@@ -291,7 +305,7 @@ def test_the_view_fits_any_terminal(width):
 def test_without_a_terminal_a_line_is_written_when_something_changes_and_now_and_then(monkeypatch):
     changes = [None, status(), status(), status(convergence="fine"), status(1, "check", convergence="fine")]
     statuses = iter([*changes, changes[-1], changes[-1]])
-    clock = iter([100.0, 100.5, 101.0, 101.5, 102.0, 102.5, 102.6 + LINE_S])
+    clock = iter([99.5, 100.0, 100.5, 101.0, 101.5, 102.0, 102.5, 102.6 + LINE_S])
     monkeypatch.setattr("dvl_calib_ros.cli.watch.time.monotonic", lambda: next(clock))
     running = iter([True] * 7 + [False])
     out = io.StringIO()
@@ -300,6 +314,14 @@ def test_without_a_terminal_a_line_is_written_when_something_changes_and_now_and
     assert len(lines) == 4
     assert lines[0] == line(status()) and lines[0].startswith("full coarse: roll 0.108 ±1.177°, ")
     assert lines[1].startswith("full fine:") and lines[2].endswith("; check") and lines[3] == lines[2]
+
+
+def test_without_a_terminal_it_is_said_that_no_node_answers(monkeypatch):
+    clock = iter([100.0, 100.5, 105.5, 106.0])
+    monkeypatch.setattr("dvl_calib_ros.cli.watch.time.monotonic", lambda: next(clock))
+    running, out = iter([True] * 3 + [False]), io.StringIO()
+    show(Console(file=out), SimpleNamespace(latest=lambda _: None), lambda: next(running))
+    assert out.getvalue() == "waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)\n"
 
 
 @pytest.mark.parametrize("name", ["M3", "F1"])
@@ -384,7 +406,7 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
     from ros import until
 
     saved = tmp_path / "result.yaml"
-    with terminal(world, "run", "--watch", "-p", f"result_file:={saved}") as screen:
+    with terminal(world, "run", "--watch", "-p", f"result_file:={saved}", "-p", "gnss_frame:=enu") as screen:
         publisher = world.node.create_publisher(TwistWithCovarianceStamped, "dvl/twist", 100)
         until(lambda: publisher.get_subscription_count() == 1, "the node's subscription")
         for i in range(20):
@@ -394,6 +416,9 @@ def test_run_watch_shows_the_node_live_and_ctrl_c_saves_and_ends_cleanly(world, 
             publisher.publish(message)
         for text in ("mounting now", "drift", "next: ", "model auto; parameters", "s save"):
             screen.until(text)
+        seen = pyte.Screen(80, 24)
+        pyte.Stream(seen).feed(screen.text)
+        assert seen.display[0].startswith("model "), "the view begins in the first row"
         assert not saved.exists()
         screen.key(b"s")
         screen.until("saved to ")

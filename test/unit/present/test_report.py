@@ -415,7 +415,7 @@ def test_own_trajectories_are_not_compared_with_the_published_figures(tmp_path):
 
 def test_an_evaluation_without_studies_has_no_empty_sections(tmp_path):
     path = tmp_path / "evaluation.html"
-    bare = evaluation(each=None, held_out=(), coverage=())
+    bare = evaluation(each=None, held_out=(), coverage=(), convergence=())
     write_report(path, bare)
     text = Page(path).text
     for section in ("Can the uncertainty", "each run", "Held-out"):
