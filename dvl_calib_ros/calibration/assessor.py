@@ -12,6 +12,7 @@ import numpy as np
 from ..verdict.reasons import Reason
 from .assessment.dead_reckoning import Navigation, SlowNoise, dead_reckoned, doubts, objections
 from .assessment.manoeuvre_planner import drift_left_open
+from .checks.beam_faults import BeamFault
 from .estimators.estimator import NEVER, Estimator, Rest
 from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
 from .filters.day_to_day_covariance import day_covariance
@@ -151,7 +152,10 @@ class Assessor:
         n_days, p = len(terms[0]), self._estimates.parameters
         parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
         corrections = [each for of_days in terms for each in of_days]
-        return dead_reckoned(recording, parts, corrections, p, epoch_ns, deviation, self._further.slow_noise)
+        further = self._further
+        return dead_reckoned(
+            recording, parts, corrections, p, epoch_ns, deviation, further.slow_noise, further.beam_fault
+        )
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
         """Return, per fold and day, one model's corrections estimated without that fold.
@@ -363,6 +367,11 @@ class NonlinearEstimators:
     def slow_noise(self) -> SlowNoise | None:
         """Slow errors of reference and attitude as estimated; None if not estimated."""
         return self._first(lambda each: each.slow_noise)
+
+    @property
+    def beam_fault(self) -> BeamFault | None:
+        """Most significant fault of one beam of the DVL; None if not tested."""
+        return self._first(lambda each: each.beam_fault)
 
     @property
     def n_days(self) -> int:

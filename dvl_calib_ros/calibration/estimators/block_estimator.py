@@ -19,6 +19,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..assessment.dead_reckoning import SlowNoise
 from ..assessment.model_selection import Evidence
+from ..checks.beam_faults import BeamFault
 from ..filters.cross_validation import FOLDS, HeldOutError, Moments
 from ..filters.filter_bank import ModelCounts
 from ..filters.filter_setup import prior
@@ -501,6 +502,11 @@ class FullEstimator(Estimator):
     def slow_noise(self) -> SlowNoise | None:
         """See `Estimator`."""
         return self._idle_solver().fit.slow_noise
+
+    @property
+    def beam_fault(self) -> BeamFault | None:
+        """See `Estimator`."""
+        return self._idle_solver().fit.beam_fault()
 
     def _idle_solver(self) -> BlockSolver:
         self._newest()
