@@ -107,6 +107,11 @@ class Estimator(ABC):
         return False
 
     @property
+    def arm_effect_mps(self) -> float | None:
+        """Velocity error (σ) by an unknown lever arm where turn rates are unknown; None where they are known."""
+        return None
+
+    @property
     def left_open(self) -> Array:
         """Part (n, n) of `of_recording`'s covariance due to the uncertain clock offset of the reference."""
         n = len(self.state().x)

@@ -48,6 +48,11 @@ class LogNormal(NamedTuple):
     median: float
     factor: float
 
+    @property
+    def mean_square(self) -> float:
+        """Mean of the square."""
+        return self.median**2 * math.exp(2.0 * math.log(self.factor) ** 2)
+
 
 @dataclass(frozen=True)
 class Priors:
