@@ -272,7 +272,7 @@ CONFIGURATIONS = (
     _Said(
         "MOUNTING_CONTRADICTED",
         "DVL and reference do not agree with the mounting {given}; they do with {found}",
-        "",
+        "A heading without its magnetic declination (setting EB of an RDI) looks the same.",
         "try -p mounting_rpy:={option}",
     ),
     _Said(

@@ -53,7 +53,7 @@ _KINDS = (
         "MISALIGNMENT_LARGE",
         "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
         "Seldom the bracket.",
-        "is mounting_rpy right, and are the frames?",
+        "are mounting_rpy, the frames and a compass's declination right?",
         Severity.REJECT,
     ),
     Kind(

@@ -390,11 +390,13 @@ def doubts(
         found.append(heading_warnings(navigation.deviation).weighed(severity_of(navigation.deviation, estimate)))
     if in_earth and bed is None:
         found += one_heading_warnings(estimate, parameters, navigation.speed)
+    # the first-order model of a misalignment makes a velocity longer, which looks like one beam
+    is_large = float(np.linalg.norm(estimate.state[:3])) > parameters.reject_misalignment
     return found + residual_warnings(
         navigation.followed,
         are_positions(parameters),
         reference_lag_s(estimate, parameters),
         is_insignificant(estimate),
         std_along(estimate, parameters),
-        navigation.beam,
+        None if is_large else navigation.beam,
     )
