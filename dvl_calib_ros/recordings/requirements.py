@@ -13,7 +13,7 @@ from ..messages.drivers import DVL_TYPES, IMU_TYPE, REFERENCE_TYPES
 from ..verdict.reasons import Reason, finding
 from .recording import Recording
 from .topic_messages import Recorded
-from .topics import Topics
+from .topics import NONE, Topics
 
 
 def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> None:
@@ -30,7 +30,7 @@ def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> N
     _check_types(recording, topics, found)
     if not recording.counts[topics.dvl]:
         raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
-    if topics.gnss not in present:
+    if topics.gnss not in (*present, NONE):
         found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
 
 

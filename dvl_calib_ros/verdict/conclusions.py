@@ -143,6 +143,13 @@ _DIAGNOSES = (
         Severity.MARGINAL,
     ),
     Kind(
+        "CALIBRATION_REJECTS",
+        "the calibration rejects this recording: {says}",
+        "The diagnosis fits a mounting and a scale, which may absorb the error.",
+        "",
+        Severity.REJECT,
+    ),
+    Kind(
         "GAP_TOO_SHORT",
         "this recording cannot show a gap: {samples} samples over {seconds:.0f} s are too few",
         "Samples with DVL, reference and attitude count.",
