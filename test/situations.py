@@ -57,6 +57,18 @@ def one_axis_negated(told: Told, wrong: bool) -> None:
             message.twist.twist.linear.z *= -1.0
 
 
+def one_beam_low(told: Told, wrong: bool) -> None:
+    """One of four beams at 30 degrees reads 15 % low."""
+    sound(told)
+    around = np.radians([45.0, 135.0, 225.0, 315.0])
+    beams = np.column_stack([0.5 * np.cos(around), 0.5 * np.sin(around), np.full(4, -math.sqrt(0.75))])
+    solved = np.linalg.pinv(beams)
+    for _, topic, _, message in told.rows:
+        if wrong and topic == DVL:
+            v = message.twist.twist.linear
+            v.x, v.y, v.z = (solved @ (beams @ [v.x, v.y, v.z] * [1.0, 0.85, 1.0, 1.0])).tolist()
+
+
 def quaternion_components_mixed_up(told: Told, wrong: bool) -> None:
     """An IMU driver that writes w, y, z, w in place of x, y, z, w."""
     sound(told)
@@ -217,6 +229,7 @@ SITUATIONS = {
     "one axis negated": Situation(
         told_by(one_axis_negated, long_motion), "DVL_LEFT_HANDED", "negate this axis in the DVL's driver"
     ),
+    "one beam low": Situation(told_by(one_beam_low, long_motion), "BEAM_OFF", "at 135°"),
     "quaternion components mixed up": Situation(
         told_by(quaternion_components_mixed_up), "GRAVITY_LEANS", "check the IMU's mounting in its driver"
     ),

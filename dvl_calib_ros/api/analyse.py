@@ -81,9 +81,11 @@ def diagnose(
     if rounds is not None or keep is not None:
         raise InputError("rounds, keep: only with simulator")
     from ..diagnosis.diagnose import diagnose as run
+    from ..examination.examine import rejection
 
     ((recording, discovery),) = sides
-    return run(recording, discovery.diagnosed, discovery.topics)
+    diagnosis = run(recording, discovery.diagnosed, discovery.topics)
+    return diagnosis.led_by(lambda: rejection(recording, discovery))
 
 
 def simulate(

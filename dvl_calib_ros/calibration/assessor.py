@@ -12,10 +12,11 @@ import numpy as np
 from ..verdict.reasons import Reason
 from .assessment.dead_reckoning import Navigation, SlowNoise, dead_reckoned, doubts, objections
 from .assessment.manoeuvre_planner import drift_left_open
+from .checks.beam_faults import BeamFault
 from .estimators.estimator import NEVER, Estimator, Rest
 from .filters.cross_validation import HeldOutError, Moments, calibration_error, folds_of
 from .filters.filter_setup import nis_bounds
-from .filters.observability import MEASURES_VERTICAL, convergence, observability
+from .filters.observability import MEASURES_TURNS, MEASURES_VERTICAL, convergence, observability
 from .models import MODELS, Model
 from .models.parameters import Parameters
 from .numerics.error_model import correction_matrix
@@ -151,7 +152,10 @@ class Assessor:
         n_days, p = len(terms[0]), self._estimates.parameters
         parts = folds_of(stamps_ns, p) * n_days + self._further.day_of(stamps_ns)
         corrections = [each for of_days in terms for each in of_days]
-        return dead_reckoned(recording, parts, corrections, p, epoch_ns, deviation, self._further.slow_noise)
+        further = self._further
+        return dead_reckoned(
+            recording, parts, corrections, p, epoch_ns, deviation, further.slow_noise, further.beam_fault
+        )
 
     def held_out_terms(self, name: str) -> list[list[Terms]]:
         """Return, per fold and day, one model's corrections estimated without that fold.
@@ -242,7 +246,7 @@ class Estimates:
 
         Roll and pitch need an IMU that measures them and a reference with vertical velocity, which the lever arm's
         height needs too. Roll alone is uncertain if the configured lever arm is contradicted: attitude of another time
-        causes both.
+        causes both. Without turn rates the lever arm is in the velocities, as roll, yaw and scale.
         """
         model, p = MODELS[estimate.model], self.parameters
         needs = ""
@@ -250,8 +254,9 @@ class Estimates:
             needs = "an IMU that measures roll and pitch"
         elif self.further.is_horizontal:
             needs = MEASURES_VERTICAL
-        unknown_axes = 0 if not model.aided else 2 if needs else int(self._finds_another_arm)
-        if not unknown_axes:
+        arm_effect_mps = self.further.arm_effect_mps
+        unknown_axes = 2 if needs else int(arm_effect_mps is not None or self._finds_another_arm)
+        if not model.aided or not unknown_axes:
             return estimate
         level = p.rotation_dvl_from_body[:, :unknown_axes]
         unknown = np.zeros((model.n_state, model.n_state))
@@ -259,13 +264,20 @@ class Estimates:
         if needs == MEASURES_VERTICAL and results.estimates_lever_arm(model):  # the height is not observable either
             height = model.state_names.index("lever_arm_z")
             unknown[height, height] = p.initial_std_lever_arm**2
+        kept = self.further.recording
+        if arm_effect_mps and kept is not None:
+            speed = np.sqrt((kept[0].dvl.velocity ** 2).sum(axis=1).mean())
+            ahead, up = p.rotation_dvl_from_body[:, 0], p.rotation_dvl_from_body[:, 2]
+            by_arm = arm_effect_mps / speed * np.column_stack([[*up, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, *ahead**2]])
+            of_state = np.linalg.pinv(model.error_terms_from_state) @ by_arm
+            unknown += of_state @ of_state.T
         own = estimate.velocity_covariance + unknown
         return replace(
             estimate,
             covariance=estimate.covariance + unknown,
             recording_covariance=estimate.recording_covariance + unknown,
             convergence=convergence(model, own, p),
-            observability=observability(model, own, p, needs),
+            observability=observability(model, own, p, needs or ("" if arm_effect_mps is None else MEASURES_TURNS)),
         )
 
     @property
@@ -321,6 +333,11 @@ class NonlinearEstimators:
         return any(each.is_level for each in self._all)
 
     @property
+    def arm_effect_mps(self) -> float | None:
+        """Velocity error (σ) by an unknown lever arm where turn rates are unknown; None where they are known."""
+        return self._first(lambda each: each.arm_effect_mps)
+
+    @property
     def is_horizontal(self) -> bool:
         """Return whether no reference measures the vertical."""
         return any(each.is_horizontal for each in self._all)
@@ -363,6 +380,11 @@ class NonlinearEstimators:
     def slow_noise(self) -> SlowNoise | None:
         """Slow errors of reference and attitude as estimated; None if not estimated."""
         return self._first(lambda each: each.slow_noise)
+
+    @property
+    def beam_fault(self) -> BeamFault | None:
+        """Most significant fault of one beam of the DVL; None if not tested."""
+        return self._first(lambda each: each.beam_fault)
 
     @property
     def n_days(self) -> int:

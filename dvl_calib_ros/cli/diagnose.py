@@ -56,7 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
     from ..diagnosis.diagnose import diagnose
     from ..diagnosis.model.recorded_streams import recording_names
     from ..disk.atomic import own_stream, save_all
+    from ..examination.examine import rejection
     from ..present import diagnosis as present
+    from ..verdict.kinds import Severity
 
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
@@ -83,6 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
             with_series=arguments.report is not None,
             forget=True,
         )
+    # opened again, as its messages are forgotten
+    diagnosis = diagnosis.led_by(lambda: rejection(common.opened(arguments.bags, parameters), discovery))
 
     written: list[str] = []
 
@@ -117,7 +121,8 @@ def run(arguments: argparse.Namespace) -> int:
         (arguments.twin, write_all_twins),
         (arguments.report, lambda path: write_report(path, diagnosis)),
     )
-    return int(diagnosis.verdict in (DiagnosisVerdict.UNKNOWN, DiagnosisVerdict.INSUFFICIENT_EXCITATION))
+    cannot = diagnosis.verdict in (DiagnosisVerdict.UNKNOWN, DiagnosisVerdict.INSUFFICIENT_EXCITATION)
+    return int(cannot or diagnosis.reasons[0].severity is Severity.REJECT)
 
 
 def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:

@@ -32,7 +32,7 @@ from ..messages.decode import DECLARED_FRAMES, EARTH_FRAMES, DeclaredFrame, fram
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.recording import Recording, open_recording
 from ..recordings.topic_preview import Look, Survey
-from ..recordings.topics import ORIENTATION, Topics
+from ..recordings.topics import NONE, ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
 from .axis_signs import sign_findings
@@ -150,18 +150,14 @@ class _Search:
             chosen, notes = topic_choice.choose_reference(self._seen, default.gnss, dvl, difference_of)
             gnss = chosen or default.gnss
             self._notes += notes
-        elif given.gnss_topic != topic_choice.NONE:
+        elif given.gnss_topic != NONE:
             gnss = self._named("gnss", given.gnss_topic) or gnss
         else:
-            gnss = topic_choice.NONE
+            gnss = NONE
         if given.imu_topic is None:
             imu = topic_choice.choose_imu(self._seen, default.imu, gnss) or default.imu
         else:
-            imu = (
-                topic_choice.NONE
-                if given.imu_topic == topic_choice.NONE
-                else self._named("imu", given.imu_topic) or imu
-            )
+            imu = NONE if given.imu_topic == NONE else self._named("imu", given.imu_topic) or imu
         if imu.endswith(ORIENTATION) and imu in self._seen.topics:
             self._found.append(
                 f"no IMU gives an attitude; it is the orientation of {imu.removesuffix(ORIENTATION)}, and turn rates "

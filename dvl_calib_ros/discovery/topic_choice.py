@@ -15,7 +15,6 @@ from ..verdict.reasons import Reason, finding
 if TYPE_CHECKING:
     from ..recordings.topic_preview import Look, Survey
 
-NONE = "none"
 DVL_WORDS = ("dvl", "doppler", "bottom_track", "bottomtrack", "a50", "a125", "wayfinder", "pathfinder", "nucleus")
 # Satellites first, then other navigation systems. A simulator's truth is equivalent to either.
 GNSS_WORDS = ("gnss", "gps", "navsat", "rtk", "ublox", "septentrio", "novatel", "fix", "nmea")

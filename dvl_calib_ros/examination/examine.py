@@ -32,7 +32,7 @@ from ..recordings.topic_messages import Recorded
 from ..recordings.topic_preview import Look
 from ..verdict.answering import Answering
 from ..verdict.kinds import Severity
-from ..verdict.reasons import Reason, finding, is_cause
+from ..verdict.reasons import Reason, finding, full, is_cause
 from . import topic_checks
 
 # a reference below this rate (Hz) interpolates turns by straight lines; 1 Hz receivers are a little slow at times
@@ -120,7 +120,7 @@ class Examination(Answering):
             return "There is no reference velocity: roll and scale stay unknown, and nothing can be verified."
         if self.cannot or self.verdict == "no":
             why = self.cannot or self.against[0].says
-            return f"{why[:1].upper()}{why[1:]}."
+            return full(why)
         missing = [each.name for each in self.shown if each.needs]
         listed = " and ".join(filter(None, (", ".join(missing[:-1]), *missing[-1:])))
         return f"Not shown yet: {listed}." if listed else ""
@@ -193,6 +193,16 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         reasons,
         cannot,
     )
+
+
+def rejection(recording: Recording, discovery: Discovery) -> Reason | None:
+    """Return the reason for which the calibration rejects a recording; None if it is usable."""
+    replayed, cannot = _replayed(recording, discovery)
+    if replayed is None:
+        return finding("CALIBRATION_REJECTS", says=cannot)
+    verification = replayed.result.verifications[replayed.result.selected]
+    is_rejected = verification.verdict is Severity.REJECT
+    return finding("CALIBRATION_REJECTS", says=verification.reasons[0]) if is_rejected else None
 
 
 def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | None, str]:

@@ -53,7 +53,7 @@ class DvlLog(NamedTuple):
     """DVL samples (forward-left-up) in order of time, and the number of unusable reports by reason.
 
     references, attitudes, waters: other samples in the log. notes: remarks in sentences. nominal_yaw: rad, of the DVL
-    in the body (forward-left-up), as configured in the instrument.
+    in the body of the attitudes (forward-left-up), as configured in the instrument; 0 if it has its own compass.
     """
 
     samples: list[DvlSample]
@@ -62,4 +62,4 @@ class DvlLog(NamedTuple):
     attitudes: Sequence[ImuSample] = ()
     notes: tuple[str, ...] = ()
     waters: Sequence[WaterReading] = ()
-    nominal_yaw: float = 0.0
+    nominal_yaw: float | None = None

@@ -201,7 +201,8 @@ def _read_pd0(path: Path, content: bytes) -> DvlLog:
             f"and {-degrees:+.2f}° is the nominal yaw of the DVL",
         )
     imu = imu_samples(stamps, rpy)
-    return DvlLog(samples, left_out + nmea.left_out, nmea.references(), imu, notes, waters, -alignment)
+    nominal_yaw = -alignment if alignment or (stamps and not nmea.headings()[0]) else None
+    return DvlLog(samples, left_out + nmea.left_out, nmea.references(), imu, notes, waters, nominal_yaw)
 
 
 def _pd0_attitudes(
@@ -219,8 +220,8 @@ def _pd0_attitudes(
     if not len(rpy) or not np.ptp(rpy, axis=0).any():  # no sensor: a constant setting
         return [], rpy[:0], ()
     note = (
-        f"{path}: heading, pitch and roll are from the DVL's own sensors; the heading is magnetic except for the "
-        "setting EB; give --attitude for another source"
+        f"{path}: heading, pitch and roll are from the DVL's own sensors; the heading is magnetic unless the "
+        "setting EB is the declination; give --attitude for another source"
     )
     return own, rpy, (note,)
 

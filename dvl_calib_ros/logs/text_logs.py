@@ -65,7 +65,7 @@ def read_pd6(path: Path, content: bytes) -> DvlLog:
     rpy = np.array([attitudes[at] for at in stamps]).reshape(-1, 3)
     note = f"{path}: heading, pitch and roll are from the DVL's own sensors; give --attitude for another source"
     own = imu_samples(stamps, rpy) if len(rpy) and np.ptp(rpy, axis=0).any() else []
-    return DvlLog(samples, left_out, (), own, (note,) if own else ())
+    return DvlLog(samples, left_out, (), own, (note,) if own else (), nominal_yaw=0.0 if own else None)
 
 
 def read_sentences(_: Path, content: bytes) -> DvlLog:

@@ -291,7 +291,7 @@ def import_recording(
         attitudes = (read_heading if names_columns(attitude, "heading") else read_attitude)(attitude, start_ns, notes)
     with BagWriter(output, options.storage, options.compression) as bag:
         writer = SampleWriter(bag)
-        if log.nominal_yaw:
+        if log.nominal_yaw is not None and (attitude is None or log.nominal_yaw):
             writer.nominal_yaw(log.samples[0].stamp_ns, log.nominal_yaw)
         writer.recording(attitudes, references, fixes, log.samples)
         waters = writer.water(log.waters)

@@ -35,7 +35,7 @@ from .far_stamps import without_far
 from .sample_columns import Stretch, stretches
 from .topic_messages import Recorded, recorded
 from .topic_preview import Survey, look_of
-from .topics import ORIENTATION, Topics, spelled
+from .topics import NONE, ORIENTATION, Topics, spelled
 
 TF_TYPE, STRING_TYPE = "tf2_msgs/msg/TFMessage", "std_msgs/msg/String"
 # static transforms and descriptions are few, so the first ones of a recording that repeats them are enough
@@ -499,7 +499,7 @@ def check_topics(recording: Recording, topics: Topics, found: list[Reason]) -> N
     _check_types(recording, topics, found)
     if not recording.counts[topics.dvl]:
         raise InputError(f"{where}: topic {topics.dvl} holds no messages; was the DVL on? Else set --dvl-topic")
-    if topics.gnss not in present:
+    if topics.gnss not in (*present, NONE):
         found.append(finding("BAG_NO_GNSS", topic=topics.gnss))
 
 

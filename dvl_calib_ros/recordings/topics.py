@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 # suffix that a topic of poses gets as a topic of orientations (recording.py)
 ORIENTATION = "/orientation"
+# Name of a topic that is to be ignored
+NONE = "none"
 
 
 @dataclass(frozen=True)

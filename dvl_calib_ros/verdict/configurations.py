@@ -234,6 +234,7 @@ CONFIGURATIONS = on_page(
     reject(
         "MOUNTING_CONTRADICTED",
         "DVL and reference do not agree with the mounting {given}; they do with {found}",
+        means="A heading without its magnetic declination (setting EB of an RDI) looks the same.",
         remedy="try -p mounting_rpy:={option}",
     ),
     reject(

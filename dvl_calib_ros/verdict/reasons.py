@@ -179,5 +179,7 @@ def _plain(value: object) -> object:
 
 
 def full(sentence: str) -> str:
-    """Return a sentence with a capital and a full stop."""
-    return f"{sentence[:1].upper()}{sentence[1:]}" + ("" if sentence.endswith((".", "?")) else ".")
+    """Return a sentence with a full stop, and a capital unless it begins with a name, such as a path."""
+    first = sentence.split(" ", 1)[0].rstrip(",:;.?'")
+    start = sentence[:1].upper() if first.replace("-", "").replace("'", "").isalpha() else sentence[:1]
+    return f"{start}{sentence[1:]}" + ("" if sentence.endswith((".", "?")) else ".")

@@ -43,7 +43,7 @@ VERDICTS = on_page(
         "MISALIGNMENT_LARGE",
         "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
         means="Seldom the bracket.",
-        remedy="is mounting_rpy right, and are the frames?",
+        remedy="are mounting_rpy, the frames and a compass's declination right?",
     ),
     reject(
         "SCALE_LARGE",
@@ -286,6 +286,11 @@ DIAGNOSES = on_page(
     marginal(
         "GAP_NOT_TESTABLE",
         "this recording cannot rule out a gap: only {visible} of {tested} effects would have been found in it",
+    ),
+    reject(
+        "CALIBRATION_REJECTS",
+        "the calibration rejects this recording: {says}",
+        means="The diagnosis fits a mounting and a scale, which may absorb the error.",
     ),
     marginal(
         "GAP_TOO_SHORT",

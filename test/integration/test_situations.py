@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 import pytest
+import stacks
 from scipy.spatial.transform import Rotation
-from situations import SITUATIONS, contradicts
-from stacks import true_mounting
+from situations import DVL, SITUATIONS, contradicts, long_motion, sound
+from stacks import ODOMETRY, TWIST, Told, true_mounting
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.filters.observability import body_angle_std
@@ -42,6 +43,43 @@ def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_t
     errors_deg, std_deg = errors_of(calibration, situation.yaw_deg)
     assert (errors_deg < np.maximum(3.0 * std_deg, RIGHT_DEG)).all(), (errors_deg, std_deg)
     assert std_deg[2] < YAW_STD_DEG
+
+
+@pytest.mark.slow
+def test_doctor_replay_and_diagnose_begin_with_one_cause(tmp_path):
+    """`diagnose` said no_gap, as it fits a mounting of any size."""
+    told = Told(motion=long_motion())
+    sound(told, yaw=math.radians(-135.0), said_yaw=math.radians(135.0))
+    bag = told.write(tmp_path / "bag")
+    calibration = dc.replay(bag, history=False)
+    first, *_ = calibration.replayed.result.verifications[calibration.model].reasons
+    assert first.code == "MOUNTING_CONTRADICTED" and dc.doctor(bag).reasons[0] == first
+    diagnosis = dc.diagnose(bag)
+    assert diagnosis.verdict.value == "no_gap" and diagnosis.reasons[0].code == "CALIBRATION_REJECTS"
+    assert diagnosis.reasons[0].causes == (first,)
+    assert diagnosis.sentence.startswith("The calibration rejects this recording: DVL and reference do not agree")
+
+
+def test_a_reference_that_is_to_be_ignored_is_not_missed(tmp_path):
+    told = Told()
+    sound(told)
+    calibration = dc.replay(told.write(tmp_path / "bag"), history=False, gnss_topic="none")
+    assert "BAG_NO_GNSS" not in {each.code for each in calibration.findings}
+
+
+@pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), (0.3, 0.0, -0.5), (1.0, 0.0, 0.0)])
+def test_without_turn_rates_sigma_includes_what_a_lever_arm_makes(tmp_path, monkeypatch, arm):
+    """Of an INS's body velocity alone roll was 7.2° ± 1.6 for 0.7, and yaw 3.9° ± 0.3 for 1.5."""
+    monkeypatch.setattr(stacks, "LEVER_ARM", arm)
+    told = Told(motion=long_motion())
+    told.dvl(DVL, TWIST, "dvl_link")
+    told.reference("/ins/odometry", ODOMETRY, "base_link", "body", std=0.02)
+    calibration = dc.replay(told.write(tmp_path / "bag"), history=False)
+    errors_deg, std_deg = errors_of(calibration, 0.0)
+    assert (errors_deg < 3.0 * std_deg).all(), (errors_deg, std_deg)
+    roll, pitch, *_ = calibration.replayed.result.estimate.observability
+    assert "turn rate" in roll.missing and pitch.observed
+    assert (calibration.verdict == "accept") == (not any(arm)), calibration.reasons
 
 
 def errors_of(calibration, yaw_deg):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
+from ..checks.beam_faults import BeamFault
 from ..checks.data_warnings import one_heading_warnings
 from ..checks.heading_deviation import HeadingDeviation, heading_deviation, heading_warnings, severity_of
 from ..checks.lever_arm_check import lever_arm_warnings
@@ -115,6 +116,8 @@ class Navigation:
         Heading deviation; None if not significant.
     followed
         Signals that the residual velocity follows; None without attitude, or for too little data.
+    beam
+        Most significant fault of one beam; None if not tested.
     """
 
     distance_m: float
@@ -134,6 +137,7 @@ class Navigation:
     error_after: Array
     deviation: HeadingDeviation | None = None
     followed: ResidualTrend | None = None
+    beam: BeamFault | None = None
 
     @property
     def speed(self) -> float:
@@ -157,11 +161,12 @@ def dead_reckoned(
     epoch_ns: int = 0,
     heading: GaussianState | None = None,
     slow: SlowNoise | None = None,
+    beam: BeamFault | None = None,
 ) -> Navigation | None:
     """Compare the track of the DVL, uncorrected and corrected, with the reference; None without reference or motion.
 
     folds: (N,) index into `terms` of each DVL sample's correction. epoch_ns: stamp of the recording's time 0. heading:
-    see `Estimate.heading_deviation`. slow: None if not estimated.
+    see `Estimate.heading_deviation`. slow, beam: None if not estimated.
     """
     if len(recording.dvl.times) < 2 or len(recording.reference.times) < 2:
         return None
@@ -204,6 +209,7 @@ def dead_reckoned(
         error_after=after.in_body[use[kept]],
         deviation=heading_deviation(after.yaw[use], heading) if on_a_map and heading is not None else None,
         followed=_followed(recording, after, use, parameters) if on_a_map else None,
+        beam=beam,
     )
 
 
@@ -252,8 +258,7 @@ def _followed(recording: ThinnedRecording, after: _Level, use: Index, p: Paramet
     if np.isnan(rates).any():
         return None
     interval_s = float(median(np.diff(recording.reference.times)))
-    times, nominal = recording.dvl.times[use], p.rotation_dvl_from_body
-    return residual_trend(times, rotation, velocity, error, rates, interval_s, nominal)
+    return residual_trend(recording.dvl.times[use], rotation, velocity, error, rates, interval_s)
 
 
 def integration_steps(times: Array) -> Array:
@@ -385,10 +390,13 @@ def doubts(
         found.append(heading_warnings(navigation.deviation).weighed(severity_of(navigation.deviation, estimate)))
     if in_earth and bed is None:
         found += one_heading_warnings(estimate, parameters, navigation.speed)
+    # the first-order model of a misalignment makes a velocity longer, which looks like one beam
+    is_large = float(np.linalg.norm(estimate.state[:3])) > parameters.reject_misalignment
     return found + residual_warnings(
         navigation.followed,
         are_positions(parameters),
         reference_lag_s(estimate, parameters),
         is_insignificant(estimate),
         std_along(estimate, parameters),
+        None if is_large else navigation.beam,
     )

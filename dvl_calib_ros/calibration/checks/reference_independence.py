@@ -32,10 +32,11 @@ EVEN, NEAR = 0.25, 0.6
 LEAST_NOISE_MPS = 1e-4
 # Stretches needed, differences per stretch (three axes), and samples per stretch of a slow reference.
 ENOUGH, FEWEST, FEWEST_SLOW = 12, 30, 12
-# Share of the noise that is reported, and its significance in σ of the stretches' scatter.
-SHARED_FROM, SURE_FROM = 0.1, 4.0
-# The same with the vehicle's steps as estimated instead of at their upper limit.
-PASSED_FROM, PASSED_SURE_FROM = 0.06, 4.5
+# Share of the noise that is reported, and its significance in σ of the stretches' scatter, of 13 shifts. A filter that
+# smooths passes little noise on.
+SHARED_FROM, SURE_FROM = 0.06, 4.0
+# Significance in σ (0.6 % one-sided) of random steps of the vehicle; below it, its motion is taken to be smooth.
+STEPS_FROM = 2.5
 # Smallest share of noise in the differences; with less they are motion.
 LEAST_SHARE = 0.3
 # Largest correlation of differences without a common sample; vibration has more.
@@ -107,15 +108,12 @@ class SharedNoise:
         std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0) / (n - 1.0))
         best = int(np.argmax(np.where(self._stretches >= ENOUGH, mean[:, 0], -math.inf)))
         c_4, v_4, steps = mean[best].tolist()
-        passed, own = c_4 - max(steps, 0.0), v_4 - max(steps, 0.0)
-        if own > LEAST_SHARE * v_4 and passed > max(PASSED_FROM * own, PASSED_SURE_FROM * float(std[best, 0])):
-            return passed / own  # a smoothing filter passes little noise on and adds little, so this test is sensitive
-        steps = max(steps, 0.0) + 2.0 * float(std[best, 2])
-        noise = v_4 - steps
-        if noise < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
+        if steps < STEPS_FROM * float(std[best, 2]):
+            steps = 0.0
+        passed, own = c_4 - steps, v_4 - steps
+        if own < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
             return 0.0
-        sure = c_4 - steps - SHARED_FROM * noise > SURE_FROM * float(std[best, 0])
-        return (c_4 - steps) / noise if sure else 0.0
+        return passed / own if passed > max(SHARED_FROM * own, SURE_FROM * float(std[best, 0])) else 0.0
 
     def contradiction(self) -> Reason | None:
         """Return the reason if the reference contains the DVL's noise."""

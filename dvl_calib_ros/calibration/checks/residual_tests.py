@@ -1,10 +1,9 @@
 """Tests whether the residual velocity follows a signal that no mounting makes.
 
-The residual is the reference minus the corrected DVL. Least squares tests it against four signals, together with all
+The residual is the reference minus the corrected DVL. Least squares tests it against three signals, together with all
 errors that a calibration may leave. If it follows tilt, the DVL's velocity does not rotate with the IMU's attitude (a
 driver that levels it, a wrong sign). If it is constant at every speed, the DVL has a bias. If it follows the second
-derivative of the velocity, one of the two is smoothed. If it follows the velocity along one beam, that beam has a scale
-error. All four bias the angles beyond their σ.
+derivative of the velocity, one of the two is smoothed. All three bias the angles beyond their σ.
 
 If it follows the DVL's earlier noise, the reference is a filter's output with that DVL as input. With d = s + n of the
 DVL and r = s + m of an independent instrument, r - d = m - n, and no earlier d predicts white noise n. A filter that
@@ -29,6 +28,7 @@ from ..numerics.frames import Array, cross, skew
 from ..numerics.robust import median, robust_std
 from ..numerics.samples import Index
 from ..results.results import ARM, OFFSETS, Estimate
+from .beam_faults import BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
 
 # Time constants, s, between which a change of tilt is the vehicle's; slower ones may be the IMU's error.
@@ -70,10 +70,6 @@ WRONG_SIGN_FROM = 1.6
 SAID_FROM, WRONG_FROM, WITHIN = math.radians(0.2), math.radians(0.5), 2.0
 # Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
-# Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
-BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
-# Error of the velocity ahead (share of the speed) by a beam, from which it is reported, and rejected: 10 m per km.
-BEAM_SAID_FROM, BEAM_WRONG_FROM = 0.005, 0.01
 # Residual, relative to the median, beyond which it is an outlier; number of iterations.
 OUTLYING, ROUNDS = 4.0, 3
 # Smallest noise of the residual, m/s.
@@ -105,8 +101,7 @@ class ResidualTrend(NamedTuple):
     wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
     of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
     circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: memory, s, the most
-    significant of `FORGOTTEN_S`. beam, beam_std: share by which one beam reads low; beam_deg: its azimuth in the DVL;
-    beam_off: error of the mean velocity by it, as a share of the speed. over_ground, over_ground_std: (2,) m/s,
+    significant of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s,
     reference minus DVL, east and north, on every heading; 0 if the residual holds less than half of it. turned,
     turned_std: rad, change of the heading error from start to end.
     """
@@ -124,10 +119,6 @@ class ResidualTrend(NamedTuple):
     circular_s: float
     over_ground: Array
     over_ground_std: Array
-    beam: float
-    beam_std: float
-    beam_deg: float
-    beam_off: float
     turned: float
     turned_std: float
 
@@ -135,14 +126,13 @@ class ResidualTrend(NamedTuple):
 class _Fit(NamedTuple):
     """Fit of the residual: x (n,) with σ from the scatter of stretches, and P (n, n) of the noise alone.
 
-    weight: (N,). rest: (N, 3) residual. starts: of the stretches.
+    weight: (N,). starts: of the stretches.
     """
 
     x: Array
     std: Array
     p: Array
     weight: Array
-    rest: Array
     starts: Index
 
     def seen_of(self, columns: Array, values: Array) -> float:
@@ -157,7 +147,6 @@ def residual_trend(
     error: Array,
     rates: Array,
     interval_s: float = 0.0,
-    rotation_dvl_from_body: Array | None = None,
 ) -> ResidualTrend | None:
     """Fit the residual velocity; None for too little data.
 
@@ -168,7 +157,6 @@ def residual_trend(
     velocity, error: (N, 3) m/s, of the reference, and reference minus corrected DVL, body.
     rates: (N, 3) rad/s, body.
     interval_s: sample interval of the reference, which is interpolated linearly, s.
-    rotation_dvl_from_body: (3, 3) nominal mounting; None for the unit matrix.
     """
     if len(time) < 3 or time[-1] - time[0] < ENOUGH * STRETCH_S:
         return None
@@ -233,7 +221,6 @@ def residual_trend(
     return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
         *_circular(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
-        *_beam(fast, both, moving, np.eye(3) if rotation_dvl_from_body is None else rotation_dvl_from_body),
         float(slow.x[-4]), float(slow.std[-4]),
     )  # fmt: skip
 
@@ -248,36 +235,6 @@ def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> A
     known[:, :, 10:13] = body_from_enu
     known[:, :, 13] = cross(moving, body_from_enu[:, :, 2])
     return known
-
-
-def _beam(fit: _Fit, columns: Array, moving: Array, rotation_dvl_from_body: Array) -> tuple[float, float, float, float]:
-    """Return the last four values of `ResidualTrend`, of the most significant beam that matters on a straight course.
-
-    The velocity is the least-squares solution of four beams. A beam that reads high looks like the opposite one that
-    reads low, but for scales. columns: (N, 3, n) of the fit. moving: (N, 3) m/s, body.
-    """
-    t, weight, found = rotation_dvl_from_body, fit.weight, []
-    flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)
-    few, mean = of_few(np.array([len(fit.starts) - 1.0]))[0], moving.mean(axis=0)
-    # the noise of the DVL, which is in `moving` as well, looks like a beam in signals that are smaller
-    noise = float(np.einsum("n,ni,ni->", weight, fit.rest, fit.rest))
-    for degrees in AZIMUTHS_DEG:
-        along = math.radians(degrees)
-        beam = np.array([flat * math.cos(along), flat * math.sin(along), -down])
-        solution = beam / [2.0 * flat**2, 2.0 * flat**2, 4.0 * down**2]
-        low = moving @ (t.T @ np.outer(solution, beam) @ t).T
-        alone = low - columns @ (fit.p @ np.einsum("n,nij,ni->j", weight, columns, low))
-        square = float(np.einsum("n,ni,ni->", weight, alone, alone))
-        if square <= noise:
-            continue
-        share = float(np.einsum("n,ni,ni->", weight, alone, fit.rest)) / square
-        rest = fit.rest - share * alone
-        scores = np.add.reduceat(weight * (alone * rest).sum(axis=1), fit.starts) / square
-        std = few * float(_std(scores[None], QUICK_STRETCHES)[0])
-        off = abs(share) * float(np.linalg.norm(low.mean(axis=0))) / max(float(np.linalg.norm(mean)), 1e-6)
-        if off > BEAM_SAID_FROM:
-            found.append((abs(share), std, (degrees + 180.0 * (share < 0.0)) % 360.0, off))
-    return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0, 0.0))
 
 
 def _beside(time: Array, values: Array, starts: Index) -> Array:
@@ -344,6 +301,7 @@ def residual_warnings(
     lag_s: float = 0.0,
     is_nil: bool = False,
     along: Sequence[float] | Array = (0.0, 0.0, 0.0),
+    beam: BeamFault | None = None,
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
@@ -378,11 +336,8 @@ def residual_warnings(
             said.append(found_tilt.weighed(word))
         elif std > TILT_SHOWN and abs(float(found.lean[axis])) > WRONG_FROM:
             said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
-    if found.beam > SURELY_BIASED * found.beam_std and found.beam_off > BEAM_SAID_FROM:
-        is_clear = found.beam > SURELY_SMOOTHED * found.beam_std  # slow errors may look like one of the eight beams
-        word = Severity.REJECT if is_clear and found.beam_off > BEAM_WRONG_FROM else Severity.MARGINAL
-        percent, std = 100.0 * found.beam, 100.0 * found.beam_std
-        said.append(finding("BEAM_OFF", percent=percent, std=std, azimuth=found.beam_deg).weighed(word))
+    if all(each.severity is Severity.WARNING for each in said):  # a wrong tilt looks like a beam
+        said += beam_warning(beam)
     # the heading at either end, relative to its mean
     off = 0.5 * abs(found.turned)
     if off > SAID_FROM and off > 0.5 * SURELY * found.turned_std:
@@ -439,7 +394,7 @@ def _fitted(
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
     beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
     std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T, together)
-    return _Fit(x, np.sqrt(std**2 + (beside**2).sum(axis=1)), p, weight, rest, starts)
+    return _Fit(x, np.sqrt(std**2 + (beside**2).sum(axis=1)), p, weight, starts)
 
 
 def _std(scatter: Array, together: Sequence[int]) -> Array:

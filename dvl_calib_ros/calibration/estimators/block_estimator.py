@@ -19,6 +19,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..assessment.dead_reckoning import SlowNoise
 from ..assessment.model_selection import Evidence
+from ..checks.beam_faults import BeamFault
 from ..filters.cross_validation import FOLDS, HeldOutError, Moments
 from ..filters.filter_bank import ModelCounts
 from ..filters.filter_setup import prior
@@ -37,6 +38,7 @@ from .block_preprocessing import MARGIN_NS, Block, DvlSamples, ImuSamples, Refer
 from .block_solver import BlockSolver, Outcome
 from .estimator import AtOnce, Estimator, EstimatorSetup, Rest
 from .full_forward_model import deviation_of
+from .slow_errors import Priors
 
 BLOCK_NS = 10_000_000_000  # length of a block
 # Time after which the DVL's rate is known, ns; memory is then reserved for this multiple of its samples.
@@ -192,6 +194,12 @@ class FullEstimator(Estimator):
     def is_level(self) -> bool:
         """See `Estimator`."""
         return self._idle_solver().is_level
+
+    @property
+    def arm_effect_mps(self) -> float | None:
+        """See `Estimator`: a mean turn adds as much to the mean error as turns add to the slow errors."""
+        slow = None if self._idle_solver().has_imu else self.slow_noise
+        return None if slow is None else math.sqrt(max(slow.velocity**2 - Priors().horizontal.mean_square, 0.0))
 
     @property
     def is_horizontal(self) -> bool:
@@ -495,6 +503,11 @@ class FullEstimator(Estimator):
     def slow_noise(self) -> SlowNoise | None:
         """See `Estimator`."""
         return self._idle_solver().fit.slow_noise
+
+    @property
+    def beam_fault(self) -> BeamFault | None:
+        """See `Estimator`."""
+        return self._idle_solver().fit.beam_fault()
 
     def _idle_solver(self) -> BlockSolver:
         self._newest()

@@ -54,7 +54,10 @@ class Outcome(NamedTuple):
 
 
 class BlockSolver:
-    """Solver of blocks in order. restarted: number of fits that diverged. kept: streams for verification, or None."""
+    """Solver of blocks in order. restarted: number of fits that diverged. kept: streams for verification, or None.
+
+    has_imu: whether any IMU sample came.
+    """
 
     def __init__(
         self,
@@ -75,7 +78,7 @@ class BlockSolver:
         self.fit = JointFit(parameters, prior, unknown)
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
-        self._has_imu = False
+        self.has_imu = False
         self._seen_ahead = self._seen_upwards = False  # whether references measure these body axes
         self._dvl_stream = DvlStream()
         self._turned = False
@@ -150,8 +153,8 @@ class BlockSolver:
             return self.outcome()
         self._spikes += streams.dvl_spikes
         self._look_at(streams)
-        self._has_imu = self._has_imu or len(streams.imu.times) > 0
-        if not self._has_imu and streams.reference.in_body.all():
+        self.has_imu = self.has_imu or len(streams.imu.times) > 0
+        if not self.has_imu and streams.reference.in_body.all():
             streams = streams._replace(imu=_as_if_still(streams.block, self.epoch_ns))
         if len(streams.dvl.times) < FEWEST_DVL or len(streams.imu.times) < 2:
             return self.outcome()

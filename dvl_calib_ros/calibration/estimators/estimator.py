@@ -18,6 +18,7 @@ import numpy as np
 from ...verdict.reasons import Reason
 from ..assessment.dead_reckoning import Navigation, SlowNoise
 from ..assessment.model_selection import NO_EVIDENCE, Evidence
+from ..checks.beam_faults import BeamFault
 from ..filters.cross_validation import HeldOutError, Moments, held_out_error
 from ..filters.filter_bank import Group, ModelCounts
 from ..filters.state_history import Counts, Numbers, StateTrace
@@ -105,6 +106,11 @@ class Estimator(ABC):
         return False
 
     @property
+    def arm_effect_mps(self) -> float | None:
+        """Velocity error (σ) by an unknown lever arm where turn rates are unknown; None where they are known."""
+        return None
+
+    @property
     def left_open(self) -> Array:
         """Part (n, n) of `of_recording`'s covariance due to the uncertain clock offset of the reference."""
         n = len(self.state().x)
@@ -123,6 +129,11 @@ class Estimator(ABC):
     @property
     def slow_noise(self) -> SlowNoise | None:
         """Slow errors of reference and attitude as estimated; None if not estimated."""
+        return None
+
+    @property
+    def beam_fault(self) -> BeamFault | None:
+        """Most significant fault of one beam of the DVL; None if not tested."""
         return None
 
     def rest(self, *, fresh: bool) -> Rest | None:

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..assessment.dead_reckoning import SlowNoise
+from ..checks.beam_faults import EFFECTS, BeamFault, most_significant
 from ..filters.cross_validation import FOLDS, HeldOutError
 from ..models.own import (
-    BIAS,
     DELAY,
     FULL,
     HEADING,
@@ -35,9 +35,9 @@ from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index
 from .full_delay_search import better_delay
-from .full_forward_model import FitBlock, predicted
+from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
 from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
-from .section_rows import GATE, SECTION_S, SectionRows, masked_median, section_starts, usual_square
+from .section_rows import GATE, SECTION_S, SectionRows, effects_gram, masked_median, section_starts, usual_square
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
 OF_DAY = FULL.of_day
@@ -273,8 +273,8 @@ class JointFit:
         return SlowNoise(horizontal, heading, float(self._fitted.weights @ self._slow.memory_s[:, 0]))
 
     def _by_day(self, state: GaussianState) -> list[GaussianState]:
-        each = (self._of_day(number) for number in range(len(self._days)))
-        return [_with_bias_in_mounting(state.x[at], state.p[np.ix_(at, at)]) for at in each]
+        days = map(self._of_day, range(len(self._days)))
+        return [with_bias_in_mounting(state.x[at], state.p[np.ix_(at, at)]) for at in days]
 
     def _of_day(self, number: int) -> Index:
         """Return the indices of one day's states (20,) among all states."""
@@ -310,9 +310,8 @@ class JointFit:
             while n > KEPT_BLOCKS and day.blocks:
                 block = day.blocks.pop(0)
                 n -= 1
-                until_s = block.end_s
                 before = day.before or [Chain.begun(self._slow)] * (1 + FOLDS)
-                while day.sections and day.begin_s < until_s - 1e-6:
+                while day.sections and day.begin_s < block.end_s - 1e-6:
                     section = day.sections.pop(0)
                     day.begin_s += section.seconds
                     before = [
@@ -433,11 +432,16 @@ class JointFit:
         self._fitted = self._mixture(ended, slice(None), self._climbs())
         self._x = self._fitted.state.x.copy()
 
-    def without_folds(self) -> list[list[GaussianState]]:
-        """Return, per fold, the states (20,) of every day from all other folds."""
+    @property
+    def _likeliest(self) -> slice:
+        """Likeliest point of the slow errors."""
         assert self._fitted is not None
         likeliest = int(np.argmax(self._fitted.weights))
-        points = slice(likeliest, likeliest + 1)
+        return slice(likeliest, likeliest + 1)
+
+    def without_folds(self) -> list[list[GaussianState]]:
+        """Return, per fold, the states (20,) of every day from all other folds."""
+        points = self._likeliest
         slow = self._slow.part(points)
         found = []
         for fold in range(FOLDS):
@@ -461,9 +465,8 @@ class JointFit:
         """
         if not self.has_data:
             return None
-        assert self._fitted is not None
-        likeliest = int(np.argmax(self._fitted.weights))
-        slow_variance, memory_s = self._slow.std[likeliest] ** 2, float(self._slow.memory_s[likeliest, 0])
+        slow = self._slow.part(self._likeliest)
+        slow_variance, memory_s = slow.std[0] ** 2, float(slow.memory_s[0, 0])
         sums, seconds = HeldOutSums(), 0.0
         for day in self._days:
             for block in day.blocks:
@@ -482,6 +485,25 @@ class JointFit:
                     sums.add(before, after, fold, state, day.single, slow_variance)
                     seconds += (block.end_s - block.from_s) * float(np.mean(block.fold == fold))
         return sums.error(seconds, memory_s)
+
+    def beam_fault(self) -> BeamFault | None:
+        """Return the most significant fault of one beam, by the residual of the blocks whose streams are kept."""
+        if not self.has_data:
+            return None
+        points, k = self._likeliest, len(EFFECTS)
+        own, of_state, _ = self._by_prior(points, math.inf, 0.0)
+        information, vector = np.pad(own[0], (0, k)), np.append(of_state[0], np.zeros(k))
+        velocity, effects = [], np.arange(len(vector) - k, len(vector))
+        for number, day in enumerate(self._days):
+            x = self._x[self._of_day(number)]
+            parts = [part for block in day.blocks for part in self._parts(block, x)]
+            if np.isfinite(day.white).all():
+                gram = effects_gram(parts, EFFECTS, x, day.single, day.white, self._slow.part(points))
+                at = np.append(self._of_day(number), effects)
+                information[np.ix_(at, at)] += gram[:-1, :-1]
+                vector[at] += gram[:-1, -1]
+                velocity += [part.rows.dvl for part in parts if part.rows is not None]
+        return most_significant(information, vector, np.concatenate(velocity).mean(axis=0)) if velocity else None
 
     def _climbs(self, without: int = -1) -> list[_Climb]:
         """Return the mean climb of every day that shows one. without: fold that is held out."""
@@ -571,20 +593,8 @@ class JointFit:
         scale[:, HEADING] = 1.0 / deviation[:, None]
         if offset_std:
             upwards = [int(self._of_day(number)[REFERENCE_ERROR][-1]) for number in range(len(self._days))]
-            own_std = self._parameters.reference_offset_std
-            scale[:, upwards] = min(1.0, own_std / offset_std)
+            scale[:, upwards] = min(1.0, self._parameters.reference_offset_std / offset_std)
         if self._arm_is_given:
             scale[:, LEVER_ARM] = np.maximum(np.sqrt(np.diag(self._prior.p)[LEVER_ARM]) / tape_std, 1.0)
         information *= scale[:, :, None] * scale[:, None]
         return information, vector * scale, -2.0 * np.log(scale).sum(axis=1)
-
-
-def _with_bias_in_mounting(x: Array, p: Array) -> GaussianState:
-    """Return the states x (20,), P (20, 20) of one day at zero DVL bias, with the bias's uncertainty in P.
-
-    Published velocities are not corrected for bias, so the mounting absorbs it (docs/models.md, "full: all unknowns in
-    one fit").
-    """
-    gain = p[:, BIAS] @ np.linalg.inv(p[BIAS, BIAS])
-    moved = gain @ x[BIAS]
-    return GaussianState(x - moved, p + np.outer(moved, moved))

@@ -119,7 +119,8 @@ class PredictedRows(NamedTuple):
 
     times: (J,) s. residual: (J, 3) m/s. columns: (J, 3, 20) derivatives of the prediction by the states. slow:
     (J, 3, 6) by the slow errors. weight: (J, 3) per axis. fold: (J,). up: (J, 21) derivatives of the DVL's velocity
-    upwards by the states, and that velocity (m/s); 0 without attitude. oriented: (J,) whether it has attitude.
+    upwards by the states, and that velocity (m/s); 0 without attitude. oriented: (J,) whether it has attitude. dvl:
+    (J, 3) m/s, mean of the DVL's velocities before and after, whose noise is not in the residual.
     """
 
     times: Array
@@ -130,11 +131,12 @@ class PredictedRows(NamedTuple):
     fold: NDArray[np.int64]
     up: Array
     oriented: Mask
+    dvl: Array
 
     def part(self, at: slice) -> PredictedRows:
         """Return the rows of a slice."""
-        t, r, c, s, w, f, u, o = self
-        return PredictedRows(t[at], r[at], c[at], s[at], w[at], f[at], u[at], o[at])
+        t, r, c, s, w, f, u, o, d = self
+        return PredictedRows(t[at], r[at], c[at], s[at], w[at], f[at], u[at], o[at], d[at])
 
 
 def spline_slopes(times: Array, values: Array) -> Array:
@@ -274,7 +276,9 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     slow[:, :, 3:] = -turn[:, :, None] * skew(predicted_velocity)
     residual = reference.velocity[use] - predicted_velocity - turn * x[REFERENCE_ERROR]
     weight = block.measured[use].astype(float)
-    return PredictedRows(reference.times[use], residual, columns, slow, weight, block.fold[use], up, oriented[use])
+    times, fold = reference.times[use], block.fold[use]
+    beside = 0.5 * (earlier + later)
+    return PredictedRows(times, residual, columns, slow, weight, fold, up, oriented[use], beside)
 
 
 def _about_up(angle: Array) -> Array:
@@ -290,3 +294,14 @@ def _about_up(angle: Array) -> Array:
 def deviation_of(state: GaussianState) -> GaussianState:
     """Return the heading deviation of a state x (20,), P (20, 20), see `Estimate.heading_deviation`."""
     return GaussianState(-state.x[HEADING], state.p[HEADING, HEADING])
+
+
+def with_bias_in_mounting(x: Array, p: Array) -> GaussianState:
+    """Return the states x (20,), P (20, 20) of one day at zero DVL bias, with the bias's uncertainty in P.
+
+    Published velocities are not corrected for bias, so the mounting absorbs it (docs/models.md, "full: all unknowns in
+    one fit").
+    """
+    gain = p[:, BIAS] @ np.linalg.inv(p[BIAS, BIAS])
+    moved = gain @ x[BIAS]
+    return GaussianState(x - moved, p + np.outer(moved, moved))

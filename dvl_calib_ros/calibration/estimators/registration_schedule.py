@@ -226,7 +226,14 @@ class KeptClocks:
             typical_error(recording, Terms.of_state(state.x), p),
             recording.judged(p),
             dead_reckoned(
-                recording, folds_of(stamps_ns, p), terms, p, told.epoch_ns, deviation_of(state), told.fit.slow_noise
+                recording,
+                folds_of(stamps_ns, p),
+                terms,
+                p,
+                told.epoch_ns,
+                deviation_of(state),
+                told.fit.slow_noise,
+                told.fit.beam_fault(),
             ),
             not recording.reference.in_body.any(),
         )

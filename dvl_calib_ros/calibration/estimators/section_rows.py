@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
+from ..models.own import BIAS
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from .full_forward_model import FitBlock, PredictedRows
-from .slow_errors import Bins, binned_rows
+from .slow_errors import Bins, Chain, SlowErrors, binned_rows, gram_of
 
 # Interval between knots of the slow errors, and length of bins of rows, s. A bin holds at least BIN_INTERVALS DVL
 # intervals.
@@ -32,6 +35,15 @@ class SectionRows:
             residual = np.where(rows.weight > 0.0, rows.residual, np.nan)
             self.level = masked_median(residual)
             self.left = residual - self.level
+
+    def with_effects(self, effects: Array) -> SectionRows:
+        """Return the rows with derivatives by effects E (k, 3, 3), by which the DVL's velocity v changes by -E v."""
+        assert self.rows is not None
+        # the velocity's error is a bias of -E v
+        more = -self.rows.columns[:, :, BIAS] @ np.einsum("kij,nj->nik", effects, self.rows.dvl)
+        whole = copy.copy(self)
+        whole._bins, whole.rows = None, self.rows._replace(columns=np.concatenate([self.rows.columns, more], axis=2))
+        return whole
 
     def misfit(self, single: Array) -> Array:
         """Return the squared deviation (J,) of rows from the median, in variances (3,) of single rows."""
@@ -58,6 +70,27 @@ class SectionRows:
             weight = np.minimum(1.0, GATE / np.maximum(self.misfit(single), 1e-9))
             self._bins = binned_rows(self.rows, weight, self.from_s, self.from_s + SECTION_S, self._bin_s)
         return self._bins
+
+
+def effects_gram(
+    parts: Sequence[SectionRows], effects: Array, x: Array, single: Array, white: Array, slow: SlowErrors
+) -> Array:
+    """Return the Gram matrix (21 + k, 21 + k) of a day over [states, effects, residual], without slow errors.
+
+    effects: (k, 3, 3), see `SectionRows.with_effects`. x: (20,) point of linearisation. single, white: (3,) variances.
+    """
+    k = len(effects)
+    chain, end_s = Chain.begun(slow, k), math.inf
+    for part in parts:
+        if part.from_s > end_s + 1e-6:
+            chain = chain.after(None, part.from_s - end_s, slow)
+        gram, end_s = None, part.from_s + SECTION_S
+        if part.rows is not None:
+            bins = part.with_effects(effects).bins(single)
+            gram = gram_of(bins, white, np.append(x, np.zeros(k)), part.slope_variance)
+        chain = chain.after(gram, SECTION_S, slow)
+    found: Array = chain.ended().gram[0]
+    return found
 
 
 def usual_square(values: Array) -> Array:

@@ -48,6 +48,11 @@ class LogNormal(NamedTuple):
     median: float
     factor: float
 
+    @property
+    def mean_square(self) -> float:
+        """Mean of the square."""
+        return self.median**2 * math.exp(2.0 * math.log(self.factor) ** 2)
+
 
 @dataclass(frozen=True)
 class Priors:
@@ -134,7 +139,7 @@ def gram_of(bins: Bins, variance: Array, x: Array, slope_variance: float) -> Arr
     (20,), so that sections with different points of linearisation add.
     """
     rows = bins.rows * np.sqrt(bins.weight / variance)[:, :, None]
-    rows = rows.reshape(-1, WIDTH)
+    rows = rows.reshape(-1, rows.shape[2])
     delay = rows[:, _DELAY].copy()
     by_noise = NOISE_TWICE * slope_variance * float((bins.weight / variance).sum())
     share = 1.0 - by_noise / max(float(delay @ delay), 1e-300)
@@ -161,9 +166,10 @@ class Chain(NamedTuple):
     log_determinant: Array
 
     @staticmethod
-    def begun(slow: SlowErrors) -> Chain:
-        """Return the chain before the first section."""
-        gram = np.zeros((len(slow.std), SLOW + N_STATE + 1, SLOW + N_STATE + 1))
+    def begun(slow: SlowErrors, more: int = 0) -> Chain:
+        """Return the chain before the first section. more: number of columns tested in addition to the states."""
+        width = SLOW + N_STATE + more + 1
+        gram = np.zeros((len(slow.std), width, width))
         gram[:, np.arange(SLOW), np.arange(SLOW)] = slow.std**-2.0
         return Chain(gram, 2.0 * np.log(slow.std).sum(axis=1))
 
@@ -173,10 +179,11 @@ class Chain(NamedTuple):
 
     def after(self, gram: Array | None, seconds: float, slow: SlowErrors) -> Chain:
         """Return the chain with one more section (WIDTH, WIDTH) of this length; None for a section without rows."""
-        own, first, rest = np.arange(SLOW), slice(SLOW), slice(2 * SLOW, WIDTH)
+        width = self.gram.shape[1] + SLOW
+        own, first, rest = np.arange(SLOW), slice(SLOW), slice(2 * SLOW, width)
         memory = np.exp(-seconds / slow.memory_s)
         driven = slow.std**2 * (1.0 - memory**2)
-        joint = np.zeros((len(self.gram), WIDTH, WIDTH))
+        joint = np.zeros((len(self.gram), width, width))
         if gram is not None:
             joint += gram
         joint[:, first, first] += self.gram[:, :SLOW, :SLOW]

@@ -27,6 +27,7 @@ FINE_STD = {"m": 0.05, "s": 0.01}
 _BODY_AXES = ("roll", "pitch", "yaw")
 # Requirement of roll and pitch on a reference.
 MEASURES_VERTICAL = "a reference that measures the vertical velocity"
+MEASURES_TURNS = "an IMU that measures the turn rate, by which the lever arm is estimated"
 
 
 class Convergence(Enum):

@@ -10,6 +10,8 @@ from ..numerics.frames import Array
 
 # Noise from which velocities derived from positions are useless, m/s.
 NOISY_MPS = 0.3
+# Factors of the second, fourth and sixth difference in the inverse of a mean (arcsine series).
+SERIES = -1.0 / 24.0, 3.0 / 640.0, -5.0 / 7168.0
 
 
 def are_positions(parameters: Parameters) -> bool:
@@ -29,15 +31,23 @@ def check_model(parameters: Parameters) -> None:
 def of_moments(times: Array, velocity: Array, window_s: float) -> Array:
     """Correct mean velocities (N, 3) m/s over windows to those at the middles (N,) s of the windows.
 
-    The mean attenuates waves in proportion to their curvature, which on a circle looks like a delay.
+    The mean attenuates a wave of frequency f by sin(x) / x with x = π f window_s, which on a circle looks like a delay.
+    The inverse is a series in differences over the window: x / sin(x) = arcsin(s) / s with s = sin(x).
     """
     if len(times) < 2:
         return velocity
-    bend = -2.0 * velocity
     known = np.ones(len(times), dtype=bool)
+    sides = []
     for asked in (times - window_s, times + window_s):
         after = np.clip(np.searchsorted(times, asked), 1, len(times) - 1)
         # no correction beyond an end and across an outage
         known &= (asked >= times[0]) & (asked <= times[-1]) & (times[after] - times[after - 1] <= 1.5 * window_s)
-        bend = bend + np.stack([np.interp(asked, times, axis) for axis in velocity.T], axis=1)
-    return velocity - np.where(known[:, None], bend, 0.0) / 24.0
+        sides.append(asked)
+    found, bend = velocity.copy(), velocity
+    for factor in SERIES:
+        around = sum(np.column_stack([np.interp(asked, times, axis) for axis in bend.T]) for asked in sides)
+        bend = np.where(known[:, None], around - 2.0 * bend, 0.0)
+        found += factor * bend
+        # the next difference needs this one on both sides
+        known = known & np.all([np.interp(asked, times, known) > 0.99 for asked in sides], axis=0)
+    return found

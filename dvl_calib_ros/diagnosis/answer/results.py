@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
@@ -84,6 +84,11 @@ class Diagnosis(Answering):
     twins: tuple[Twin, ...] = ()
     dvl: DvlSeen | None = None
     selection: EffectSelection | None = field(default=None, repr=False, compare=False)
+
+    def led_by(self, rejection: Callable[[], Reason | None]) -> Diagnosis:
+        """Return a diagnosis without a gap that begins with the calibration's reason against the recording, if any."""
+        first = rejection() if self.verdict is DiagnosisVerdict.NO_GAP else None
+        return self if first is None else replace(self, reasons=(first, *self.reasons))
 
     @property
     def sentence(self) -> str:

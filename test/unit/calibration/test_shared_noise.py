@@ -116,3 +116,14 @@ def test_a_filter_that_smooths_is_told_by_what_it_passes_on(tau):
     reference = np.column_stack([np.interp(reference_times, times, column) for column in kept.T])
     found = judged(times, dvl, reference_times, reference + rng.normal(0.0, 0.003, reference.shape))
     assert found.contradiction().code == "REFERENCE_HOLDS_DVL"
+
+
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_a_filter_that_weighs_the_dvl_as_much_as_a_noisy_receiver_is_told(seed):
+    """Yaw 2.0° ± 0.4 for 4.0 was accepted."""
+    times, dvl, _, _ = streams(seed=seed)
+    own = motion(times) + np.random.default_rng(40 + seed).normal(0.0, 0.1, dvl.shape)
+    kept = 0.5 * (dvl + own)
+    for at in range(1, len(kept)):
+        kept[at] = 0.5 * (kept[at - 1] + kept[at])
+    assert judged(times, dvl, times + 0.004, kept).contradiction().code == "REFERENCE_HOLDS_DVL"

@@ -184,6 +184,18 @@ def test_an_import_hands_on_the_nominal_yaw_and_no_place(tmp_path, capsys):
     assert any("mounting 0° 0° -47°: dvl_link in base_link, from /robot_description" in each for each in found.found)
 
 
+def test_a_dvl_with_its_own_compass_has_no_yaw_in_the_body_of_that_compass(tmp_path, capsys):
+    """A magnetic declination of 12 degrees was found as a mounting of -12.0° ± 0.3."""
+    log, attitudes = tmp_path / "dive.pd0", ((0, 0, 0), (4500, 100, -100))
+    log.write_bytes(b"".join(ensemble((0, -1500, 0), i, 1, attitude=attitudes[i % 2]) for i in range(20)))
+    assert read_dvl_log(log).nominal_yaw == 0.0
+    succeed(capsys, "import", log, "-o", tmp_path / "bag")
+    assert discover([tmp_path / "bag"], Parameters()).values["mounting_rpy"] == (0.0, 0.0, 0.0)
+    without = tmp_path / "without.pd0"
+    without.write_bytes(b"".join(ensemble((0, -1500, 0), i, 1) for i in range(20)))
+    assert read_dvl_log(without).nominal_yaw is None
+
+
 def test_an_ensemble_that_ends_before_its_heading_is_a_velocity_and_no_damage(tmp_path):
     (tmp_path / "dive.pd0").write_bytes(ensemble((0, -1000, 0), 1, length=16) + ensemble((0, -1000, 0), 2))
     log = read_dvl_log(tmp_path / "dive.pd0")

@@ -23,6 +23,7 @@ from dvl_calib_ros.calibration.models.own import REFERENCE_DELAY_STD_S
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import corrected_mounting
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
+from dvl_calib_ros.calibration.numerics.samples import ImuSample
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.calibration.results.results import Result
 from dvl_calib_ros.disk.atomic import save_text
@@ -405,11 +406,13 @@ def test_files_that_are_no_result_file_are_refused(tmp_path):
 
 
 def test_a_filter_continued_from_a_file_ends_as_if_both_had_been_one(tmp_path):
-    samples = steady_run(400)
+    # without turn rates an unknown lever arm would be in sigma, and so in the prior of the second
+    run = steady_run(400)
+    samples = [each for one in run for each in (one, ImuSample(one.stamp_ns, None, (0.0, 0.0, 0.0)))]
     whole = estimates(write_bag(tmp_path / "whole", samples))
-    first = replayed(write_bag(tmp_path / "first", samples[:400])).result
+    first = replayed(write_bag(tmp_path / "first", samples[:800])).result
     save_text(tmp_path / "first.yaml", result_text(result_document(first)))
-    second = write_bag(tmp_path / "second", samples[400:])
+    second = write_bag(tmp_path / "second", samples[800:])
     continued = estimates(second, initial_calibration=str(tmp_path / "first.yaml"))
     for name, expected in whole.items():
         if MODELS[name].estimator:  # works in whole blocks, and each run has a rest

@@ -13,7 +13,7 @@ from conftest import ROOT
 from documentation import section
 
 from dvl_calib_ros.verdict.kinds import Kind, Severity
-from dvl_calib_ros.verdict.reasons import KINDS, TABLES, by_severity, finding, lookup, of_consequence
+from dvl_calib_ros.verdict.reasons import KINDS, TABLES, by_severity, finding, full, lookup, of_consequence
 
 PACKAGE = ROOT / "dvl_calib_ros"
 MODULES = [path for path in sorted(PACKAGE.rglob("*.py")) if path.parent.name != "verdict"]
@@ -134,3 +134,17 @@ def test_of_an_accepted_calibration_ambiguities_within_the_target_are_no_warning
     ]
     kept = of_consequence(said, 2.0)
     assert [said.index(each) for each in kept] == [1, 4, 5, 7]
+
+
+@pytest.mark.parametrize(
+    ("sentence", "said"),
+    [
+        ("bags/short_00: empty", "bags/short_00: empty."),
+        ("short_00: empty", "short_00: empty."),
+        ("/dvl: empty", "/dvl: empty."),
+        ("the DVL's z is negated", "The DVL's z is negated."),
+        ("doctor: is it on?", "Doctor: is it on?"),
+    ],
+)
+def test_a_sentence_begins_with_a_capital_unless_with_a_name(sentence, said):
+    assert full(sentence) == said

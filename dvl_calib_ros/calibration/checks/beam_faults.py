@@ -1,0 +1,83 @@
+"""Score test for one beam of the DVL that reads low or high, on the residual of `full`.
+
+The velocity is the least-squares solution of four beams, so a beam that reads low by a share s changes it by -s E v
+with E = (solution of that beam) (its direction)ᵀ. Misalignment and scale are parts of E that `full` estimates. The
+symmetric off-diagonal part is no mounting. Velocities before and after a sample stand for v, because its own noise is
+in the residual.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...verdict.kinds import Severity
+from ...verdict.reasons import Reason, finding
+from ..numerics.frames import Array
+
+# Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
+BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
+# Significance, in σ, of eight tests of one recording: false alarms of 0.3 % (said) and 0.02 % (rejected).
+SAID, SURELY = 3.4, 4.0
+# Error of the velocity ahead (share of the speed) from which a beam is reported: 10 m per km, the limit of acceptance.
+SAID_FROM = 0.01
+
+
+def _effects() -> Array:
+    """Return E (9, 3, 3): the scale of z as a nuisance, as noise of the DVL looks like it, and of each beam."""
+    flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)
+    effects = [np.diag([0.0, 0.0, 1.0])]
+    for degrees in AZIMUTHS_DEG:
+        along = math.radians(degrees)
+        beam = np.array([flat * math.cos(along), flat * math.sin(along), -down])
+        effects.append(np.outer(beam / [2.0 * flat**2, 2.0 * flat**2, 4.0 * down**2], beam))
+    return np.array(effects)
+
+
+EFFECTS: Array = _effects()
+
+
+class BeamFault(NamedTuple):
+    """Most significant beam.
+
+    share, std: by which it reads low. azimuth_deg: in the DVL. off: error of the mean velocity by it, as a share of the
+    speed.
+    """
+
+    share: float
+    std: float
+    azimuth_deg: float
+    off: float
+
+
+def most_significant(information: Array, vector: Array, mean: Array) -> BeamFault | None:
+    """Return the most significant beam that matters on a straight course; None without one.
+
+    Parameters
+    ----------
+    information, vector: (n, n), (n,) normal equations of states and `EFFECTS`, the latter in the last places.
+    mean: (3,) m/s, mean velocity in the DVL.
+    """
+    own = len(vector) - len(EFFECTS) + 1  # states and the nuisance
+    solved = np.linalg.solve(information[:own, :own], np.column_stack([information[:own, own:], vector[:own]]))
+    score = vector[own:] - information[own:, :own] @ solved[:, -1]
+    known = np.diag(information)[own:] - (information[own:, :own] * solved[:, :-1].T).sum(axis=1)
+    found = []
+    for degrees, effect, u, told in zip(AZIMUTHS_DEG, EFFECTS[1:], score.tolist(), known.tolist(), strict=True):
+        if told <= 0.0:
+            continue
+        off = abs(u / told) * float(np.linalg.norm(effect @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
+        if off > SAID_FROM:
+            found.append(BeamFault(abs(u) / told, told**-0.5, (degrees + 180.0 * (u < 0.0)) % 360.0, off))
+    return max(found, key=lambda each: each.share / each.std, default=None)
+
+
+def beam_warning(found: BeamFault | None) -> list[Reason]:
+    """Return the reason against a calibration by a DVL with a faulty beam."""
+    if found is None or found.share < SAID * found.std:
+        return []
+    word = Severity.REJECT if found.share > SURELY * found.std else Severity.MARGINAL
+    percent, std = 100.0 * found.share, 100.0 * found.std
+    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(word)]
