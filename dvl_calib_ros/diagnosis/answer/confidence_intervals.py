@@ -9,6 +9,7 @@ import numpy as np
 
 from ...calibration.numerics.frames import Array
 from ...effects.base import MountingEffect
+from ..fit.cross_validation import coloured_anew, with_slow_noise
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.parametric_bootstrap import simulated_recordings
 from ..fit.selection_criteria import NuisanceFit, blocks_of
@@ -23,6 +24,8 @@ Times = dict[tuple[str, int, str], Triple]
 # Number of simulated recordings. Thresholds of significance: of the mean error, in σ; of the relative scatter, exceeded
 # by chance in one of thirty such sets
 MADE_UP, OFF_BY, SCATTER = 12, 1.0, 1.35
+# Recordings of slower noise
+DRAWN = 100
 # True motion between samples lies between fitted and simulated interpolation: half of their difference counts
 HALF_WAY = 0.5
 
@@ -31,7 +34,7 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     """Return the covariance (6 + p, 6 + p) of a selection, and effects' times with 95 per cent intervals. Times are by
     effect, recording and name."""
     fitter, fit = selection.fitter, selection.fit
-    covariance = fit.covariance(blocks_of(fitter.problem))
+    covariance = _with_slower_noise(fitter.problem, fit, fit.covariance(blocks_of(fitter.problem)))
     if not selection.selected:
         return covariance, {}
     covariance = with_unshown_turns(fitter.problem, fit, _with_samples(fitter, fit, covariance))
@@ -44,6 +47,20 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
                 times[effect.name, recording, spec.name] = found
                 covariance = covariance + fitter.moved_by_time(fit, effect, spec.name, recording, found[1:])
     return covariance, times
+
+
+def _with_slower_noise(problem: Problem, fit: Fit, covariance: Array) -> Array:
+    """Inflate a covariance (n, n) to the scatter of the estimate under noise that lasts as the residual says.
+
+    The fit's own noise is bounded in memory, so that no effect is taken for it, and blocks are shorter than multipath.
+    """
+    known = NuisanceFit.of_fit(problem, fit)
+    slower = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)[0]
+    rng = np.random.default_rng(0)
+    drawn = np.stack([slower.unwhiten(rng.standard_normal(fit.residual.size)) for _ in range(DRAWN)], axis=2)
+    steps = fit.system.covariance() @ fit.noise.whiten(fit.columns).T @ fit.noise.whiten(drawn)
+    grown = np.sqrt(np.maximum((steps**2).mean(axis=1) / np.diag(covariance), 1.0))
+    return np.asarray(covariance * np.outer(grown, grown))
 
 
 def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
