@@ -24,6 +24,9 @@ SAID, SURELY = 3.4, 4.0
 # Error of the velocity ahead (share of the speed) from which a beam is reported: 10 m per km, the limit of acceptance.
 SAID_FROM = 0.01
 
+# Prior σ of the nuisance, the scale of z.
+Z_SCALE_STD = 1.0
+
 
 def _effects() -> Array:
     """Return E (9, 3, 3): the scale of z as a nuisance, as noise of the DVL looks like it, and of each beam."""
@@ -61,7 +64,9 @@ def most_significant(information: Array, vector: Array, mean: Array) -> BeamFaul
     mean: (3,) m/s, mean velocity in the DVL.
     """
     own = len(vector) - len(EFFECTS) + 1  # states and the nuisance
-    solved = np.linalg.solve(information[:own, :own], np.column_stack([information[:own, own:], vector[:own]]))
+    of_states = information[:own, :own].copy()
+    of_states[-1, -1] += Z_SCALE_STD**-2.0  # without a vertical reference nothing else does
+    solved = np.linalg.solve(of_states, np.column_stack([information[:own, own:], vector[:own]]))
     score = vector[own:] - information[own:, :own] @ solved[:, -1]
     known = np.diag(information)[own:] - (information[own:, :own] * solved[:, :-1].T).sum(axis=1)
     found = []

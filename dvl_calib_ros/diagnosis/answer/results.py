@@ -86,8 +86,9 @@ class Diagnosis(Answering):
     selection: EffectSelection | None = field(default=None, repr=False, compare=False)
 
     def led_by(self, rejection: Callable[[], Reason | None]) -> Diagnosis:
-        """Return a diagnosis without a gap that begins with the calibration's reason against the recording, if any."""
-        first = rejection() if self.verdict is DiagnosisVerdict.NO_GAP else None
+        """Return the diagnosis with the calibration's reason against the recording first, unless an effect is named."""
+        is_named = self.verdict not in (DiagnosisVerdict.NO_GAP, DiagnosisVerdict.UNKNOWN)
+        first = None if is_named else rejection()
         return self if first is None else replace(self, reasons=(first, *self.reasons))
 
     @property
