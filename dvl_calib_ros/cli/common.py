@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from ..errors import InputError, needing_ros, printable
 from ..standard_streams import give_up
@@ -189,8 +189,12 @@ def console(stderr: bool = False) -> Console:
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # main handles it; rich would exit with 1
 
-    stream = sys.stderr if stderr else sys.stdout  # 160 columns are enough for every table
-    return Console(stderr=stderr, width=None if stream.isatty() else 160, highlight=False, emoji=False)
+    return Console(stderr=stderr, width=_width(sys.stderr if stderr else sys.stdout), highlight=False, emoji=False)
+
+
+def _width(stream: TextIO) -> int | None:
+    """Return None for a terminal, else 160 columns, enough for every table."""
+    return None if stream.isatty() else 160
 
 
 def print_warnings(notes: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from ros import until
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from dvl_calib_ros.node.main import ReceivingExecutor
+from dvl_calib_ros.node.executor import ReceivingExecutor
 
 FLOOD = 2000
 

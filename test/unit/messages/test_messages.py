@@ -129,7 +129,7 @@ def test_a_reference_in_a_frame_that_says_nothing_is_refused_until_gnss_frame_is
     feed = Feed()
     assert feed.feed.reference(twist(SECOND, frame_id), 0) is None
     assert feed.counts("reference")["wrong_frame"] == 1
-    assert "set parameter gnss_frame to body, enu or ned" in feed.said[0]
+    assert "set gnss_frame to body, enu or ned" in feed.said[0]
     for frame in VelocityFrame:
         assert Feed(gnss_frame=frame.value).feed.reference(twist(SECOND, frame_id), 0).frame is frame
 
