@@ -19,11 +19,11 @@ from ..numerics.frames import Array
 
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
-# Significance, in σ, of eight tests of one recording: false alarms of 0.3 % (said) and 0.02 % (rejected).
-SAID, SURELY = 3.4, 4.0
+# Significance, in σ, of eight tests of one recording, for false alarms of 0.3 %
+SAID = 3.4
 # Error of the velocity ahead (share of the speed) from which a beam is reported: 10 m per km, the limit of acceptance.
-SAID_FROM = 0.01
-
+# A calibration whose error is above it even if the beam is better by WITHIN σ is rejected.
+SAID_FROM, WITHIN = 0.01, 2.0
 # Prior σ of the nuisance, the scale of z.
 Z_SCALE_STD = 1.0
 
@@ -83,6 +83,7 @@ def beam_warning(found: BeamFault | None) -> list[Reason]:
     """Return the reason against a calibration by a DVL with a faulty beam."""
     if found is None or found.share < SAID * found.std:
         return []
-    word = Severity.REJECT if found.share > SURELY * found.std else Severity.MARGINAL
+    least = found.off * (1.0 - WITHIN * found.std / found.share)
+    word = Severity.REJECT if least > SAID_FROM else Severity.MARGINAL
     percent, std = 100.0 * found.share, 100.0 * found.std
     return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(word)]
