@@ -373,6 +373,17 @@ def test_a_slow_dvl_that_is_off_now_and_then_costs_no_calibration():
     np.testing.assert_allclose(one_by_one.state, estimate.state, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize(("from_s", "to_s"), [(55.0, 75.0), (56.0, 74.0), (53.0, 73.0), (40.0, 90.0)])
+def test_a_gap_of_the_dvl_ends_no_calibration(from_s, to_s):
+    """The bottom was lost for 18 s about a block: replay and diagnosis ended in a traceback."""
+
+    def is_received(sample):
+        return not isinstance(sample, DvlSample) or not from_s < 1e-9 * (sample.stamp_ns - START_NS) < to_s
+
+    calibrator = feed(Calibrator(Parameters(model="full")), [each for each in late(0.2) if is_received(each)])
+    assert calibrator.estimate("full").used > 400
+
+
 def test_an_initial_calibration_of_g2_goes_on_where_it_was():
     first = found(-1.4)
     later = calibrate(late(-1.4, seed=1), NOISE, initial={"full": first.state("full")})
