@@ -158,11 +158,10 @@ class BlockSolver:
             streams = streams._replace(imu=_as_if_still(streams.block, self.epoch_ns))
         if len(streams.dvl.times) < FEWEST_DVL or len(streams.imu.times) < 2:
             return self.outcome()
-        kept = self._fit_block(streams)
-        if len(kept.dvl.times) < 2:  # a gap, and a sample in it
-            return self.outcome()
         try:
-            self.fit.add(kept)
+            kept = self._fit_block(streams)
+            if len(kept.dvl.times) > 1:  # else the DVL has a gap there
+                self.fit.add(kept)
         except np.linalg.LinAlgError:  # the fit diverged
             self.restarted += 1
         return self.outcome(self.fit.has_data)

@@ -134,8 +134,6 @@ def _whiles(problem: Problem) -> Iterator[tuple[slice, Array]]:
 
 def _in(problem: Problem, rows: slice, values: Array) -> Array:
     """Return values (m, A, K, c) of some bins among zeros (M, A, K, c)."""
-    if len(problem.rows_of) == 1:
-        return values
     whole = np.zeros((len(problem.time), *values.shape[1:]))
     whole[rows] = values
     return whole
