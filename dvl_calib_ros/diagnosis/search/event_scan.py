@@ -6,7 +6,6 @@ noise takes such an error for its own unless the time of the event is searched.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -53,7 +52,7 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
             if log_p[at] < best:
                 best, event = float(log_p[at]), columns[:, :, at]
         if event is not None:
-            found.append(Event(about, best + math.log(tried), event, tried))
+            found.append(Event(about, best + float(np.log(tried)), event, tried))
     return found
 
 
