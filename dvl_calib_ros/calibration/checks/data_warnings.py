@@ -16,8 +16,9 @@ from ..results.results import ARM, OFFSETS, Day, Estimate
 SUSPICIOUS_GATED = 0.2
 # Samples needed for a warning.
 ENOUGH_SAMPLES = 20
-# Share of exactly repeated DVL velocities above which the driver repeats stale data.
-SUSPICIOUS_REPEATED = 0.05
+# Share of exactly repeated DVL velocities above which the driver repeats stale data, and of samples, such as those
+# before the IMU's first, up to which a lack changes no answer.
+SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
 OFTEN_OFF = 4.0
 # Constant reference error that is reported, m/s, and its significance, σ.
@@ -59,7 +60,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
         found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=lost))
     if _never_meet(counts):
         found.append(finding("DVL_NO_REFERENCE"))
-    if pairing["without_attitude"]:
+    if pairing["without_attitude"] > FEW * dvl["received"]:
         found.append(finding("REFERENCE_NO_ATTITUDE", count=pairing["without_attitude"]))
     if dvl["dropouts"]:
         found.append(finding("DVL_DROPOUTS", count=dvl["dropouts"]))
@@ -71,7 +72,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
         found.append(finding("GNSS_LOSSES", count=pairing["gnss_losses"]))
     if dvl["no_turn_rate"]:
         found.append(finding("NO_TURN_RATE", count=dvl["no_turn_rate"]))
-    if dvl.get("lever_arm_uncompensated"):
+    if dvl.get("lever_arm_uncompensated", 0) > FEW * dvl["received"]:
         found.append(finding("LEVER_ARM_NOT_COMPENSATED", count=dvl["lever_arm_uncompensated"]))
     for name, count in counts["calibration"].items():
         if count and name.endswith(" restarted"):
