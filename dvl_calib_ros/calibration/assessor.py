@@ -254,8 +254,8 @@ class Estimates:
             needs = "an IMU that measures roll and pitch"
         elif self.further.is_horizontal:
             needs = MEASURES_VERTICAL
-        arm_effect_mps = self.further.arm_effect_mps
-        unknown_axes = 2 if needs else int(arm_effect_mps is not None or self._finds_another_arm)
+        arm_effect = self.further.arm_effect
+        unknown_axes = 2 if needs else int(arm_effect is not None or self._finds_another_arm)
         if not model.aided or not unknown_axes:
             return estimate
         level = p.rotation_dvl_from_body[:, :unknown_axes]
@@ -264,11 +264,9 @@ class Estimates:
         if needs == MEASURES_VERTICAL and results.estimates_lever_arm(model):  # the height is not observable either
             height = model.state_names.index("lever_arm_z")
             unknown[height, height] = p.initial_std_lever_arm**2
-        kept = self.further.recording
-        if arm_effect_mps and kept is not None:
-            speed = np.sqrt((kept[0].dvl.velocity ** 2).sum(axis=1).mean())
+        if arm_effect:
             ahead, up = p.rotation_dvl_from_body[:, 0], p.rotation_dvl_from_body[:, 2]
-            by_arm = arm_effect_mps / speed * np.column_stack([[*up, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, *ahead**2]])
+            by_arm = arm_effect * np.column_stack([[*up, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, *ahead**2]])
             of_state = np.linalg.pinv(model.error_terms_from_state) @ by_arm
             unknown += of_state @ of_state.T
         own = estimate.velocity_covariance + unknown
@@ -277,7 +275,7 @@ class Estimates:
             covariance=estimate.covariance + unknown,
             recording_covariance=estimate.recording_covariance + unknown,
             convergence=convergence(model, own, p),
-            observability=observability(model, own, p, needs or ("" if arm_effect_mps is None else MEASURES_TURNS)),
+            observability=observability(model, own, p, needs or ("" if arm_effect is None else MEASURES_TURNS)),
         )
 
     @property
@@ -333,9 +331,9 @@ class NonlinearEstimators:
         return any(each.is_level for each in self._all)
 
     @property
-    def arm_effect_mps(self) -> float | None:
-        """Velocity error (σ) by an unknown lever arm where turn rates are unknown; None where they are known."""
-        return self._first(lambda each: each.arm_effect_mps)
+    def arm_effect(self) -> float | None:
+        """Velocity error by an unknown arm without turn rates, σ as a share of the speed; None if rates are known."""
+        return self._first(lambda each: each.arm_effect)
 
     @property
     def is_horizontal(self) -> bool:

@@ -196,10 +196,12 @@ class FullEstimator(Estimator):
         return self._idle_solver().is_level
 
     @property
-    def arm_effect_mps(self) -> float | None:
+    def arm_effect(self) -> float | None:
         """See `Estimator`: a mean turn adds as much to the mean error as turns add to the slow errors."""
         slow = None if self._idle_solver().has_imu else self.slow_noise
-        return None if slow is None else math.sqrt(max(slow.velocity**2 - Priors().horizontal.mean_square, 0.0))
+        if slow is None:
+            return None
+        return math.sqrt(max(slow.velocity**2 - Priors().horizontal.mean_square, 0.0)) / self._idle_solver().fit.speed
 
     @property
     def is_horizontal(self) -> bool:

@@ -106,8 +106,8 @@ class Estimator(ABC):
         return False
 
     @property
-    def arm_effect_mps(self) -> float | None:
-        """Velocity error (σ) by an unknown lever arm where turn rates are unknown; None where they are known."""
+    def arm_effect(self) -> float | None:
+        """Velocity error by an unknown arm without turn rates, σ as a share of the speed; None if rates are known."""
         return None
 
     @property

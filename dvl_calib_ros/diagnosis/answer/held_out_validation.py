@@ -13,7 +13,9 @@ from ..fit.selection_criteria import NuisanceFit, blocks_of, robust_p
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
+from ..search.event_scan import EVENTS
 from ..search.unexplained import (
+    INEXACT,
     Unexplained,
     is_of_group,
     matters,
@@ -34,12 +36,13 @@ def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
     best: tuple[float, EffectSelection, Unexplained] | None = None
     for out in _subsets(selection):
         reduced = selection.without({effect.name for effect in out})
-        if reduced.fit.deviance - fit.deviance > SETTINGS.instead_of:
+        drop = reduced.fit.deviance - fit.deviance
+        if drop > SETTINGS.instead_of:
             continue
         other = unexplained(fitter, reduced.fit, asked=0.0)
         if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
             continue
-        gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable
+        gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop
         if gain > 0.0 and (best is None or gain > best[0]):
             best = gain, reduced, other
     return _sure_beside(*((selection, rest) if best is None else best[1:]))
@@ -89,6 +92,7 @@ def confirmed(selection: EffectSelection, rest: Unexplained, gap: Gap) -> tuple[
         return selection, rest
     none = selection.withdrawn()
     left = unexplained(none.fitter, none.fit)
-    if gap.shown_from > 0.0 and not matters(none.fitter.problem, none.fit, left):
+    is_event = left.about in EVENTS  # such as the turn by which a clock jump shows
+    if gap.shown_from > 0.0 and (is_event or not matters(none.fitter.problem, none.fit, left)):
         return selection, rest
     return none, left
