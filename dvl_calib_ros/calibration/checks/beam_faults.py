@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 
@@ -83,4 +84,4 @@ def beam_warning(found: BeamFault | None) -> list[Reason]:
     if found is None or found.share < SAID * found.std:
         return []
     percent, std = 100.0 * found.share, 100.0 * found.std  # noise that lasts may look like it, so it is a doubt
-    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg)]
+    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.MARGINAL)]
