@@ -21,8 +21,9 @@ from ..numerics.frames import Array
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
 # Significance, in σ, of eight tests of one recording, for false alarms of 0.3 %
 SAID = 3.4
-# Error of the velocity ahead (share of the speed) from which a beam is reported: 10 m per km, the limit of acceptance.
-SAID_FROM = 0.01
+# Error of the velocity ahead (share of the speed) from which a beam is reported, even if it is better by WITHIN σ: 10 m
+# per km, the limit of acceptance.
+SAID_FROM, WITHIN = 0.01, 2.0
 
 # Prior σ of the nuisance, the scale of z.
 Z_SCALE_STD = 1.0
@@ -54,6 +55,11 @@ class BeamFault(NamedTuple):
     azimuth_deg: float
     off: float
 
+    @property
+    def least(self) -> float:
+        """Return the error of the mean velocity by a beam that is better by WITHIN σ."""
+        return self.off * (1.0 - WITHIN * self.std / self.share)
+
 
 def most_significant(information: Array, vector: Array, mean: Array) -> BeamFault | None:
     """Return the most significant beam that matters on a straight course; None without one.
@@ -81,7 +87,7 @@ def most_significant(information: Array, vector: Array, mean: Array) -> BeamFaul
 
 def beam_warning(found: BeamFault | None) -> list[Reason]:
     """Return the reason against a calibration by a DVL with a faulty beam."""
-    if found is None or found.share < SAID * found.std:
+    if found is None or found.share < SAID * found.std or found.least < SAID_FROM:
         return []
     percent, std = 100.0 * found.share, 100.0 * found.std  # noise that lasts may look like it, so it is a doubt
     return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.MARGINAL)]
