@@ -201,7 +201,8 @@ class FullEstimator(Estimator):
         slow = None if self._idle_solver().has_imu else self.slow_noise
         if slow is None:
             return None
-        return math.sqrt(max(slow.velocity**2 - Priors().horizontal.mean_square, 0.0)) / self._idle_solver().fit.speed
+        count, squares = self._idle_solver().speeds
+        return math.sqrt(max(slow.velocity**2 - Priors().horizontal.mean_square, 0.0) * count / max(squares, 1e-12))
 
     @property
     def is_horizontal(self) -> bool:

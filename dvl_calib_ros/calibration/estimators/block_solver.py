@@ -56,7 +56,7 @@ class Outcome(NamedTuple):
 class BlockSolver:
     """Solver of blocks in order. restarted: number of fits that diverged. kept: streams for verification, or None.
 
-    has_imu: whether any IMU sample came.
+    has_imu: whether any IMU sample came. speeds: number of DVL samples in the fit, and sum of their squares, (m/s)².
     """
 
     def __init__(
@@ -79,6 +79,7 @@ class BlockSolver:
         self._attitude_rates = AttitudeRates()
         self._shared_noise = SharedNoise()
         self.has_imu = False
+        self.speeds = np.zeros(2)
         self._seen_ahead = self._seen_upwards = False  # whether references measure these body axes
         self._dvl_stream = DvlStream()
         self._turned = False
@@ -162,6 +163,7 @@ class BlockSolver:
             kept = self._fit_block(streams)
             if len(kept.dvl.times) > 1:  # else the DVL has a gap there
                 self.fit.add(kept)
+                self.speeds += len(kept.dvl.times), float((kept.dvl.velocity**2).sum())
         except np.linalg.LinAlgError:  # the fit diverged
             self.restarted += 1
         return self.outcome(self.fit.has_data)

@@ -486,12 +486,6 @@ class JointFit:
                     seconds += (block.end_s - block.from_s) * float(np.mean(block.fold == fold))
         return sums.error(seconds, memory_s)
 
-    @property
-    def speed(self) -> float:
-        """Root mean square of the DVL's speed, m/s, in the blocks whose streams are kept."""
-        velocity = np.concatenate([block.dvl.velocity for day in self._days for block in day.blocks])
-        return max(float(np.sqrt((velocity**2).sum(axis=1).mean())), LEAST_NOISE_MPS)
-
     def beam_fault(self) -> BeamFault | None:
         """Return the most significant fault of one beam, by the residual of the blocks whose streams are kept."""
         if not self.has_data:
