@@ -24,7 +24,6 @@ SAID = 3.4
 # Error of the velocity ahead (share of the speed) from which a beam is reported, even if it is better by WITHIN σ: 10 m
 # per km, the limit of acceptance.
 SAID_FROM, WITHIN = 0.01, 2.0
-
 # Prior σ of the nuisance, the scale of z.
 Z_SCALE_STD = 1.0
 
@@ -86,8 +85,8 @@ def most_significant(information: Array, vector: Array, mean: Array) -> BeamFaul
 
 
 def beam_warning(found: BeamFault | None) -> list[Reason]:
-    """Return the reason against a calibration by a DVL with a faulty beam."""
+    """Return the reason against a calibration by a faulty beam. It is a doubt: lasting noise may look like a beam."""
     if found is None or found.share < SAID * found.std or found.least < SAID_FROM:
         return []
-    percent, std = 100.0 * found.share, 100.0 * found.std  # noise that lasts may look like it, so it is a doubt
+    percent, std = 100.0 * found.share, 100.0 * found.std
     return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.MARGINAL)]

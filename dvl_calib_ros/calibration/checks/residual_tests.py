@@ -101,9 +101,9 @@ class ResidualTrend(NamedTuple):
     wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
     of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
     circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: memory, s, the most
-    significant of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s,
-    reference minus DVL, east and north, on every heading; 0 if the residual holds less than half of it. turned,
-    turned_std: rad, change of the heading error from start to end.
+    significant of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
+    heading; 0 if the residual holds less than half of it. turned, turned_std: rad, change of the heading error from
+    start to end.
     """
 
     tilt: Array

@@ -16,8 +16,8 @@ from ..fit.gauss_newton import Fit, Fitter
 from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..noise.noise_model import Noise
-from ..noise.whitened_least_squares import WhitenedLeastSquares
-from ..search.unexplained import explained, orthonormal
+from ..noise.whitened_least_squares import WhitenedLeastSquares, orthonormal
+from ..search.unexplained import explained
 
 LEVEL = 0.01
 TURNING_RADPS = np.deg2rad(2.0)

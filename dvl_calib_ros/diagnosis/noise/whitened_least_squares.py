@@ -1,4 +1,4 @@
-"""Whitened least squares with a prior, for all of the diagnosis."""
+"""Whitened least squares with a prior, and score tests of further columns, for all of the diagnosis."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from ...calibration.numerics.frames import Array
 MOSTLY = 0.5
 # Added to normal equations of unit diagonal, so that collinear columns have a solution
 ROUNDING = 1e-9
+# Directions with less than this share of their length outside the others are excluded as collinear
+INDEPENDENT = 1e-3
 
 
 def root_of_inverse(normal: Array) -> Array:
@@ -89,3 +91,46 @@ class WhitenedLeastSquares:
     def freedom(self) -> Array:
         """Return the degrees of freedom (n,) per parameter, less than one where the prior contributes."""
         return np.asarray(1.0 - np.diag(self.covariance()) / self.std**2)
+
+
+def orthonormal(white: Array) -> Array:
+    """Return an orthonormal basis (m, r) of whitened columns (m, n), which may be zero or collinear."""
+    lengths = np.linalg.norm(white, axis=0)
+    white = white[:, lengths > 0.0] / lengths[lengths > 0.0]
+    u, s, _ = np.linalg.svd(white, full_matrices=False)
+    return u[:, s > INDEPENDENT]
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """Normal equations of columns for a whitened series, orthogonal to a basis.
+
+    Basis and series may end with prior rows, which the columns lack. gram: (c, c) of unit columns after projection.
+    along: (c,) products with the series. has: (c,) whether a column exceeds rounding after projection.
+    """
+
+    gram: Array
+    along: Array
+    has: NDArray[np.bool_]
+
+    @staticmethod
+    def of(q: Array, white_columns: Array, white: Array) -> ScoreTest:
+        """Test whitened columns (m, c) beside an orthonormal basis q for a whitened series."""
+        rows = len(white_columns)
+        known, square = q[:rows].T @ white_columns, white_columns.T @ white_columns
+        left = square - known.T @ known
+        before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, left))
+        has = after > 0.02 * np.maximum(before, 1e-300)
+        size = np.where(has, after, 1.0)
+        along = white_columns.T @ white[:rows] - known.T @ (q.T @ white)
+        return ScoreTest(left / np.outer(size, size), along / size, has)
+
+    def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
+        """Return the energy that columns `at` explain jointly, and their rank."""
+        at = at[self.has[at]]
+        if not len(at):
+            return 0.0, 0
+        squares, directions = np.linalg.eigh(self.gram[np.ix_(at, at)])
+        apart = squares > INDEPENDENT**2
+        along = directions[:, apart].T @ self.along[at]
+        return float(np.sum(along**2 / squares[apart])), int(np.count_nonzero(apart))

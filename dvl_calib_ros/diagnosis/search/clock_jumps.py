@@ -33,8 +33,6 @@ PARTS, FEWEST_PARTS = 60, 3
 WORTH_FITTING, NO_DELAY = 40.0, 0.13
 # Largest gaps that may be jumps ahead: their number, least length, s, and tolerance of the jump's size, s
 GAPS, GAP_FROM_S, AS_LARGE_S = 6, 0.15, 0.3
-# Gaps without lost samples that are tried as clock jumps
-LEAPS = 3
 # Lost samples leave a gap of whole steps; a clock jump differs from that by this share of a step
 OF_A_STEP = 0.15
 

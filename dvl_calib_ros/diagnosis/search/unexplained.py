@@ -25,6 +25,7 @@ from ..fit.selection_criteria import NuisanceFit
 from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..noise.noise_model import Noise
+from ..noise.whitened_least_squares import INDEPENDENT, ScoreTest, orthonormal
 from .alternative_regressors import ALTERNATIVES, dictionary
 from .event_scan import events
 
@@ -44,8 +45,6 @@ INEXACT = 0.005
 AS_LIKELY = 6.0
 # A column belongs to a group whose functions leave less than this share of its squares
 OF_GROUP = 0.02
-# Directions with less than this share of their length outside the others are excluded as collinear
-INDEPENDENT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,7 @@ def _looked(
     sound = ~_upset(fitter, noise)[:, None]
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions * sound, problem.axes)
-        told = _Told.by(q, noise.whiten(raw[name]), white)
+        told = ScoreTest.of(q, noise.whiten(raw[name]), white)
         for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
             looks.append(FollowTest(name, at, number == 0, *told.energy(at)))
     return looks, white, raw, q
@@ -394,50 +393,8 @@ def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
     return [*looks, *(index[:, at : at + together].ravel() for at in range(0, c, together))]
 
 
-def orthonormal(white: Array) -> Array:
-    """Return an orthonormal basis (m, r) of whitened columns (m, n), which may be zero or collinear."""
-    lengths = np.linalg.norm(white, axis=0)
-    white = white[:, lengths > 0.0] / lengths[lengths > 0.0]
-    u, s, _ = np.linalg.svd(white, full_matrices=False)
-    return u[:, s > INDEPENDENT]
-
-
 def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
     """Return log p of the energy of a whitened series in some columns, and its excess over the null."""
-    energy, dof = _Told.by(q, white_columns, white).energy(np.arange(white_columns.shape[1]))
+    energy, dof = ScoreTest.of(q, white_columns, white).energy(np.arange(white_columns.shape[1]))
     energy /= variance
     return (float(chi2_logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class _Told:
-    """Normal equations of columns for a whitened series, orthogonal to a basis.
-
-    Basis and series may end with prior rows, which the columns lack. gram: (c, c) of unit columns after projection.
-    along: (c,) products with the series. has: (c,) whether a column exceeds rounding after projection.
-    """
-
-    gram: Array
-    along: Array
-    has: NDArray[np.bool_]
-
-    @staticmethod
-    def by(q: Array, white_columns: Array, white: Array) -> _Told:
-        rows = len(white_columns)
-        known, square = q[:rows].T @ white_columns, white_columns.T @ white_columns
-        left = square - known.T @ known
-        before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, left))
-        has = after > 0.02 * np.maximum(before, 1e-300)
-        size = np.where(has, after, 1.0)
-        along = white_columns.T @ white[:rows] - known.T @ (q.T @ white)
-        return _Told(left / np.outer(size, size), along / size, has)
-
-    def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
-        """Return the energy that columns `at` explain jointly, and their rank."""
-        at = at[self.has[at]]
-        if not len(at):
-            return 0.0, 0
-        squares, directions = np.linalg.eigh(self.gram[np.ix_(at, at)])
-        apart = squares > INDEPENDENT**2
-        along = directions[:, apart].T @ self.along[at]
-        return float(np.sum(along**2 / squares[apart])), int(np.count_nonzero(apart))
