@@ -1,9 +1,9 @@
 """Score test for one beam of the DVL that reads low or high, on the residual of `full`.
 
-The velocity is the least-squares solution of four beams, so a beam that reads low by a share s changes it by -s E v
-with E = (solution of that beam) (its direction)ᵀ. Misalignment and scale are parts of E that `full` estimates. The
-symmetric off-diagonal part is no mounting. Velocities before and after a sample stand for v, because its own noise is
-in the residual.
+The velocity is the least-squares solution of four beams. A beam that reads low by a share s changes it by -s E v, with
+E = (solution of that beam) (its direction)ᵀ. Misalignment and scale are parts of E that `full` estimates. The symmetric
+off-diagonal part is no mounting. v is the mean of the velocities before and after a sample, because the sample's own
+noise is in the residual.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ EFFECTS: Array = _effects()
 class BeamFault(NamedTuple):
     """Most significant beam.
 
-    share, std: by which it reads low. azimuth_deg: in the DVL. off: error of the mean velocity by it, as a share of the
+    share, std: amount by which it reads low. azimuth_deg: in the DVL. off: error of the mean velocity by it, as a share of the
     speed.
     """
 

@@ -16,8 +16,8 @@ from ..results.results import ARM, OFFSETS, Day, Estimate
 SUSPICIOUS_GATED = 0.2
 # Samples needed for a warning.
 ENOUGH_SAMPLES = 20
-# Share of exactly repeated DVL velocities above which the driver repeats stale data, and of samples, such as those
-# before the IMU's first, up to which a lack changes no answer.
+# Share of exactly repeated DVL velocities above which the driver repeats stale data. Share of samples without attitude
+# or turn rate, such as those before the IMU's first, that changes no answer.
 SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
 OFTEN_OFF = 4.0

@@ -92,7 +92,7 @@ def confirmed(selection: EffectSelection, rest: Unexplained, gap: Gap) -> tuple[
         return selection, rest
     none = selection.withdrawn()
     left = unexplained(none.fitter, none.fit)
-    is_event = left.about in EVENTS  # such as the turn by which a clock jump shows
+    is_event = left.about in EVENTS  # such as the only turn after a clock jump
     if gap.shown_from > 0.0 and (is_event or not matters(none.fitter.problem, none.fit, left)):
         return selection, rest
     return none, left

@@ -1,7 +1,7 @@
 """Scan of a residual for one event: a step that stays, or a passage that ends.
 
-A beam that drops out switches an error on or off; a magnetic anomaly turns the heading while the vehicle passes. Slow
-noise takes such an error for its own unless the time of the event is searched.
+A beam that drops out switches an error on or off. A magnetic anomaly rotates the heading while the vehicle passes. The
+slow noise absorbs such an error unless the time of the event is searched.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _of_heading(problem: Problem, fit: Fit) -> Array | None:
     return np.concatenate(across)[:, np.array(problem.measured), None]
 
 
-# Courses over time and error of each event, by the words for what the residual follows
+# Courses over time and error of each event, by its name in the sentence on the residual
 EVENTS: dict[str, tuple[Callable[[Array], Array], Callable[[Problem, Fit], Array | None]]] = {
     "a step in time": (_steps, _of_each_axis),
     "a stretch of time": (_passages, _of_each_axis),

@@ -38,7 +38,7 @@ STEPS_OF_A_BIN = 16
 OUTLYING = 5.0
 # Simulated recordings for the null distribution, and degrees of freedom of the prior on its scale of 1
 MADE_UP, PRIOR_DOF = 12, 4.0
-# Share of what effects explain that they leave behind for a while, as interpolation is inexact
+# Share of the effects' explained deviance that inexact interpolation may leave
 INEXACT = 0.005
 # Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
 # fifteen functions of the turn rate.
