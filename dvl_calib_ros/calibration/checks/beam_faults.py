@@ -45,8 +45,8 @@ EFFECTS: Array = _effects()
 class BeamFault(NamedTuple):
     """Most significant beam.
 
-    share, std: amount by which it reads low. azimuth_deg: in the DVL. off: error of the mean velocity by it, as a share of the
-    speed.
+    share, std: amount by which it reads low. azimuth_deg: in the DVL. off: error of the mean velocity by it, as a share
+    of the speed.
     """
 
     share: float
