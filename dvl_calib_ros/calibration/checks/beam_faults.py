@@ -1,4 +1,4 @@
-"""Score test for one beam of the DVL that reads low or high, on the residual of `full`.
+"""Test for one beam of the DVL that reads low or high, on the residual of `full`.
 
 The velocity is the least-squares solution of four beams. A beam that reads low by a share s changes it by -s E v, with
 E = (solution of that beam) (its direction)ᵀ. Misalignment and scale are parts of E that `full` estimates. The symmetric
@@ -15,6 +15,7 @@ import numpy as np
 
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
+from ..numerics.block_covariance import TimeBlocks, inflations
 from ..numerics.frames import Array
 
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
@@ -60,33 +61,40 @@ class BeamFault(NamedTuple):
         return self.off * (1.0 - WITHIN * self.std / self.share)
 
 
-def most_significant(information: Array, vector: Array, mean: Array) -> BeamFault | None:
+def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean: Array) -> BeamFault | None:
     """Return the most significant beam that matters on a straight course; None without one.
+
+    Each beam is fitted with the states and the scale of z. Its σ includes the scatter of the blocks.
 
     Parameters
     ----------
-    information, vector: (n, n), (n,) normal equations of states and `EFFECTS`, the latter in the last places.
+    blocks: normal equations of n states, then `EFFECTS`.
+    information, vector: (n, n), (n,) prior of the states.
     mean: (3,) m/s, mean velocity in the DVL.
     """
-    own = len(vector) - len(EFFECTS) + 1  # states and the nuisance
-    of_states = information[:own, :own].copy()
-    of_states[-1, -1] += Z_SCALE_STD**-2.0  # without a vertical reference nothing else does
-    solved = np.linalg.solve(of_states, np.column_stack([information[:own, own:], vector[:own]]))
-    score = vector[own:] - information[own:, :own] @ solved[:, -1]
-    known = np.diag(information)[own:] - (information[own:, :own] * solved[:, :-1].T).sum(axis=1)
+    n = len(vector)
+    # without a vertical reference nothing else holds the scale of z
+    prior = np.diag([*np.zeros(n), Z_SCALE_STD**-2.0, 0.0])
+    prior[:n, :n] = information
     found = []
-    for degrees, effect, u, told in zip(AZIMUTHS_DEG, EFFECTS[1:], score.tolist(), known.tolist(), strict=True):
-        if told <= 0.0:
+    for number, (degrees, effect) in enumerate(zip(AZIMUTHS_DEG, EFFECTS[1:], strict=True)):
+        at = np.append(np.arange(n + 1), n + 1 + number)
+        each = blocks.of(0).part(at)
+        whole = prior + each.total
+        if each.total[-1, -1] <= 0.0:
             continue
-        off = abs(u / told) * float(np.linalg.norm(effect @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
+        p = np.linalg.inv(whole)
+        x = p @ (each.vector.sum(axis=0) + np.append(vector, [0.0, 0.0]))
+        share, std = float(x[-1]), math.sqrt(p[-1, -1]) * float(inflations([each], x[None], p[None])[0, -1])
+        off = abs(share) * float(np.linalg.norm(effect @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
         if off > SAID_FROM:
-            found.append(BeamFault(abs(u) / told, told**-0.5, (degrees + 180.0 * (u < 0.0)) % 360.0, off))
+            found.append(BeamFault(abs(share), std, (degrees + 180.0 * (share < 0.0)) % 360.0, off))
     return max(found, key=lambda each: each.share / each.std, default=None)
 
 
 def beam_warning(found: BeamFault | None) -> list[Reason]:
-    """Return the reason against a calibration by a faulty beam. It is a doubt: lasting noise may look like a beam."""
+    """Return the reason against a calibration by a faulty beam, whose roll and yaw are wrong by several σ."""
     if found is None or found.share < SAID * found.std or found.least < SAID_FROM:
         return []
     percent, std = 100.0 * found.share, 100.0 * found.std
-    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.MARGINAL)]
+    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.REJECT)]

@@ -19,18 +19,9 @@ import numpy as np
 from ..assessment.dead_reckoning import SlowNoise
 from ..checks.beam_faults import EFFECTS, BeamFault, most_significant
 from ..filters.cross_validation import FOLDS, HeldOutError
-from ..models.own import (
-    DELAY,
-    FULL,
-    HEADING,
-    LEVER_ARM,
-    N_STATE,
-    PHI,
-    REFERENCE_DELAY,
-    REFERENCE_ERROR,
-    SCALE,
-)
+from ..models.own import DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, REFERENCE_ERROR, SCALE
 from ..models.parameters import Parameters
+from ..numerics.block_covariance import TimeBlocks
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index
@@ -492,18 +483,22 @@ class JointFit:
             return None
         points, k = self._likeliest, len(EFFECTS)
         own, of_state, _ = self._by_prior(points, math.inf, 0.0)
-        information, vector = np.pad(own[0], (0, k)), np.append(of_state[0], np.zeros(k))
-        velocity, effects = [], np.arange(len(vector) - k, len(vector))
+        n = len(of_state[0]) + k
+        blocks, velocity, effects = TimeBlocks(), [], np.arange(n - k, n)
         for number, day in enumerate(self._days):
             x = self._x[self._of_day(number)]
-            parts = [part for block in day.blocks for part in self._parts(block, x)]
-            if np.isfinite(day.white).all():
-                gram = effects_gram(parts, EFFECTS, x, day.single, day.white, self._slow.part(points))
-                at = np.append(self._of_day(number), effects)
-                information[np.ix_(at, at)] += gram[:-1, :-1]
-                vector[at] += gram[:-1, -1]
-                velocity += [part.rows.dvl for part in parts if part.rows is not None]
-        return most_significant(information, vector, np.concatenate(velocity).mean(axis=0)) if velocity else None
+            at = np.append(self._of_day(number), effects)
+            for part in (part for block in day.blocks for part in self._parts(block, x)):
+                if part.rows is None or not np.isfinite(day.white).all():
+                    continue
+                gram = effects_gram(part, EFFECTS, x, day.single, day.white, self._slow.part(points))
+                information, vector = np.zeros((1, n, n)), np.zeros((1, n))
+                information[0][np.ix_(at, at)], vector[0, at] = gram[:-1, :-1], gram[:-1, -1]
+                blocks.add(information, vector, 1.0)
+                velocity.append(part.rows.dvl)
+        if not velocity:
+            return None
+        return most_significant(blocks, own[0], of_state[0], np.concatenate(velocity).mean(axis=0))
 
     def _climbs(self, without: int = -1) -> list[_Climb]:
         """Return the mean climb of every day that shows one. without: fold that is held out."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -72,24 +71,14 @@ class SectionRows:
         return self._bins
 
 
-def effects_gram(
-    parts: Sequence[SectionRows], effects: Array, x: Array, single: Array, white: Array, slow: SlowErrors
-) -> Array:
-    """Return the Gram matrix (21 + k, 21 + k) of a day over [states, effects, residual], without slow errors.
+def effects_gram(part: SectionRows, effects: Array, x: Array, single: Array, white: Array, slow: SlowErrors) -> Array:
+    """Return the Gram matrix (21 + k, 21 + k) of a section over [states, effects, residual], without slow errors.
 
     effects: (k, 3, 3), see `SectionRows.with_effects`. x: (20,) point of linearisation. single, white: (3,) variances.
     """
-    k = len(effects)
-    chain, end_s = Chain.begun(slow, k), math.inf
-    for part in parts:
-        if part.from_s > end_s + 1e-6:
-            chain = chain.after(None, part.from_s - end_s, slow)
-        gram, end_s = None, part.from_s + SECTION_S
-        if part.rows is not None:
-            bins = part.with_effects(effects).bins(single)
-            gram = gram_of(bins, white, np.append(x, np.zeros(k)), part.slope_variance)
-        chain = chain.after(gram, SECTION_S, slow)
-    found: Array = chain.ended().gram[0]
+    bins = part.with_effects(effects).bins(single)
+    gram = gram_of(bins, white, np.append(x, np.zeros(len(effects))), part.slope_variance)
+    found: Array = Chain.begun(slow, len(effects)).after(gram, SECTION_S, slow).ended().gram[0]
     return found
 
 

@@ -121,6 +121,10 @@ class BlocksOfOne(NamedTuple):
     vector: Array
     total: Array
 
+    def part(self, at: NDArray[np.intp]) -> BlocksOfOne:
+        """Return the blocks of some of the states."""
+        return BlocksOfOne(self.information[:, at[:, None], at], self.vector[:, at], self.total[at[:, None], at])
+
 
 def inflations(
     blocks: Sequence[BlocksOfOne],

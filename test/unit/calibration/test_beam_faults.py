@@ -2,17 +2,38 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.checks.beam_faults import BeamFault, beam_warning
+from dvl_calib_ros.calibration.checks.beam_faults import EFFECTS, BeamFault, beam_warning, most_significant
+from dvl_calib_ros.calibration.numerics.block_covariance import TimeBlocks
 from dvl_calib_ros.verdict.kinds import Severity
 
 
 @pytest.mark.parametrize(
     ("share", "off", "severities"),
-    [(0.02, 0.025, []), (0.06, 0.025, [Severity.MARGINAL]), (0.047, 0.013, [])],
+    [(0.02, 0.025, []), (0.06, 0.025, [Severity.REJECT]), (0.047, 0.013, [])],
 )
-def test_a_significant_beam_whose_error_matters_is_a_doubt_about_the_calibration(share, off, severities):
+def test_a_significant_beam_whose_error_matters_rejects_the_calibration(share, off, severities):
     """Eight of twelve recordings with a beam that reads 6 % too much were accepted."""
     found = beam_warning(BeamFault(share, 0.01, 135.0, off))
     assert [each.severity for each in found] == severities
+
+
+def test_lasting_noise_makes_a_beam_less_significant():
+    """A right survey was rejected for a beam of 21 %, as its residual lasted for a minute."""
+    n, information = 1 + len(EFFECTS), 400.0
+
+    def found(noise: float) -> BeamFault:
+        blocks = TimeBlocks()
+        for each in 8 * (-1.0, 1.0):
+            vector = np.zeros((1, n))
+            vector[0, 2] = information * (0.1 + noise * each)
+            blocks.add(information * np.eye(n)[None], vector, 1.0)
+        beam = most_significant(blocks, np.eye(1), np.zeros(1), np.array([1.0, 0.0, 0.0]))
+        assert beam is not None
+        return beam
+
+    white, lasting = found(0.0), found(0.3)
+    assert white.share == pytest.approx(0.1) and white.std == pytest.approx((16.0 * information) ** -0.5, rel=0.01)
+    assert lasting.share == pytest.approx(0.1) and lasting.std > 0.3 / 4.0
