@@ -15,6 +15,7 @@ import numpy as np
 
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
+from ..models.own import BIAS
 from ..numerics.block_covariance import TimeBlocks, inflations
 from ..numerics.frames import Array
 
@@ -25,8 +26,8 @@ SAID = 3.4
 # Error of the velocity ahead (share of the speed) from which a beam is reported, even if it is better by WITHIN σ: 10 m
 # per km, the limit of acceptance.
 SAID_FROM, WITHIN = 0.01, 2.0
-# Prior σ of the nuisance, the scale of z.
-Z_SCALE_STD = 1.0
+# Prior σ of the nuisances: the scale of z, and the DVL's bias (m/s), which at one speed looks like a beam.
+Z_SCALE_STD, BIAS_STD = 1.0, 0.1
 
 
 def _effects() -> Array:
@@ -64,7 +65,7 @@ class BeamFault(NamedTuple):
 def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean: Array) -> BeamFault | None:
     """Return the most significant beam that matters on a straight course; None without one.
 
-    Each beam is fitted with the states and the scale of z. Its σ includes the scatter of the blocks.
+    Each beam is fitted with the states, a DVL bias and the scale of z. Its σ includes the scatter of the blocks.
 
     Parameters
     ----------
@@ -76,6 +77,7 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     # without a vertical reference nothing else holds the scale of z
     prior = np.diag([*np.zeros(n), Z_SCALE_STD**-2.0, 0.0])
     prior[:n, :n] = information
+    prior[BIAS, BIAS] = np.eye(3) * BIAS_STD**-2.0
     found = []
     for number, (degrees, effect) in enumerate(zip(AZIMUTHS_DEG, EFFECTS[1:], strict=True)):
         at = np.append(np.arange(n + 1), n + 1 + number)
