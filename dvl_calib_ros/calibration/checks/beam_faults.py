@@ -3,7 +3,7 @@
 The velocity is the least-squares solution of four beams. A beam that reads low by a share s changes it by -s E v, with
 E = (solution of that beam) (its direction)ᵀ. Misalignment and scale are parts of E that `full` estimates. The symmetric
 off-diagonal part is no mounting. v is the mean of the velocities before and after a sample, because the sample's own
-noise is in the residual.
+noise is in the residual. A scale that grows with speed looks similar; the more significant one is taken.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ SAID_FROM, WITHIN = 0.01, 2.0
 Z_SCALE_STD, BIAS_STD = 1.0, 0.1
 
 
-def _effects() -> Array:
-    """Return E (9, 3, 3): the scale of z as a nuisance, as noise of the DVL looks like it, and of each beam."""
+def _beams() -> Array:
+    """Return E (8, 3, 3) of each beam."""
     flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)
-    effects = [np.diag([0.0, 0.0, 1.0])]
+    effects = []
     for degrees in AZIMUTHS_DEG:
         along = math.radians(degrees)
         beam = np.array([flat * math.cos(along), flat * math.sin(along), -down])
@@ -41,7 +41,20 @@ def _effects() -> Array:
     return np.array(effects)
 
 
-EFFECTS: Array = _effects()
+BEAMS: Array = _beams()
+N_EFFECTS = len(BEAMS) + 2
+
+
+def effect_velocities(v: Array) -> Array:
+    """Return the velocities (N, 3, `N_EFFECTS`) that a DVL with velocities v (N, 3) has too much by each effect.
+
+    These are the scale of z, each beam by its whole velocity, and a scale that grows with speed, by 1 per m/s.
+    """
+    found = np.zeros((len(v), 3, N_EFFECTS))
+    found[:, 2, 0] = v[:, 2]
+    found[:, :, 1:-1] = -np.einsum("kij,nj->nik", BEAMS, v)
+    found[:, :, -1] = np.linalg.norm(v, axis=1)[:, None] * v
+    return found
 
 
 class BeamFault(NamedTuple):
@@ -63,13 +76,13 @@ class BeamFault(NamedTuple):
 
 
 def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean: Array) -> BeamFault | None:
-    """Return the most significant beam that matters on a straight course; None without one.
+    """Return the most significant beam; None if a scale that grows with speed is more significant.
 
     Each beam is fitted with the states, a DVL bias and the scale of z. Its σ includes the scatter of the blocks.
 
     Parameters
     ----------
-    blocks: normal equations of n states, then `EFFECTS`.
+    blocks: normal equations of n states, then of `effect_velocities`.
     information, vector: (n, n), (n,) prior of the states.
     mean: (3,) m/s, mean velocity in the DVL.
     """
@@ -78,20 +91,20 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     prior = np.diag([*np.zeros(n), Z_SCALE_STD**-2.0, 0.0])
     prior[:n, :n] = information
     prior[BIAS, BIAS] = np.eye(3) * BIAS_STD**-2.0
-    found = []
-    for number, (degrees, effect) in enumerate(zip(AZIMUTHS_DEG, EFFECTS[1:], strict=True)):
-        at = np.append(np.arange(n + 1), n + 1 + number)
-        each = blocks.of(0).part(at)
-        whole = prior + each.total
+    all_blocks, found = blocks.of(0), []
+    for number in range(1, N_EFFECTS):
+        at = np.append(np.arange(n + 1), n + number)
+        each = all_blocks.part(at)
         if each.total[-1, -1] <= 0.0:
             continue
-        p = np.linalg.inv(whole)
+        p = np.linalg.inv(prior + each.total)
         x = p @ (each.vector.sum(axis=0) + np.append(vector, [0.0, 0.0]))
-        share, std = float(x[-1]), math.sqrt(p[-1, -1]) * float(inflations([each], x[None], p[None])[0, -1])
-        off = abs(share) * float(np.linalg.norm(effect @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
-        if off > SAID_FROM:
-            found.append(BeamFault(abs(share), std, (degrees + 180.0 * (share < 0.0)) % 360.0, off))
-    return max(found, key=lambda each: each.share / each.std, default=None)
+        found.append((float(x[-1]), math.sqrt(p[-1, -1]) * float(inflations([each], x[None], p[None])[0, -1]), number))
+    share, std, number = max(found, key=lambda each: abs(each[0]) / each[1], default=(0.0, 1.0, N_EFFECTS - 1))
+    if number == N_EFFECTS - 1:
+        return None
+    off = abs(share) * float(np.linalg.norm(BEAMS[number - 1] @ mean)) / max(float(np.linalg.norm(mean)), 1e-6)
+    return BeamFault(abs(share), std, (AZIMUTHS_DEG[number - 1] + 180.0 * (share < 0.0)) % 360.0, off)
 
 
 def beam_warning(found: BeamFault | None) -> list[Reason]:

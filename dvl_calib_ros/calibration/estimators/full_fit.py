@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..assessment.dead_reckoning import SlowNoise
-from ..checks.beam_faults import EFFECTS, BeamFault, most_significant
+from ..checks.beam_faults import N_EFFECTS, BeamFault, effect_velocities, most_significant
 from ..filters.cross_validation import FOLDS, HeldOutError
 from ..models.own import DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, REFERENCE_ERROR, SCALE
 from ..models.parameters import Parameters
@@ -481,7 +481,7 @@ class JointFit:
         """Return the most significant fault of one beam, by the residual of the blocks whose streams are kept."""
         if not self.has_data:
             return None
-        points, k = self._likeliest, len(EFFECTS)
+        points, k = self._likeliest, N_EFFECTS
         own, of_state, _ = self._by_prior(points, math.inf, 0.0)
         n = len(of_state[0]) + k
         blocks, velocity, effects = TimeBlocks(), [], np.arange(n - k, n)
@@ -491,7 +491,7 @@ class JointFit:
             for part in (part for block in day.blocks for part in self._parts(block, x)):
                 if part.rows is None or not np.isfinite(day.white).all():
                     continue
-                gram = effects_gram(part, EFFECTS, x, day.single, day.white, self._slow.part(points))
+                gram = effects_gram(part, effect_velocities, x, day.single, day.white, self._slow.part(points))
                 information, vector = np.zeros((1, n, n)), np.zeros((1, n))
                 information[0][np.ix_(at, at)], vector[0, at] = gram[:-1, :-1], gram[:-1, -1]
                 blocks.add(information, vector, 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from ..models.own import BIAS
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from .full_forward_model import FitBlock, PredictedRows
-from .slow_errors import Bins, Chain, SlowErrors, binned_rows, gram_of
+from .slow_errors import WIDTH, Bins, Chain, SlowErrors, binned_rows, gram_of
 
 # Interval between knots of the slow errors, and length of bins of rows, s. A bin holds at least BIN_INTERVALS DVL
 # intervals.
@@ -35,11 +36,10 @@ class SectionRows:
             self.level = masked_median(residual)
             self.left = residual - self.level
 
-    def with_effects(self, effects: Array) -> SectionRows:
-        """Return the rows with derivatives by effects E (k, 3, 3), by which the DVL's velocity v changes by -E v."""
+    def with_effects(self, velocities: Callable[[Array], Array]) -> SectionRows:
+        """Return the rows with derivatives by effects, from `velocities` (N, 3, k) that a DVL (N, 3) has too much."""
         assert self.rows is not None
-        # the velocity's error is a bias of -E v
-        more = -self.rows.columns[:, :, BIAS] @ np.einsum("kij,nj->nik", effects, self.rows.dvl)
+        more = self.rows.columns[:, :, BIAS] @ velocities(self.rows.dvl)
         whole = copy.copy(self)
         whole._bins, whole.rows = None, self.rows._replace(columns=np.concatenate([self.rows.columns, more], axis=2))
         return whole
@@ -71,14 +71,17 @@ class SectionRows:
         return self._bins
 
 
-def effects_gram(part: SectionRows, effects: Array, x: Array, single: Array, white: Array, slow: SlowErrors) -> Array:
+def effects_gram(
+    part: SectionRows, velocities: Callable[[Array], Array], x: Array, single: Array, white: Array, slow: SlowErrors
+) -> Array:
     """Return the Gram matrix (21 + k, 21 + k) of a section over [states, effects, residual], without slow errors.
 
-    effects: (k, 3, 3), see `SectionRows.with_effects`. x: (20,) point of linearisation. single, white: (3,) variances.
+    velocities: see `SectionRows.with_effects`. x: (20,) point of linearisation. single, white: (3,) variances.
     """
-    bins = part.with_effects(effects).bins(single)
-    gram = gram_of(bins, white, np.append(x, np.zeros(len(effects))), part.slope_variance)
-    found: Array = Chain.begun(slow, len(effects)).after(gram, SECTION_S, slow).ended().gram[0]
+    bins = part.with_effects(velocities).bins(single)
+    k = bins.rows.shape[2] - WIDTH
+    gram = gram_of(bins, white, np.append(x, np.zeros(k)), part.slope_variance)
+    found: Array = Chain.begun(slow, k).after(gram, SECTION_S, slow).ended().gram[0]
     return found
 
 
