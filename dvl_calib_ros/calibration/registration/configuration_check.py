@@ -236,11 +236,18 @@ def _wrong_axes(
             alike = f" (read as {dvl_axes}; read as {instead}, {other} does)" if instead else ""
             return finding("DVL_LEFT_HANDED", axis=axis, alike=alike)
         return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
-    too_small = np.where(is_shown, factors / factors[0] - SCALED_ALONE - SIGNIFICANT * std, 0.0)
-    if not is_turned.any() and too_small.max() > 1.0:
-        at = int(np.argmax(too_small))
-        return finding("DVL_AXIS_SCALED", axis="xyz"[at], factor=float(factors[0] / factors[at]))
-    return None
+    return None if is_turned.any() else scaled_axis(factors, std)
+
+
+def scaled_axis(factors: Array, std: Array) -> Reason | None:
+    """Return the finding of a DVL axis that reads less than the best known one, from factors (3,) with σ, else None."""
+    best = int(np.argmin(std))  # the axis ahead in any mounting: sway is small, and so its factor is badly known
+    is_shown = factors > SIGNIFICANT * std
+    too_small = np.where(is_shown, (factors - SIGNIFICANT * std) / factors[best] - SCALED_ALONE, 0.0)
+    at = int(np.argmax(too_small))
+    if too_small[at] <= 1.0:
+        return None
+    return finding("DVL_AXIS_SCALED", axis="xyz"[at], other="xyz"[best], factor=float(factors[best] / factors[at]))
 
 
 def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
