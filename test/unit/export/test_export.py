@@ -95,15 +95,6 @@ def test_mounting_rate_and_noise_are_read_back_as_they_were_found(name, tmp_path
 
 
 @pytest.mark.parametrize("name", SIMULATORS)
-def test_a_lever_arm_is_read_back_and_a_delay_is_listed_as_missing(name, tmp_path):
-    exported, dvl = read_back(name, FOUND, tmp_path / "file")
-    np.testing.assert_allclose(dvl.lever_arm, FOUND.lever_arm, atol=1e-8)
-    said = {each.name: each.error for each in exported.missing}
-    assert "lever_arm" not in said
-    assert said["dvl_time_offset"] == 0.11
-
-
-@pytest.mark.parametrize("name", SIMULATORS)
 def test_what_stays_of_scale_and_bias_is_what_the_simulator_measures_too_little(name, tmp_path):
     exported, dvl = read_back(name, FOUND, tmp_path / "file")
     quiet = np.random.Generator(np.random.PCG64(1))
@@ -185,12 +176,6 @@ def test_what_no_effect_explains_is_said_to_stay(tmp_path, capsys):
     assert "not_explained" in out and "12.4" in out
     _, errors = succeed(capsys, "simulate", tmp_path / "bag", "--duration", "10", "--diagnosis", tmp_path / "d.json")
     assert "not_explained" in errors
-
-
-def test_a_file_before_is_kept_as_a_backup(diagnosis, tmp_path, capsys):
-    (tmp_path / "dvl.sdf").write_text("mine")
-    succeed(capsys, "export", "gazebo", diagnosis, "-o", tmp_path / "dvl.sdf")
-    assert (tmp_path / "dvl.sdf.bak").read_text() == "mine"
 
 
 def test_a_source_with_two_hyphens_leaves_the_xml_well_formed(tmp_path, capsys):
