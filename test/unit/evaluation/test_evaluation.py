@@ -5,9 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
-import signal
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +30,6 @@ from dvl_calib_ros.evaluation.validation_study import (
     dvl_velocities,
     evaluate,
     references,
-    run_seed,
     sensor_data,
     true_state,
 )
@@ -250,33 +247,6 @@ def test_workers_change_nothing(evaluation):
 def test_a_worker_process_that_is_killed_is_said():
     with pytest.raises(InputError, match="a worker process was killed"):
         run_all(os._exit, [1, 1], Workers(jobs=2))
-
-
-def test_a_dask_worker_killed_on_the_way_loses_nothing():
-    """A real scheduler with two worker processes; the one that finished first is killed."""
-    distributed = pytest.importorskip("distributed")
-    procedure = Procedure(own_trajectories(), ("M4", "M7"), protocol.SETS[:1], Parameters(**DEFAULTS), studies=False)
-    expected = [run_seed(procedure, seed) for seed in range(12)]
-    killed: list[int] = []
-    done_before: list[float] = []
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None, processes=True) as cluster,
-        distributed.Client(cluster, set_as_default=False) as watcher,
-    ):
-
-        def kill_one(share: float) -> None:
-            if killed:
-                return
-            done_before.append(share)
-            done = {address: len(keys) for address, keys in watcher.has_what().items()}
-            address = max(done, key=lambda each: done[each])
-            killed.append(watcher.run(os.getpid, workers=[address])[address])
-            os.kill(killed[0], signal.SIGKILL)
-
-        found = run_all(partial(run_seed, procedure), range(12), Workers(dask=cluster.scheduler_address), kill_one)
-    assert killed and done_before[0] < 1.0
-    for one, other in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(one.by_set[0].by_time, other.by_set[0].by_time)
 
 
 def test_a_scheduler_that_does_not_answer_is_said_in_seconds(capsys, monkeypatch):

@@ -40,35 +40,24 @@ def value(number: float) -> dict:
     return {"value": number, "ci95": [number - 1.0, number + 1.0]}
 
 
+def values(**numbers: float) -> dict:
+    return {name: value(number) for name, number in numbers.items()}
+
+
 def document(**changes) -> dict:
     """A diagnosis as diagnose --json writes it, as far as it is read."""
+    arm = {"name": "lever_arm", "equivalent_to": ["sideslip"], "parameters": values(x_m=-1.35, y_m=0.0, z_m=0.0)}
+    late = {"name": "dvl_time_offset", "equivalent_to": [], "parameters": values(seconds=0.2)}
     return {
-        "verdict": "known",
-        "effects": [
-            {
-                "name": "lever_arm",
-                "equivalent_to": ["sideslip"],
-                "parameters": {"x_m": value(-1.35), "y_m": value(0.0), "z_m": value(0.0)},
-            },
-            {"name": "dvl_time_offset", "equivalent_to": [], "parameters": {"seconds": value(0.2)}},
-        ],
-        "noise": [{"name": "outliers", "parameters": {"share": value(0.01)}}],
-        "calibration": {
-            "phi_rad": {axis: value(x) for axis, x in zip("xyz", (0.01, -0.02, 0.03), strict=True)},
-            "delta_k": {axis: value(x) for axis, x in zip("xyz", (0.005, 0.005, 0.005), strict=True)},
-        },
+        "verdict": "known", "effects": [arm, late], "noise": [{"name": "outliers", "parameters": values(share=0.01)}],
+        "calibration": {"phi_rad": values(x=0.01, y=-0.02, z=0.03), "delta_k": values(x=0.005, y=0.005, z=0.005)},
         "dvl": {
-            "mounting_rpy": [0.0, 0.0, 0.7],
-            "lever_arm_m": [-0.5, 0.0, 0.1],
-            "time_offset_s": 0.1,
-            "clock_drift": 0.0,
-            "rate_hz": 5.0,
-            "noise_std_mps": list(STD),
-            "speed_mps": [1.4, 0.1, 0.1],
+            "mounting_rpy": [0.0, 0.0, 0.7], "lever_arm_m": [-0.5, 0.0, 0.1], "time_offset_s": 0.1, "clock_drift": 0.0,
+            "rate_hz": 5.0, "noise_std_mps": list(STD), "speed_mps": [1.4, 0.1, 0.1],
             "sizes_mps": {"misalignment": 0.05, "scale": 0.007, "lever_arm": 0.1, "dvl_time_offset": 0.08},
         },
         **changes,
-    }
+    }  # fmt: skip
 
 
 @pytest.fixture
