@@ -31,7 +31,7 @@ from dvl_calib_ros.recordings.recording import open_bags, open_recording
 # ---------------------------------------------------------------------- names
 
 HOSTILE = [
-    "run#1", "run%31", "run?mode=memory", "run²_1", "run%", "a b", "日本", "-x", "~", "'", '"', ";", "..a", "$HOME", "#",
+    "run#1", "run%31", "run?mode=memory", "run%", "a b", "日本", "-x", "~", "'", '"', ";", "..a", "$HOME", "#",
 ]  # fmt: skip
 
 
