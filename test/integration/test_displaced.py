@@ -65,11 +65,13 @@ def recorded(
     return write_bag(path, tuple(heapq.merge(samples, key=lambda sample: sample.stamp_ns)))
 
 
-@pytest.mark.spread(1)
 @pytest.mark.parametrize(
     ("lever_arm", "late_s", "waves_mps"),
-    [((1.3, 0.0, 0.0), 0.0, 0.02), ((1.3, -0.3, 0.0), -2.2, 0.02), ((1.0, 0.2, 0.0), 2.5, 0.15)],
-    ids=["ahead", "ahead and early", "ahead and late by half a wave"],
+    [
+        ((1.0, 0.2, 0.0), 2.5, 0.15),
+        pytest.param((1.3, -0.3, 0.0), -2.2, 0.02, marks=pytest.mark.slow),
+    ],
+    ids=["ahead and late by half a wave", "ahead and early"],
 )
 def test_a_dvl_that_is_displaced_or_late_is_not_taken_for_one_that_is_turned(tmp_path, lever_arm, late_s, waves_mps):
     calibration = dc.replay(recorded(tmp_path / "bag", lever_arm, late_s, waves_mps=waves_mps), history=False)
@@ -80,8 +82,7 @@ def test_a_dvl_that_is_displaced_or_late_is_not_taken_for_one_that_is_turned(tmp
     np.testing.assert_allclose(mounting.rpy_deg[1:], 0.0, atol=0.5)
 
 
-@pytest.mark.spread(2)
-@pytest.mark.parametrize("ahead_m", [-1.9, -0.3, 0.3, 1.9])
+@pytest.mark.parametrize("ahead_m", [-0.3, 1.9])
 def test_on_a_circle_a_displaced_dvl_is_not_taken_for_a_turned_one_and_its_yaw_is_not_claimed(tmp_path, ahead_m):
     calibration = dc.replay(recorded(tmp_path / "bag", (ahead_m, 0.0, 0.0), 0.0, motion=circle), history=False)
     assert calibration.mounting.nominal_rpy_deg == (0.0, 0.0, 0.0)
@@ -89,9 +90,8 @@ def test_on_a_circle_a_displaced_dvl_is_not_taken_for_a_turned_one_and_its_yaw_i
     assert calibration.verdict == "reject" or abs(yaw_deg) < 3.0 * std_deg, (yaw_deg, std_deg, calibration.reasons)
 
 
-@pytest.mark.parametrize("late_s", [0.0, 1.3])
-@pytest.mark.spread(1)
-def test_spikes_of_both_streams_cost_no_calibration_and_are_counted(tmp_path, late_s):
+def test_spikes_of_both_streams_cost_no_calibration_and_are_counted(tmp_path):
+    late_s = 1.3
     calibration = dc.replay(
         recorded(tmp_path / "bag", (1.3, 0.2, 0.0), late_s, waves_mps=0.1, spikes=0.03), history=False
     )
@@ -120,10 +120,8 @@ def test_a_reference_that_claims_no_noise_is_not_suspected_for_being_better_than
     assert calibration.model == "full" and calibration.verdict == "accept", calibration.reasons
 
 
-@pytest.mark.parametrize("late_s", [0.0, 2.0])
-@pytest.mark.spread(1)
-def test_a_dvl_that_is_turned_and_displaced_is_found_to_be_turned(tmp_path, late_s):
-    bag = recorded(tmp_path / "bag", (1.0, 0.0, 0.0), late_s, (0.0, 0.0, np.pi / 2.0))
+def test_a_dvl_that_is_turned_and_displaced_is_found_to_be_turned(tmp_path):
+    bag = recorded(tmp_path / "bag", (1.0, 0.0, 0.0), 2.0, (0.0, 0.0, np.pi / 2.0))
     mounting = dc.replay(bag, history=False).mounting
     np.testing.assert_allclose(mounting.nominal_rpy_deg, (0.0, 0.0, 90.0), atol=1e-9)
     np.testing.assert_allclose(mounting.xyz_m[:2], (1.0, 0.0), atol=0.05)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -248,34 +246,3 @@ def test_a_command_that_is_ended_half_way_leaves_no_half_of_a_bag(tmp_path, numb
         assert process.stderr.read() == "dvl-calib simulate: interrupted\n"
     # Python makes the second of it where the interrupt went through an exec() of text; 130 to a shell, too
     assert process.returncode in (130, -signal.SIGINT) and os.listdir(tmp_path) == []
-
-
-@pytest.mark.spread(1)
-@pytest.mark.parametrize("answer", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
-def test_a_port_that_is_open_and_is_no_scheduler_is_said_within_ten_seconds(bag, tmp_path, capsys, answer):
-    pytest.importorskip("distributed", reason="Dask is optional: pip install distributed")
-    other = write_bag(tmp_path / "other", run(10.0))
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        connected = []
-
-        def accept() -> None:
-            while True:
-                try:
-                    connection, _ = server.accept()
-                except OSError:
-                    return
-                connected.append(connection)
-                if answer:
-                    connection.sendall(answer)
-
-        accepting = threading.Thread(target=accept, daemon=True)
-        accepting.start()
-        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        began = time.monotonic()
-        error = fail(capsys, "evaluate", bag, other, "--dask", address)
-        assert time.monotonic() - began < 10.0
-        assert f"--dask {address}: no scheduler answers there" in error
-        server.shutdown(socket.SHUT_RDWR)
-        accepting.join()
-        for connection in connected:
-            connection.close()

@@ -46,12 +46,7 @@ def said(command, bag, tmp_path, capsys, *options):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "late",
-    [
-        {"reference_time_offset": 30.0},
-        {"dvl_time_offset": 7.5},
-        {"attitude_time_offset": 2.0},
-        {"dvl_time_offset": 5.0, "reference_time_offset": 2.5},
-    ],
+    [{"attitude_time_offset": 2.0}, {"dvl_time_offset": 5.0, "reference_time_offset": 2.5}],
     ids=lambda late: ", ".join(f"{name[:3]} {seconds}" for name, seconds in late.items()),
 )
 def test_doctor_replay_and_diagnose_name_the_same_clock(late, tmp_path, capsys):
@@ -130,10 +125,10 @@ def test_at_one_speed_a_diagnosis_says_that_the_clock_may_be_an_arm_and_what_is_
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("late", "rate"), [(7.5, 1.0), (30.0, 5.0)])
-def test_on_legs_that_repeat_a_dvl_far_behind_is_found_and_calibrated_with(late, rate, tmp_path):
-    """It was a delay of 3 s, marginal; or 50 s early to diagnose."""
-    bag = bag_of(tmp_path, {"dvl_time_offset": late}, "lawnmower", dvl_rate=rate, gnss_rate=rate)
+def test_on_legs_that_repeat_a_dvl_far_behind_is_found_and_calibrated_with(tmp_path):
+    """It was a delay of 3 s, marginal."""
+    late = 7.5
+    bag = bag_of(tmp_path, {"dvl_time_offset": late}, "lawnmower", dvl_rate=1.0, gnss_rate=1.0)
     run = dc.replay(bag, history=False)
     assert run.verdict == "accept"
     assert run.replayed.result.parameters["dvl_time_offset"] == pytest.approx(late, abs=0.05 + 0.04 * late)

@@ -49,9 +49,9 @@ def bag_of(folder, reference_s=0.0, dvl_s=0.0, arm_m=0.0, hz=5):
     return write_bag(folder / "late", heapq.merge(imu, gnss, dvl, key=lambda sample: sample.stamp_ns))
 
 
-@pytest.mark.parametrize("seconds", [0.8, 7.5])
-def test_doctor_replay_and_diagnose_agree_on_how_late_a_reference_is(seconds, tmp_path, capsys):
+def test_doctor_replay_and_diagnose_agree_on_how_late_a_reference_is(tmp_path, capsys):
     """Diagnose could not tell the clock from a lever arm, which registration rules out by a chi-square of 300."""
+    seconds = 7.5
     bag = bag_of(tmp_path, reference_s=seconds)
     print(dc.doctor(bag))
     text = " ".join(capsys.readouterr().out.split())

@@ -31,10 +31,9 @@ LOOKED_FOR = {
     ("effects", "trajectory", "code"),
     [
         (["reference_lag:time_constant_s=1.5"], "free", "VELOCITY_SMOOTHED"),
-        pytest.param(["heading_error:sin_rad=0.1"], "free", "HEADING_DEVIATION", marks=pytest.mark.slow),
-        pytest.param(["lever_arm:x_m=-1.5"], "free", "LEVER_ARM_CONTRADICTED", marks=pytest.mark.slow),
-        pytest.param([], "straight", "ONE_HEADING", marks=pytest.mark.slow),
-        pytest.param([], "free", "", marks=pytest.mark.slow),
+        (["lever_arm:x_m=-1.5"], "free", "LEVER_ARM_CONTRADICTED"),
+        ([], "straight", "ONE_HEADING"),
+        ([], "free", ""),
     ],
 )
 def test_live_says_what_a_replay_says_and_what_it_saves_is_refused_as_well(effects, trajectory, code, tmp_path):
@@ -64,9 +63,8 @@ def test_live_says_what_a_replay_says_and_what_it_saves_is_refused_as_well(effec
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [36001, 34246])
-def test_of_random_surveys_what_a_replay_rejects_live_does_not_call_usable(seed, tmp_path):
-    write_survey(draw(seed), tmp_path / "bag")
+def test_of_a_random_survey_what_a_replay_rejects_live_does_not_call_usable(tmp_path):
+    write_survey(draw(36001), tmp_path / "bag")
     recording = open_recording([tmp_path / "bag"])
     found = discover(recording, Parameters())
     named = recording.of_types(found.topics, found.parameters)

@@ -107,18 +107,8 @@ def test_names_of_a_recording(bag, result, tmp_path, capsys, monkeypatch):
 def test_names_of_topics_and_of_what_is_not_there(bag, tmp_path, capsys):
     topic = said(capsys, "replay", bag, "--dvl-topic", EVIL, codes=(2,))
     assert "\\x1b[2J" in topic
-    for command in (
-        "replay",
-        "doctor",
-        "salvage",
-        "diagnose",
-        "evaluate",
-        "play",
-        "import",
-        "apply",
-        "compare",
-        "fleet",
-    ):
+    commands = "replay doctor salvage diagnose evaluate play import apply compare fleet"
+    for command in commands.split():
         said(capsys, command, tmp_path / FILE, "--" + EVIL, codes=(2,))
         said(capsys, command, tmp_path / FILE, codes=(2,))
     for option in (f"{EVIL}:=1", f"model:={EVIL}", f"min_speed:={EVIL}", f"initial_calibration:={EVIL}"):

@@ -11,9 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from conftest import searched
-from hypothesis import example, given
-from hypothesis import strategies as st
 from io_fixtures import replayed, run, selected_alone, write_bag
 
 from dvl_calib_ros.cli.command_line import build_parser
@@ -124,11 +121,6 @@ def the_same(folder: Path, path: Path) -> Path:
 
 
 @alias
-def absolute(folder: Path, path: Path) -> Path:
-    return folder / path
-
-
-@alias
 def roundabout(folder: Path, path: Path) -> Path:
     return Path("runs") / ".." / path
 
@@ -136,13 +128,6 @@ def roundabout(folder: Path, path: Path) -> Path:
 @alias
 def link(folder: Path, path: Path) -> Path:
     (folder / "alias").symlink_to(folder / path)
-    return Path("alias")
-
-
-@alias
-def link_to_a_link(folder: Path, path: Path) -> Path:
-    (folder / "first").symlink_to(folder / path)
-    (folder / "alias").symlink_to("first")
     return Path("alias")
 
 
@@ -335,52 +320,3 @@ def test_twins_that_are_there_already_are_refused_before_any_work(scratch, capsy
     folder = scratch()
     (folder / "twins" / "bag_with").mkdir(parents=True)
     assert "exists already" in refused(capsys, ["diagnose", "bag", "--twin", "twins"])
-
-
-PATHS = st.sampled_from(
-    ["bag/bag.mcap", "bag/metadata.yaml", "bag/new.json", "bag.mcap", "loose/x", "out", "out.bak", "out.bak.2", "link",
-     "link.bak", "up/out", "sub/../out", "params.yaml", "params.yaml.bak", "initial.yaml", "./out", "fifo", "dir"]
-)  # fmt: skip
-
-
-# Of inputs that may be in no way in the way
-HARMLESS = {"out", "bag.mcap", "loose/x"}
-
-
-@pytest.mark.slow
-@example(outputs=["out", "up/out"], target="out")  # one file by two names
-@example(outputs=["out.bak", "out"], target="out")
-@example(outputs=["link"], target="bag/bag.mcap")
-@example(outputs=["out", "bag.mcap", "loose/x"], target="out")
-@searched(60)
-@given(outputs=st.lists(PATHS, min_size=1, max_size=3), target=PATHS)
-def test_whatever_outputs_are_named_every_input_stays_as_it_is_and_the_code_says_what_happened(
-    original, tmp_path_factory, outputs, target
-):
-    folder = tmp_path_factory.mktemp("any") / "folder"
-    shutil.copytree(original, folder)
-    (folder / "link").symlink_to(target)
-    (folder / "up").symlink_to(".")
-    (folder / "dir").mkdir()
-    (folder / "sub").mkdir()
-    os.mkfifo(folder / "fifo")
-    before = snapshot(folder)
-    here = os.getcwd()
-    os.chdir(folder)
-    try:
-        words = COMMAND["replay"].arguments.split()
-        for option, output in zip(("--json", "--save", "--report"), outputs, strict=False):
-            words += [option, output]
-        code = main(words)
-    finally:
-        os.chdir(here)
-    after = snapshot(folder)
-    for name in ("bag/bag.mcap", "bag/metadata.yaml", "params.yaml", "initial.yaml"):
-        assert after[name] == before[name]
-    assert (folder / "fifo").is_fifo() and (folder / "link").is_symlink()
-    if code == 0:
-        written = {os.path.realpath(folder / output) for output in outputs}
-        assert len(written) == len(outputs) and all(map(os.path.isfile, written))
-    else:
-        assert code == 2 and after == before
-        assert not (set(outputs) <= HARMLESS and len(set(outputs)) == len(outputs))

@@ -8,7 +8,6 @@ import re
 import runpy
 import sys
 import types
-import warnings
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -103,15 +102,6 @@ def test_only_the_package_is_installed(monkeypatch):
     runpy.run_path(str(ROOT / "setup.py"))
     folders = {path.parent for path in MODULES}
     assert {name.replace(".", "/") for name in given["packages"]} == {str(path.relative_to(ROOT)) for path in folders}
-
-
-def test_no_file_gives_a_syntax_warning():
-    """Python 3.12 and later tell users of every one."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for folder in ("dvl_calib_ros", "benchmarks", "validation", "test", "launch", "examples"):
-            for path in (ROOT / folder).rglob("*.py"):
-                compile(path.read_text(encoding="utf-8"), str(path), "exec")
 
 
 class Anything:

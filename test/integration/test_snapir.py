@@ -41,7 +41,7 @@ def calibrate_on(folder: Path, time, velocity, errors, rng):
     return replay([folder / "bag"], Parameters()).result, counts
 
 
-@pytest.mark.parametrize("name", ["T01", "T05", "T09", "T13"])
+@pytest.mark.parametrize("name", ["T05", "T13"])
 def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, tmp_path, rng):
     result, written = calibrate_on(tmp_path, *trajectories[name], COMBINATIONS[5], rng)
     dvl, reference = result.counts["dvl"], result.counts["reference"]

@@ -10,7 +10,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from conftest import few
 from io_fixtures import live, write_bag
 from scipy.spatial.transform import Rotation
 
@@ -120,12 +119,10 @@ def in_the_earth(samples):
     return made
 
 
-YAW = {deg: (0.0, 0.0, math.radians(deg)) for deg in (45, 180)}
+YAW = {45: (0.0, 0.0, math.radians(45.0))}
 WRONG = {
     "yaw off by 45 degrees": (lambda: run(YAW[45]), {}, "MOUNTING_FITS"),
-    "yaw off by 180 degrees": (lambda: run(YAW[180]), {}, "MOUNTING_FITS"),
     "z flipped": (lambda: run((math.pi, 0.0, 0.0)), {}, "DVL_AXES_TURNED"),
-    "x and y swapped": (lambda: run((math.pi, 0.0, math.pi / 2)), {}, "MOUNTING_FITS"),
     "ENU, body claimed": (run, {"gnss_frame": "body"}, "REFERENCE_LOOKS"),
     # of the two next ones roll would tell, which a level vehicle does not show: 180 degrees of it are chance
     "ENU, NED claimed": (run, {"gnss_frame": "ned"}, "REFERENCE_OR_IMU_NED"),
@@ -141,9 +138,6 @@ WRONG = {
     "rates in degrees": (lambda: rates(run(), np.degrees), {}, "RATES_DEGREES"),
     "a compass heading as yaw": (lambda: with_a_compass(run()), {}, "HEADING_CLOCKWISE"),
     "a DVL in ENU": (lambda: in_the_earth(run()), {}, "DVL_TURNS_WITH_HEADING"),
-    "a DVL in ENU, body claimed": (
-        lambda: in_the_earth(run()), {"gnss_frame": "body"}, "DVL_TURNS_WITH_HEADING",
-    ),
     "a vehicle that stands": (
         lambda: [s._replace(velocity=(0.0, 0.0, 0.0)) if not isinstance(s, ImuSample) else s for s in run()], {},
         "NO_SAMPLE_USED",
@@ -156,12 +150,6 @@ def codes(reasons):
     return {each.code for each in reasons}.union(*(codes(each.causes) for each in reasons))
 
 
-WAITED_FOR = (
-    "yaw off by 45 degrees", "z flipped", "ENU, body claimed", "NED, ENU claimed", "rates negated", "a DVL in ENU",
-    "a reference with the DVL in it", "a vehicle that stands",
-)  # fmt: skip
-
-
 def test_an_effect_beyond_the_model_is_noise_and_no_calibration_is_better_for_it(tmp_path):
     result = replay([write_bag(tmp_path / "bag", swinging(run(gnss_std=0.01)))], Parameters()).result
     verification = result.verifications[result.selected]
@@ -170,7 +158,7 @@ def test_an_effect_beyond_the_model_is_noise_and_no_calibration_is_better_for_it
 
 
 @pytest.mark.spread(2)
-@pytest.mark.parametrize("wrong", few(WRONG, WAITED_FOR))
+@pytest.mark.parametrize("wrong", WRONG)
 def test_a_bag_of_a_wrong_configuration_is_rejected_with_what_fits_and_apply_refuses_it(wrong, tmp_path, capsys):
     samples, given, code = WRONG[wrong]
     result = replay([write_bag(tmp_path / "bag", samples())], Parameters(**given)).result

@@ -22,7 +22,6 @@ from test_node import Publisher, node_here, received, twist
 from dvl_calib_ros.bags.writer import Compression, Storage
 from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.disk.text_files import load_yaml
-from dvl_calib_ros.node.transforms import Transforms
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -163,14 +162,3 @@ def test_no_transform_is_broadcast_unless_asked_for(world, monkeypatch):
     with node_here(world):
         pass
     assert not SENT
-
-
-def test_own_transforms_are_known_by_what_they_say(world):
-    transforms = Transforms(world.node)
-    mine, other = TransformStamped(), TransformStamped()
-    mine.child_frame_id, other.child_frame_id = "dvl_link", "imu_link"
-    transforms.own(mine)
-    transforms._on_transforms(SimpleNamespace(transforms=[mine]))
-    assert not transforms.heard and not transforms.has("dvl_link")
-    transforms._on_transforms(SimpleNamespace(transforms=[mine, other]))
-    assert transforms.heard == 1 and transforms.has("imu_link")

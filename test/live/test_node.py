@@ -36,7 +36,6 @@ from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.demo.player import BagPlayer
 from dvl_calib_ros.disk.text_files import load_yaml
-from dvl_calib_ros.files.result_file import result_document, save_result
 from dvl_calib_ros.node.calibration_node import CalibrationNode
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -104,9 +103,8 @@ def test_the_node_and_the_replay_of_one_bag_agree_in_every_model(scenario, world
         assert len(offline.segments) == 4
 
 
-@pytest.mark.parametrize("model", ["auto", "F1"])
-def test_the_papers_own_selection_is_published_whatever_is_selected(model, world, bag):
-    with world.calibration_node(f"model:={model}", *as_arguments(PATIENT)):
+def test_the_papers_own_selection_is_published_whatever_is_selected(world, bag):
+    with world.calibration_node("model:=F1", *as_arguments(PATIENT)):
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         got = world.received(TwistWithCovarianceStamped, f"{NODE}/iac/estimate", LATCHED)
         sent = play(world, bag)
@@ -137,35 +135,6 @@ def test_the_result_is_saved_whichever_way_the_node_is_stopped(stop, world, tmp_
     assert load_yaml(saved, "result file")["model"] == "F1"
 
 
-def test_a_node_that_a_signal_ends_early_keeps_the_better_result_and_puts_its_own_next_to_it(world, tmp_path, bag):
-    saved, beside = tmp_path / "live.yaml", tmp_path / "live.newer.yaml"
-    save_result(saved, result_document(replay([bag], Parameters()).result), 3)
-    better = saved.read_bytes()
-    with world.calibration_node(f"result_file:={saved}") as process:
-        told = world.received(DiagnosticArray, "/diagnostics")
-        Publisher(world).send(*(twist(1000 + 0.2 * i) for i in range(10)))
-        until(
-            lambda: told and {each.key: each.value for each in told[-1].status[0].values}["dvl received"] == "10", "all"
-        )
-    last = process.output.splitlines()[-1]
-    assert process.returncode == 0 and f"{saved} is kept, which is better" in last and str(beside) in last
-    assert saved.read_bytes() == better and load_yaml(beside, "result file")["used"] == 10
-
-
-def test_a_node_that_gets_no_data_leaves_the_result_before_and_its_backup_as_they_are(world, tmp_path, bag):
-    saved = tmp_path / "live.yaml"
-    good = replay([bag], Parameters()).result
-    for _ in range(2):
-        save_result(saved, result_document(good), 3)
-    before = {path.name: path.read_bytes() for path in tmp_path.glob("live*")}
-    assert len(before) == 2
-    with world.calibration_node(f"result_file:={saved}") as process:
-        diagnostics = world.received(DiagnosticArray, "/diagnostics")
-        until(lambda: diagnostics, "the node to run")
-    assert process.returncode == 0 and "no sample was used" in process.output
-    assert {path.name: path.read_bytes() for path in tmp_path.glob("live*")} == before
-
-
 def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_lost(world, tmp_path):
     folder = tmp_path / "gone"
     folder.mkdir()
@@ -182,8 +151,6 @@ def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_l
     "arguments, said",
     [
         (["-p", "gnss_timout:=2.0"], "gnss_timout: no such parameter, did you mean 'gnss_timeout'?"),
-        (["-p", "gnss_timeout:=-1.0"], "gnss_timeout: -1 is outside"),
-        (["-p", "mounting_rpy:=[0.0, 1.0]"], "mounting_rpy: expected an array of 3 numbers"),
         (["-p", "prior_source:=reference"], "prior_source: reference needs recorded data"),
         (["-p", "result_file:=/no/such/folder/r.yaml"], "the folder /no/such/folder does not exist"),
         (["-p", "initial_calibration:=/no/such/file"], "/no/such/file: no such result file"),
@@ -353,11 +320,6 @@ def test_every_parameter_is_declared_with_type_range_and_description(world):
         assert node.get_parameter("gnss_timeout").value == 3.0
 
 
-def test_whole_numbers_are_accepted_for_doubles_at_the_start(world):
-    with node_here(world, gnss_timeout=3, lever_arm=[1, 0, 2]) as node:
-        assert list(node.get_parameter("lever_arm").value) == [1.0, 0.0, 2.0]
-
-
 def test_whole_numbers_are_accepted_for_doubles_in_a_file_and_live(world, tmp_path):
     """By ``NAME: 5`` in a file and ``ros2 param set NAME 5`` it is an integer."""
     file = tmp_path / "whole.yaml"
@@ -474,14 +436,6 @@ def test_best_effort_and_reliable_publishers_are_both_heard(world):
         until(lambda: heard(first.send), "a sample of the reliable publisher, still")
 
 
-def test_a_bag_that_loops_is_said_and_the_calibration_starts_anew(world, bag, tmp_path):
-    with node_here(world, **PATIENT) as node:
-        play(world, bag)
-        until(lambda: received(node) == 450, "the first round")
-        play(world, bag)
-        until(lambda: node._calibrator.restarts == 1 and received(node) == 450, "the second round")
-
-
 def test_wrong_frames_and_a_silent_dvl_are_named_in_the_diagnostics(world):
     with node_here(world) as node:
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
@@ -517,16 +471,6 @@ def test_calibrated_twist_is_the_corrected_velocity_in_the_body_with_both_uncert
         assert got[-1].header.frame_id == "base_link"
         assert (np.diag(covariance)[:3] > 0.99e-4).all() and covariance[1, 1] > covariance[0, 0]
         assert (np.diag(covariance)[3:] == -1.0).all()
-
-
-def test_messages_without_a_stamp_are_taken_at_their_reception_and_said(world):
-    with node_here(world) as node:
-        dvl = Publisher(world)
-        for i in range(3):
-            dvl.send(twist(0.0))
-            until(lambda i=i: received(node) == i + 1, "the sample")
-        assert node._feed.decoder.zero_stamps == 3
-        assert node._calibrator.counts["dvl"]["accepted"] == 3
 
 
 def test_the_node_runs_on_simulated_time_that_stands_still(world):

@@ -227,12 +227,3 @@ def test_benchmarks_are_taken_from_files_of_different_parts_and_only_their_ratio
     with pytest.raises(InputError, match=r"none\.json: is not of `python -m benchmarks --json`"):
         performance.benchmarks(tmp_path)
     performance.take([])
-
-
-def test_a_picture_of_sections_shows_these_alone_and_where_a_report_has_none_there_is_no_picture():
-    """The heading had become one of another level, and the picture was written without a word and empty."""
-    page = "<head></head><main><h2>Effects</h2>a<h2>lever_arm: measured</h2>b<h2>delay: measured</h2>c<h2>Noise</h2>d"
-    shown = "<head></head><main><h2>lever_arm: measured</h2>b<h2>delay: measured</h2>c"
-    assert pictures.only_sections(page, ": measured") == shown
-    with pytest.raises(InputError, match="no section ': as it was'"):
-        pictures.only_sections(page, ": as it was")

@@ -12,10 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import searched
 from driver_fixtures import A50, Maker, forget_definitions, write_driver_bag
-from hypothesis import HealthCheck, given
-from hypothesis import strategies as st
 from io_fixtures import JAZZY, TOPICS, estimates, mcap_bytes, raw, raw_and_notes, replayed, run, storage_file, write_bag
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
@@ -23,36 +20,19 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from dvl_calib_ros.bags import channels, sources
-from dvl_calib_ros.bags.channels import Channel, DecodingError, Definition, is_empty
+from dvl_calib_ros.bags.channels import is_empty
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Storage
 from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS, TWIST_TYPE
+from dvl_calib_ros.messages.drivers import TWIST_TYPE
 from dvl_calib_ros.recordings.recording import open_bags, open_recording
 
 # ---------------------------------------------------------------------- names
 
 HOSTILE = [
-    "run#1",
-    "run%31",
-    "run?mode=memory",
-    "run²_1",
-    "run%",
-    "a b",
-    "日本",
-    "-x",
-    "~",
-    "'",
-    '"',
-    ";",
-    "..a",
-    "$HOME",
-    "#",
-]
-names = st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="/\0"), min_size=1, max_size=30).filter(
-    lambda name: name not in (".", "..") and len(name.encode()) < 90
-)
+    "run#1", "run%31", "run?mode=memory", "run%", "a b", "日本", "-x", "~", "'", '"', ";", "..a", "$HOME", "#",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -73,12 +53,6 @@ def copy(bag: Path, target: Path) -> Path:
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_names_are_names_to_reading_salvage_and_writing(tmp_path, bags, kind, name):
     check_name(tmp_path, bags, kind, name)
-
-
-@searched(40, HealthCheck.function_scoped_fixture)
-@given(name=names, kind=st.sampled_from(["mcap", "sqlite3"]))
-def test_any_name_is_a_name_to_reading_salvage_and_writing(tmp_path_factory, bags, kind, name):
-    check_name(tmp_path_factory.mktemp("any"), bags, kind, name)
 
 
 def check_name(folder: Path, bags: dict[str, Path], kind: str, name: str) -> None:
@@ -425,21 +399,6 @@ def test_what_does_not_fit_of_a_library_is_no_damage(bags, tmp_path, monkeypatch
         list(reader.messages(reader.topics))
 
 
-def test_what_a_damaged_definition_makes_of_messages_is_told_of_each(tmp_path):
-    bad = [
-        "float64 a\nfloat64 a\n", "geometry_msgs/Nowhere a\n", "float64[99999999] a\n", "float128 a\n", "x y z\n",
-        "a/B self\n", "float64 class\n", "float64[] a\nstring<=3 b\n",
-    ]  # fmt: skip
-    for text in bad:
-        decoder = channels.Decoder(KNOWN_DEFINITIONS)
-        channel = Channel("a", "a/msg/B", Definition(channels.FORMATS["ros2msg"], text))
-        for data in (b"", b"\0\1\0\0", b"\0\1\0\0" + bytes(range(64)), b"\0\0\0\0" + b"\xff" * 64):
-            try:
-                decoder(channel, data)
-            except DecodingError as error:
-                assert str(error)
-
-
 @pytest.mark.parametrize("options", [{}, {"use_chunking": False}])
 @pytest.mark.parametrize("log_times", [(5, 2**64 - 1, 2**63, 7), (2**64 - 1,) * 4, (2**63 - 1,) * 4])
 def test_log_times_beyond_all_reason_are_no_reason_to_stop(tmp_path, log_times, options):
@@ -451,56 +410,6 @@ def test_log_times_beyond_all_reason_are_no_reason_to_stop(tmp_path, log_times, 
         expected = [(topic, min(log_ns, latest_ns), data) for topic, log_ns, data in messages]
         assert sorted(raw(tmp_path / kind)) == sorted(expected)
         assert main(["doctor", str(tmp_path / kind)]) == 1  # four messages are too few
-
-
-@pytest.mark.parametrize(
-    ("kind", "topic", "wild_ns"),
-    [
-        ("index", "chatter", 2**64 - 1),
-        ("index", "imu/data", 10**18),
-        ("flat", "chatter", 0),
-        ("flat", "imu/data", 2**63),
-        ("sqlite3", "chatter", 2**62),
-        ("sqlite3", "imu/data", 2**63 - 1),
-    ],
-)
-def test_a_wild_log_time_costs_no_more_than_its_message(tmp_path, capsys, kind, topic, wild_ns):
-    """One message of another topic, or one of the IMU: rates were 1e-7 Hz, and pauses centuries long."""
-    samples = raw(write_bag(tmp_path / "bag", run(60.0)))
-    text = bytes(JAZZY.serialize_cdr(JAZZY.types["std_msgs/msg/String"]("x"), "std_msgs/msg/String"))
-    number = next(number for number in range(500, 600) if samples[number][0] == "imu/data")
-    sound = samples if topic == "chatter" else samples[:number] + samples[number + 1 :]
-    data = text if topic == "chatter" else samples[number][2]
-    rows = [*sound[:number], (topic, wild_ns, data), *sound[number:]]
-    definitions = {"chatter": ("std_msgs/msg/String", "string data\n")}
-    if kind == "sqlite3":
-        with BagWriter(tmp_path / "wild", Storage.SQLITE3) as bag:
-            for name, log_ns, content in rows:
-                msgtype, of_type = definitions.get(name) or (TOPICS[name], JAZZY.generate_msgdef(TOPICS[name])[0])
-                bag.raw(Channel(name, msgtype, Definition(channels.FORMATS["ros2msg"], of_type)), log_ns, content)
-        path = tmp_path / "wild"
-    else:
-        path = tmp_path / "wild.mcap"
-        path.write_bytes(mcap_bytes(rows, definitions, use_chunking=kind == "index"))
-    (tmp_path / "sound.mcap").write_bytes(mcap_bytes(sound))
-    one, other = open_recording([tmp_path / "sound.mcap"]), open_recording([path])
-    assert other.file_spans_ns == one.file_spans_ns
-    assert {name: look.rate_hz for name, look in other.survey.looks.items()} == {
-        name: look.rate_hz for name, look in one.survey.looks.items()
-    }
-    is_named = [f"{topic}: 1 of 1200 messages are set aside" in note for note in other.notes]
-    assert is_named == [True] * (topic == "imu/data")
-    assert main(["doctor", str(path)]) == 0
-    assert "GAPS" not in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("days", [-6, -1, 1, 6])
-def test_topics_are_found_where_a_log_time_is_off_by_days(tmp_path, days):
-    samples = raw(write_bag(tmp_path / "bag", run(60.0)))
-    chatter = ("chatter", samples[500][1] + days * 86_400 * 10**9, b"\0\1\0\0\2\0\0\0x\0")
-    definitions = {"chatter": ("std_msgs/msg/String", "string data\n")}
-    (tmp_path / "wild.mcap").write_bytes(mcap_bytes([*samples, chatter], definitions))
-    assert set(open_recording([tmp_path / "wild.mcap"]).survey.looks) == set(TOPICS)
 
 
 def raw_twists():

@@ -372,19 +372,6 @@ def test_corrupt_bytes_in_a_sqlite_file_raise_nothing_but_input_error(tmp_path, 
     assert len(found) <= len(messages())
 
 
-def test_a_replay_of_a_damaged_bag_equals_that_of_what_is_whole_in_it(tmp_path):
-    samples = run(40.0)
-    bag = write_bag(tmp_path / "bag", samples, compression="chunk")
-    file = storage_file(bag)
-    os.truncate(file, file.stat().st_size // 2)
-    damaged = replayed(bag)
-    count = sum(damaged.result.counts[name]["received"] for name in ("dvl", "reference", "imu"))
-    whole = replayed(write_bag(tmp_path / "whole", samples[:count])).result
-    assert 0 < count < len(samples)
-    assert [*damaged.result.estimates["M3"].state] == [*whole.estimates["M3"].state]
-    assert any(f"{count} whole messages" in note for note in damaged.notes)
-
-
 def test_a_message_that_cannot_be_decoded_is_counted_and_skipped_and_told_of_once(tmp_path):
     broken = [
         (topic, log_ns, data[: 20 + i % 7] if topic == "dvl/twist" and i % 5 == 0 else data)
@@ -460,20 +447,6 @@ def test_a_file_without_permission_is_named_in_one_line(tmp_path, capsys, monkey
     monkeypatch.setattr(os, "open", denied)
     assert main(["replay", str(bag)]) == 2
     assert "Permission denied" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
-def test_of_a_folder_with_a_damaged_a_missing_and_an_empty_file_the_rest_is_read(tmp_path, kind):
-    bag = write_bag(tmp_path / "bag", run(6.0), kind)
-    file = storage_file(bag)
-    whole, suffix = file.read_bytes(), file.suffix
-    for name, data in (("bag_2", whole[: len(whole) // 2]), ("bag_3", b"")):
-        (bag / f"{name}{suffix}").write_bytes(data)
-    (bag / "metadata.yaml").unlink()
-    found, notes = raw_and_notes(bag)
-    assert len(raw(file)) < len(found) <= 2 * len(raw(file))
-    assert any("bag_2" in note and "whole messages" in note for note in notes)
-    assert any("bag_3" in note and "empty" in note for note in notes)
 
 
 def test_a_database_whose_journal_is_lost_gives_what_the_database_holds(tmp_path):

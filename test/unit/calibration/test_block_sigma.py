@@ -58,10 +58,9 @@ def test_the_full_model_finds_noise_that_lasts_by_itself():
     np.testing.assert_array_equal(lasting.recording_covariance, lasting.filter_covariance)
 
 
-@pytest.mark.parametrize("block_size", [1, 500])
-def test_how_samples_are_gathered_changes_nothing(block_size):
+def test_how_samples_are_gathered_changes_nothing():
     names = ("M3", "full", "F1", "A1")
-    one, other = (calibrate(run(0.1, **ONE_HERTZ), CLAIMED, block_size=size, models=names) for size in (64, block_size))
+    one, other = (calibrate(run(0.1, **ONE_HERTZ), CLAIMED, block_size=size, models=names) for size in (64, 1))
     for name in names:
         found = one.estimate(name).covariance, other.estimate(name).covariance
         np.testing.assert_allclose(*found, rtol=1e-7, atol=1e-12)
@@ -144,7 +143,7 @@ def mean_of(noise):
 
 @pytest.mark.parametrize(
     ("lasts", "number", "least", "most"),
-    [(0.0, 640, 0.8, 1.1), (20.0, 640, 0.7, 1.1), (60.0, 640, 0.7, 1.2), (10.0, 250, 0.8, 1.3), (0.0, 250, 0.8, 1.1)],
+    [(0.0, 640, 0.8, 1.1), (60.0, 640, 0.7, 1.2), (10.0, 250, 0.8, 1.3)],
 )
 def test_noise_that_lasts_longer_than_the_longest_blocks_is_in_sigma(lasts, number, least, most):
     """Of 640 samples blocks of 80 are the longest that there are enough of, of 250 those of 30."""

@@ -12,7 +12,7 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 
 pytestmark = pytest.mark.slow  # hundreds of simulated runs
 
-N_RUNS = 100
+N_RUNS = 60
 
 
 def normalised_estimation_error_squared(**options) -> dict[str, np.ndarray]:

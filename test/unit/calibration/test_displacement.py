@@ -26,7 +26,7 @@ def test_half_an_hour_of_positions_with_2_m_of_noise_tells_yaw_and_scale(kind):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", NOISES)
+@pytest.mark.parametrize("kind", ["lasts_2_min", "outliers"])
 def test_sigma_covers(kind):
     """Of thirty runs each."""
     inside = []

@@ -46,12 +46,11 @@ def test_a_reference_that_the_dvl_went_into_is_told_by_its_noise(rates, late):
 
 @pytest.mark.parametrize("late", [0.0, 0.4])
 @pytest.mark.parametrize("rates", [(5.0, 1.0), (8.0, 2.0), (25.0, 1.0)])
-@pytest.mark.parametrize("seed", range(3))
-def test_a_slow_reference_is_told_by_the_noise_of_the_samples_beside_it(rates, late, seed):
-    assert judged(*streams(*rates, shared=1.0, late=late, seed=seed)).contradiction().code == "REFERENCE_HOLDS_DVL"
+def test_a_slow_reference_is_told_by_the_noise_of_the_samples_beside_it(rates, late):
+    assert judged(*streams(*rates, shared=1.0, late=late)).contradiction().code == "REFERENCE_HOLDS_DVL"
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("rates", [(5.0, 1.0), (8.0, 2.0), (25.0, 1.0)])
 @pytest.mark.parametrize("waves", [{"amplitude": 0.3, "period": 4.0}, {"amplitude": 0.1, "period": 1.0}, {}])
 def test_a_slow_instrument_of_its_own_shares_none(rates, waves, seed):
@@ -63,7 +62,7 @@ def test_half_of_it_is_told_as_well():
     assert 0.25 < judged(*streams(shared=0.5)).share() < 0.6
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     "rates", [(5.0, 5.0), (5.0, 10.0), (10.0, 5.0), (5.0, 1.0), (1.0, 5.0), (1.0, 1.0), (25.0, 5.0)]
 )
@@ -71,15 +70,15 @@ def test_an_instrument_of_its_own_shares_none(rates, seed):
     assert judged(*streams(*rates, seed=seed)).contradiction() is None
 
 
-@pytest.mark.parametrize("period", [0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 6.0])
-@pytest.mark.parametrize("amplitude", [0.02, 0.1, 0.5])
+@pytest.mark.parametrize("period", [0.5, 1.0, 2.0, 6.0])
+@pytest.mark.parametrize("amplitude", [0.02, 0.5])
 @pytest.mark.parametrize("reference_std", [0.003, 0.03])
 def test_short_waves_that_both_measure_are_no_noise_that_both_have(period, amplitude, reference_std):
     found = judged(*streams(amplitude=amplitude, period=period, reference_std=reference_std, dvl_std=0.005))
     assert found.contradiction() is None
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("pushed", [0.003, 0.01, 0.05])
 @pytest.mark.parametrize("dvl_std", [0.001, 0.003, 0.01])
 def test_a_vehicle_that_is_pushed_anew_with_every_sample_is_no_noise_that_both_have(pushed, dvl_std, seed):

@@ -34,7 +34,7 @@ def registered(trajectory: str, whose: str = "", drift: float = 0.0, leap: float
     return found
 
 
-@pytest.mark.parametrize("trajectory", ["lawnmower", "box", "figure8", "free"])
+@pytest.mark.parametrize("trajectory", ["box", "free"])
 def test_clocks_that_stand_still_do(trajectory):
     assert registered(trajectory).unsteady is None
 
@@ -59,8 +59,8 @@ def test_noise_that_lasts_as_long_as_blocks_of_a_stretch_is_no_drift():
     assert found(3.5) is None
 
 
-@pytest.mark.spread(3)
-@pytest.mark.parametrize("seconds", [0.3, 1.0, -3.0, 5.0])
+@pytest.mark.spread(2)
+@pytest.mark.parametrize("seconds", [0.3, -3.0])
 @pytest.mark.parametrize("whose", ["dvl", "reference"])
 def test_one_leap_is_found_with_its_size_and_time(whose, seconds):
     found = registered("figure8", whose, leap=seconds)

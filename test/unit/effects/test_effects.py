@@ -309,12 +309,6 @@ def test_coloured_noise_has_the_size_and_the_correlation_time_given(rng):
 # ------------------------------------------------------------------ registry and plug-ins
 
 
-def test_the_registry_holds_own_effects_first_and_one_instance_of_each():
-    assert list(EFFECTS)[: len(OWN_EFFECTS)] == list(OWN_EFFECTS)
-    assert EFFECTS["lever_arm"] is EFFECTS["lever_arm"] and EFFECTS["lever_arm"].acts_on is ActsOn.MOTION
-    assert not set(EFFECTS) & set(NOISE_EFFECTS)
-
-
 PLUGIN = ROOT / "test" / "effect_plugin"
 
 
@@ -393,11 +387,6 @@ def test_a_broken_plug_in_is_named_in_one_line(monkeypatch, value, said):
 def own_rows() -> list[str]:
     """Of the table, without plug-ins that are installed here."""
     return [row for row in effect_table().splitlines()[2:] if row.split("`")[1] in {**OWN_EFFECTS, **OWN_NOISE}]
-
-
-def test_the_table_of_effects_has_one_row_of_five_cells_for_each():
-    assert [row.split("`")[1] for row in own_rows()] == [*OWN_EFFECTS, *OWN_NOISE]
-    assert all(row.count("|") == 6 for row in own_rows())
 
 
 def test_the_readme_lists_the_effects():

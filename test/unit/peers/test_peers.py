@@ -18,14 +18,14 @@ from dvl_calib_ros.errors import InputError
 from validation.__main__ import main
 from validation.peers import needed as libraries
 from validation.peers.asked import PEERS, ask, peers
-from validation.peers.command import asked_anew, generator_cases
+from validation.peers.command import asked_anew
 from validation.peers.foreign import foreign_cases, has_physics, record_foreign
 from validation.peers.forward import CLOCKS, LINEAR, Clock, Forward
 from validation.peers.scores import is_right, sides, tables
 from validation.peers.search import Fitted, Member, Search, Whitening, residual_of_all, sizes_of
 from validation.peers.streams import read_streams
 from validation.trial.generator import record
-from validation.trial.plan import Case, Family
+from validation.trial.plan import Case
 from validation.trial.run import Trial, read_answers
 from validation.trial.truth import Category, unseal
 from validation.trial.vehicle import FAULTS
@@ -82,7 +82,8 @@ def fitted(recorded, name):
 ALWAYS_THERE = [name for name in (*LINEAR, *CLOCKS) if name != "water_lock"]
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) for n in ALWAYS_THERE[3:]] + ALWAYS_THERE[:3])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ALWAYS_THERE[::3])
 def test_the_forward_model_means_by_an_effect_what_the_generator_means(name, tmp_path):
     """Written apart, the two agree on sign, size and frame of every effect."""
     kind = "free" if name != "sideslip" else "figure8"
@@ -116,11 +117,6 @@ def test_a_library_that_is_missing_is_told_in_one_line(monkeypatch, capsys, tmp_
     monkeypatch.undo()
     assert main(["peers", "--cases", "0"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_nothing_is_asked_for_anew_where_nothing_was_answered(capsys, tmp_path):
-    assert main(["peers", "--anew", "--peer", "correlation", "--out", str(tmp_path / "none")]) == 2
-    assert "has no answers" in capsys.readouterr().err and not (tmp_path / "none").exists()
 
 
 # ------------------------------------------------------------------ side by side
@@ -168,14 +164,6 @@ def test_who_is_asked_beside_is_asked_of_the_same_bags_and_scored_with_the_same_
     assert everything[0] == "all"
     assert [row[:2] for row in everything[2]] == [("diagnose", "2"), ("other", "2")]
     assert everything[2][1][-1] == "1 / 1 (1)"
-
-
-def test_cases_take_turns_over_the_classes():
-    cases = generator_cases(40)
-    counts = {(c.family, c.category) for c in cases[:10]}
-    assert (Family.SIMULATED, Category.UNKNOWN) in counts and (Family.SIMULATED, Category.PAIR) in counts
-    assert generator_cases(10) == cases[:10]
-    assert not [c for c in cases if c.category is Category.SINGLE and c.family is Family.SIMULATED and c.q < 12.0]
 
 
 @pytest.mark.skipif(not has_physics(), reason="the traps' physics is not there (DVL_CALIB_SHARED)")

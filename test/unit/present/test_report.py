@@ -67,8 +67,8 @@ def test_the_held_out_errors_of_every_model_are_shown(made):
         assert page.row(name)[1:] == [*numbers, str(error.samples), verification.verdict.value]
 
 
-@pytest.mark.slow
-def test_without_verification_the_report_says_so(tmp_path, made):
+def test_without_verification_the_report_says_so(tmp_path, made, monkeypatch):
+    drawn(monkeypatch)
     replayed = made[1]
     unverified = replace(replayed, result=replace(replayed.result, verifications={}))
     write_replay_report(tmp_path / "report.html", unverified, [tmp_path], FEW)
@@ -126,12 +126,8 @@ def test_the_static_transform_can_be_pasted(made):
     assert "ros2 run tf2_ros static_transform_publisher --x 0 --y 0 --z 0 --qx" in made[0].text
 
 
-def test_the_type_of_the_dvls_data_is_shown(made):
-    assert "DVL data geometry_msgs/msg/TwistWithCovarianceStamped" in made[0].text
-
-
-@pytest.mark.slow
-def test_warnings_are_shown(tmp_path):
+def test_warnings_are_shown(tmp_path, monkeypatch):
+    drawn(monkeypatch)
     samples = [sample for sample in run() if isinstance(sample, DvlSample)]
     path, replayed = replay_page(tmp_path, samples)
     text = Page(path).text
@@ -157,13 +153,12 @@ def test_models_can_be_told_apart_and_look_the_same_everywhere():
     assert len(set(MODEL_STYLES.values())) == len(MODELS)
 
 
-@pytest.mark.slow
-def test_the_same_data_gives_the_same_figures(tmp_path, made):
-    again = tmp_path / "again.html"
-    bag = tmp_path / "bag"
-    write_replay_report(again, made[1], [bag], FEW)
-    write_replay_report(tmp_path / "twice.html", made[1], [bag], FEW)
-    assert Page(again).images() == Page(tmp_path / "twice.html").images() != []
+def test_the_same_data_gives_the_same_figures(tmp_path):
+    pages = []
+    for path in (tmp_path / "once.html", tmp_path / "again.html"):
+        write_report(path, evaluation(each=None, held_out=(), coverage=(), convergence=()))
+        pages.append(Page(path))
+    assert pages[0].images() == pages[1].images() != []
 
 
 # ------------------------------------------------------------------ self-contained and safe
@@ -239,8 +234,8 @@ def test_a_figure_that_is_not_over_time_has_no_data_for_the_script():
 # ------------------------------------------------------------------ unusual data
 
 
-@pytest.mark.slow
-def test_a_bag_without_gnss_has_no_residuals(tmp_path):
+def test_a_bag_without_gnss_has_no_residuals(tmp_path, monkeypatch):
+    drawn(monkeypatch)
     samples = [sample for sample in run() if not isinstance(sample, ReferenceSample)]
     page = Page(replay_page(tmp_path, samples)[0])
     assert "Too few of them have a reference for residuals" in page.text
@@ -248,17 +243,10 @@ def test_a_bag_without_gnss_has_no_residuals(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("count", [1, 2])
 def test_a_report_of_hardly_any_samples(tmp_path, count):
     page = Page(replay_page(tmp_path, steady_run(count))[0])
     assert f"{count} of the DVL" in page.text and len(page.images()) > 3
-
-
-@pytest.mark.slow
-def test_a_vehicle_that_stands_still(tmp_path):
-    still = [sample._replace(velocity=(0.0, 0.0, 0.0)) for sample in steady_run(50)]
-    page = Page(replay_page(tmp_path, still)[0])
-    assert "50 slow" in page.text
 
 
 def test_the_hours_between_two_bags_are_cut_out():
@@ -365,12 +353,6 @@ def test_a_report_that_cannot_be_written_is_refused_before_the_replay(tmp_path, 
     assert "--report" in message and "--json" in message and not same.exists()
 
 
-def test_a_bad_bag_leaves_no_report(tmp_path, capsys):
-    report = tmp_path / "report.html"
-    fail(capsys, "replay", tmp_path / "none", "--report", report)
-    assert not report.exists()
-
-
 def test_without_the_plot_library_the_message_says_what_to_install(tmp_path, capsys, monkeypatch):
     for name in [name for name in sys.modules if name.startswith("dvl_calib_ros.present")]:
         monkeypatch.delitem(sys.modules, name)
@@ -394,19 +376,16 @@ def test_the_summary_of_an_evaluation_names_the_best_of_each_kind(evaluated):
     assert re.search(f"best without GNSS [0-9.]+ m/s {best_free}, ", evaluated.text)
 
 
-@pytest.mark.slow
-def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(tmp_path):
-    path = tmp_path / "evaluation.html"
-    write_report(path, evaluation())
-    html = path.read_text()
+def test_a_score_stands_beside_the_published_one_coloured_by_its_deviation(evaluated):
+    html = evaluated.source
     assert re.search('<td[^>]* class="good"[^>]*>0.0300<small>0.0301 ×1.00</small></td>', html)
     assert ' class="bad"' in html  # M2, far from the 0.10 of the made-up publication
     last = list(MODELS)[-1]
-    assert Page(path).row(last)[2:4] == ["–", "–"]  # no attitude there: neither the set nor the mean
+    assert evaluated.row(last)[2:4] == ["–", "–"]  # no attitude there: neither the set nor the mean
 
 
-@pytest.mark.slow
-def test_own_trajectories_are_not_compared_with_the_published_figures(tmp_path):
+def test_own_trajectories_are_not_compared_with_the_published_figures(tmp_path, monkeypatch):
+    drawn(monkeypatch)
     path = tmp_path / "evaluation.html"
     write_report(path, evaluation(own_generator=True))
     page = Page(path)

@@ -100,20 +100,6 @@ def test_a_recording_without_far_stamps_is_the_one_that_was_opened(tmp_path):
     np.testing.assert_array_equal(own.values, np.delete(other.values, 3, axis=0))
 
 
-def test_a_recorder_without_a_clock_does_not_make_the_recording_decades_long(tmp_path):
-    with BagReader([write_bag(tmp_path / "sound", run(20.0))]) as bag:
-        messages = [(topic, log_ns, message) for topic, log_ns, message, _ in bag.messages(TOPICS)]
-    first_ns = messages[0][1]
-    with BagWriter(tmp_path / "bag") as bag:
-        for topic, log_ns, message in messages:
-            bag.message(topic, TOPICS[topic], log_ns - (first_ns if log_ns < first_ns + 4 * S else 0), message)
-    recording = open_recording([tmp_path / "bag"])
-    start_ns, end_ns = recording.span_ns
-    assert start_ns >= first_ns + 4 * S and end_ns == messages[-1][1]
-    assert len(recording.notes) == 3
-    assert all("recorded from 1970-01-01 00:00:00 to 1970-01-01 00:00:03 UTC" in note for note in recording.notes)
-
-
 @pytest.mark.parametrize("kind", TYPES)
 def test_stamps_of_messages_that_are_decoded_one_by_one_are_those_of_their_headers(tmp_path, kind):
     def without_stamp(message) -> None:
@@ -150,7 +136,7 @@ def logged(path, topic: str, off: dict[int, int], storage: str, pause_ns: int = 
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-@pytest.mark.parametrize("off", [2 * DAY, -2 * DAY, 3 * 3600 * S, -3 * 3600 * S, 120 * S])
+@pytest.mark.parametrize("off", [2 * DAY, -3 * 3600 * S, 120 * S])
 @pytest.mark.parametrize("topic", ["dvl/twist", "imu/data"])
 def test_one_log_time_does_not_stretch_a_recording(tmp_path, topic, off, storage):
     recording, messages = logged(tmp_path, topic, {40: off}, storage)

@@ -28,8 +28,9 @@ def write(path: Path, kind: str, ahead_s: int) -> Path:
 
 
 @pytest.mark.parametrize("kind", [TWIST, A50])  # read in columns, and one by one
-@pytest.mark.parametrize("ahead_s", [HOUR_S, -HOUR_S, -YEAR_2023_S])
-@pytest.mark.parametrize("restamp", ["log", "/dvl/twist", "dvl/twist,imu/data"])
+@pytest.mark.parametrize(
+    ("ahead_s", "restamp"), [(HOUR_S, "log"), (-HOUR_S, "/dvl/twist"), (-YEAR_2023_S, "dvl/twist,imu/data")]
+)
 def test_the_answer_is_that_of_a_clock_that_is_right(tmp_path, kind, ahead_s, restamp):
     right, wrong = write(tmp_path / "right", kind, 0), write(tmp_path / "wrong", kind, ahead_s)
     assert estimates(wrong, restamp=restamp) == estimates(right)

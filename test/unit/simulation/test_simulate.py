@@ -12,9 +12,7 @@ from conftest import ROOT
 from io_fixtures import raw, storage_file, write_bag
 from mcap.reader import make_reader
 
-from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.bags.reader import BagReader
-from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.error_model import distort
 from dvl_calib_ros.calibration.numerics.frames import ENU_FROM_NED, rotation_from_quaternion, rotation_from_rpy
 from dvl_calib_ros.calibration.numerics.samples import ImuSample, VelocityFrame
@@ -24,7 +22,7 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.recorded_motion import MotionSource, recorded_motion
 from dvl_calib_ros.simulation.scenario import Scenario, simulate
-from dvl_calib_ros.simulation.sensors import DvlErrors, ImuErrors, equivalent_error_terms
+from dvl_calib_ros.simulation.sensors import DvlErrors, ImuErrors
 from dvl_calib_ros.simulation.trajectories import FREE_SPEEDS_MPS, TRAJECTORIES, Waves, add_waves, make_motion
 
 BAGS = ROOT / "bags"
@@ -140,27 +138,6 @@ def test_effects_add_up_and_may_be_given_twice():
     alone = [velocities(simulate(Scenario(**QUIET, effects=effects(text))).dvl) - before for text in texts]
     together = velocities(simulate(Scenario(**QUIET, effects=effects(*texts))).dvl) - before
     np.testing.assert_allclose(together, sum(alone), atol=1e-12)
-
-
-@pytest.mark.slow
-def test_the_calibration_compensates_what_the_simulator_put_in(tmp_path):
-    """Lever arm and time offset: the signs of simulator and calibration agree, with no word from the diagnosis."""
-    options = {**QUIET, "trajectory": "box", "seconds": 90.0, "dvl_rate": 10.0, "gnss_rate": 20.0}
-    options["errors"] = DvlErrors((0.01, 0.02, 0.03), (0.004,) * 3)
-    given = effects("lever_arm:x_m=2,y_m=0.5,z_m=-1", "dvl_time_offset:seconds=0.3")
-    parameters = {"mounting_rpy": QUIET["mounting_rpy"], "imu_timeout": 1.0}
-    compensating = parameters | {"lever_arm": (2.0, 0.5, -1.0), "dvl_time_offset": 0.3}
-    errors = {}
-    for name, scenario_effects, values in (
-        ("none", (), parameters),
-        ("left in", given, parameters),
-        ("compensated", given, compensating),
-    ):
-        run = simulate(Scenario(**options, effects=scenario_effects))
-        bag = write_bag(tmp_path / name, sorted([*run.imu, *run.gnss, *run.dvl], key=lambda s: s.stamp_ns))
-        estimate = replay([bag], Parameters(**values)).result.estimates["M1"]
-        errors[name] = np.abs(estimate.misalignment - equivalent_error_terms(options["errors"])[0]).max()
-    assert errors["compensated"] < 1.5 * errors["none"] + 1e-4 < 0.2 * errors["left in"], errors
 
 
 def test_noise_effects_leave_the_noise_of_everything_else_as_it_was():
@@ -347,10 +324,9 @@ def attachments(bag) -> dict[str, bytes]:
 OPTIONS = ["--duration", 10, "--misalignment", 1, -2, 3, "--scale", 0.5, "--seed", 3]
 
 
-@pytest.mark.parametrize("compression", ["none", "chunk", "message"])
-def test_the_truth_is_attached_on_request_and_changes_nothing_else(capsys, tmp_path, compression):
+def test_the_truth_is_attached_on_request_and_changes_nothing_else(capsys, tmp_path):
     texts = ["--effect", "lever_arm:x_m=0.3", "--effect", "water_lock:east_mps=0.1,from_s=4"]
-    options = [*OPTIONS, *texts, "--compression", compression]
+    options = [*OPTIONS, *texts, "--compression", "chunk"]
     succeed(capsys, "simulate", tmp_path / "without", *options)
     succeed(capsys, "simulate", tmp_path / "with", *options, "--truth")
     assert raw(tmp_path / "with") == raw(tmp_path / "without")
@@ -370,13 +346,6 @@ def test_the_truth_is_attached_on_request_and_changes_nothing_else(capsys, tmp_p
     np.testing.assert_allclose(as_calibrated, turned, atol=2e-3)
 
 
-def test_a_bag_with_its_truth_replays_like_any_other(capsys, tmp_path):
-    for name, more in (("with", ["--truth"]), ("without", [])):
-        succeed(capsys, "simulate", tmp_path / name, *OPTIONS, *more)
-        succeed(capsys, "replay", tmp_path / name, "--json", tmp_path / f"{name}.json")
-    assert (tmp_path / "with.json").read_text() == (tmp_path / "without.json").read_text()
-
-
 @pytest.mark.parametrize("options", [["--storage", "sqlite3"], ["--compression", "file"]])
 def test_truth_is_refused_where_it_cannot_be_attached(capsys, tmp_path, options):
     said = fail(capsys, "simulate", tmp_path / "bag", "--duration", 5, "--truth", *options)
@@ -392,16 +361,12 @@ def test_truth_is_refused_where_it_cannot_be_attached(capsys, tmp_path, options)
         ("levr_arm:x_m=1", "no such effect, did you mean 'lever_arm'?"),
         ("", "with one of lever_arm, dvl_time_offset"),
         ("lever_arm", "without parameters does nothing; give some of x_m (m), y_m (m), z_m (m)"),
-        ("lever_arm:", "without parameters does nothing"),
-        ("lever_arm:x=1", "no parameter 'x'"),
         ("dvl_time_offset:second=1", "no parameter 'second', did you mean 'seconds'?; it has seconds (s)"),
         ("lever_arm:0.3", "'0.3' is no PARAMETER=VALUE; it has x_m (m)"),
         ("lever_arm:x_m=30cm", "x_m: '30cm' is no number; give it in m, without the unit"),
         ("lever_arm:x_m=", "x_m: '' is no number"),
         ("lever_arm:x_m=nan", "x_m: nan is outside -20 .. 20 m"),
-        ("lever_arm:x_m=1e9", "x_m: 1e+09 is outside"),
         ("reference_lag:time_constant_s=-1", "time_constant_s: -1 is outside 0 .. 5 s"),
-        ("outliers:share=2", "share: 2 is outside 0 .. 1"),
         ("lever_arm:x_m=1,x_m=2", "x_m is given twice"),
     ],
 )
@@ -414,11 +379,8 @@ def test_a_wrong_effect_is_refused_with_what_there_is(capsys, tmp_path, text, sa
     ("options", "said"),
     [
         (["--waves", 20, 6], "--waves: give a height of 0 .. 10 m"),
-        (["--waves", 1, "nan"], "--waves: give a height"),
         (["--beam-bias", 0, 0, 0, "inf"], "--beam-bias: inf"),
-        (["--gyro-bias", 0, 0, 200], "--gyro-bias: 200"),
         (["--attitude-std", -1], "--attitude-std: -1"),
-        (["--motion-of", "missing"], "missing: no such file or folder"),
         (["--motion-of", "missing", "--trajectory", "free"], "not allowed with argument"),
         (
             ["--motion-of", BAGS / "harbour_box", "--motion-topics", "imu/data", "gnss/twist"],

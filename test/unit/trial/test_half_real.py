@@ -17,7 +17,6 @@ from validation.trial import generator, recorded
 from validation.trial.cases import draw
 from validation.trial.generator import VERTICALS, Noise
 from validation.trial.half_real import HORIZONTAL, MIN_DISTANCE, MIN_Q
-from validation.trial.motion import BOAT
 from validation.trial.plan import Case, Family, plan
 from validation.trial.recorded import recordings_folder
 from validation.trial.strength import Yardstick
@@ -109,7 +108,7 @@ def test_late_attitude_is_the_attitude_of_before(no_imu_noise):
 
 
 def test_every_fault_at_sea_is_strong_beside_the_others_and_apart_from_every_rival():
-    for number in range(4):
+    for number in range(2):
         drawn = draw(case(Category.TRIPLE, number=number), 11)
         truth = drawn.truth
         assert len(truth.faults) == 3 and min(truth.q.values()) >= MIN_Q
@@ -120,13 +119,6 @@ def test_every_fault_at_sea_is_strong_beside_the_others_and_apart_from_every_riv
         assert yardstick.error_mps(drawn.faults, drawn.faults) < 1e-9
         for name in drawn.faults:
             assert yardstick.error_mps(drawn.faults, {k: v for k, v in drawn.faults.items() if k != name}) > 1e-4
-
-
-def test_faults_are_as_large_as_at_sea():
-    pairs = [draw(case(number=2 * n), 5).truth.faults for n in range(8)]
-    assert max(abs(each["lever_arm"]["x_m"]) for each in pairs) > 1.5
-    delays = [abs(values["seconds"]) for each in pairs for name, values in each.items() if name != "lever_arm"]
-    assert max(delays) > 1.5 and max(delays) <= 3.0
 
 
 @pytest.mark.parametrize("number", range(len(HORIZONTAL)))
@@ -194,13 +186,6 @@ def test_a_displaced_dvl_has_what_its_name_says_beside_a_long_arm_and_a_horizont
     times = np.array([0.0, leap["at_s"] + 1.0, leap["again_at_s"] + 1.0])
     late = dvl_stamps(times, {"time_offset_jump": leap}) - times
     assert late == pytest.approx([0.0, leap["seconds"], leap["seconds"] + leap["again_seconds"]])
-
-
-def test_a_displaced_dvl_of_the_boat_moves_as_the_boat_does():
-    if not recorded.has_boat(recordings_folder()):
-        pytest.skip("no recordings of the boat")
-    motion = draw(Case(Category.NULL, BOAT, family=Family.DISPLACED), 0).scene.motions[0]
-    assert 0.8 < np.median(motion.at(np.arange(0.0, motion.seconds)).speed) < 0.9
 
 
 @pytest.mark.parametrize("name", recorded.BY_BOAT)

@@ -143,11 +143,6 @@ def test_score_is_written_as_json_and_markdown(hand_made):
     assert "| false alarms, nulls | <= 1% | 25.0% | 0.6% .. 80.6% | - | 4 | no |" in hand_made.markdown()
 
 
-def test_a_score_of_nothing_is_a_table_without_numbers():
-    empty = score([])
-    assert empty.n_cases == 0 and all(figure.met is None for each in empty.figures.values() for figure in each)
-
-
 # ------------------------------------------------------------------ real motion
 
 ARM_X = {"lever_arm": {"x_m": 1.0}}
@@ -242,9 +237,3 @@ def test_a_horizontal_reference_is_compared_with_its_twin_of_all_axes(by_family)
     assert by_family["horizontal"]["same as with all axes"] == (pytest.approx(1 / 3), 3)
     assert by_family["horizontal"]["false alarms, nulls"] == (1.0, 1)
     assert by_family["all families"]["false alarms, all nulls"] == (0.5, 2)
-
-
-def test_the_page_says_what_has_measured_it(hand_made):
-    page = hand_made.page("python -m validation trial --seed 5 --cases 16", "1.2.3")
-    assert "python -m validation trial --seed 5 --cases 16\n" in page and "version 1.2.3" in page
-    assert f"over {len(HAND_MADE)} cases" in page and "| false alarms, nulls | <= 1% | 25.0% |" in page
