@@ -53,11 +53,11 @@ def _with_slower_noise(problem: Problem, fit: Fit, covariance: Array) -> Array:
     """Inflate a covariance (n, n) to the scatter of the estimate under noise that lasts as the residual says.
 
     The fit's own noise is bounded in memory, so that no effect is taken for it, and blocks are shorter than multipath.
+    The memory is uncertain as well: it is drawn from its posterior.
     """
-    known = NuisanceFit.of_fit(problem, fit)
-    slower = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)[0]
-    rng = np.random.default_rng(0)
-    drawn = np.stack([slower.unwhiten(rng.standard_normal(fit.residual.size)) for _ in range(DRAWN)], axis=2)
+    known, rng = NuisanceFit.of_fit(problem, fit), np.random.default_rng(0)
+    slower, left = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)
+    drawn = np.stack(list(slower.drawn(left, slower.taken_by(known.columns, known.std), DRAWN, rng)), axis=2)
     steps = fit.system.covariance() @ fit.noise.whiten(fit.columns).T @ fit.noise.whiten(drawn)
     grown = np.sqrt(np.maximum((steps**2).mean(axis=1) / np.diag(covariance), 1.0))
     return np.asarray(covariance * np.outer(grown, grown))

@@ -319,6 +319,22 @@ def test_noise_keeps_the_colour_of_what_a_fit_has_taken_in(keep, low):
     assert not keep or np.median(plain) < 0.7
 
 
+def test_the_mean_of_slow_noise_is_inside_the_interval_of_what_its_memory_may_be():
+    """Five memories long, a series says little of its memory: by the best one 75 % of means were inside."""
+    rng, n, keep = np.random.default_rng(3), 300, float(np.exp(-1.0 / 60.0))
+    white = white_noise(np.ones((n, 3)), (slice(0, n),), None)
+    slow = replace(white, axes=(Arma(np.array([keep]), 0.0, 0.02 * np.sqrt(1 - keep**2), (1 - keep**2) ** -0.5),) * 3)
+    columns, std, inside = np.tile(np.eye(3), (n, 1, 1)), np.full(3, 1e3), []
+    for _ in range(50):
+        series = slow.unwhiten(rng.standard_normal(3 * n)) + rng.normal(0.0, 0.01, (n, 3))
+        noise, left = replace(white, memory=float(np.exp(-0.01))), series - series.mean(axis=0)
+        for _ in range(3):
+            noise = noise.refitted(left, taken=noise.taken_by(columns, std))
+        drawn = noise.drawn(left, noise.taken_by(columns, std), 100, rng)
+        inside.append(np.abs(series.mean(axis=0)) < 1.96 * np.std([each.mean(axis=0) for each in drawn], axis=0))
+    assert np.mean(inside) > 0.84
+
+
 def _at_rest(noise):
     """Root of the spectrum at the frequency 0."""
     (arma,) = noise.axes
