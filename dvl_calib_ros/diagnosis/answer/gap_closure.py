@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_over, ends_of_stretches, integration_steps
 from ...calibration.numerics.frames import Array
-from ..fit.cross_validation import coloured_anew, fitted_without, folds_of, stretch_of, with_slow_noise
+from ..fit.cross_validation import fitted_without, folds_of, stretch_of
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.selection_criteria import NuisanceFit, blocks_of
+from ..fit.selection_criteria import NuisanceFit, blocks_of, coloured_anew, with_slow_noise
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS

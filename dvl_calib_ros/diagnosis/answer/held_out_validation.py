@@ -9,7 +9,7 @@ import numpy as np
 from ...effects.base import Effect
 from ..fit.cross_validation import surprise_elsewhere
 from ..fit.gauss_newton import Fit
-from ..fit.selection_criteria import NuisanceFit, blocks_of, robust_p
+from ..fit.selection_criteria import NuisanceFit, robust_covariance, robust_p
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
@@ -53,11 +53,13 @@ def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectS
 
     The unknown cause's part in them is undetermined: a current and two drifts may replace a step in a bias.
     """
-    fitter, block = selection.fitter, blocks_of(selection.fitter.problem)
+    fitter = selection.fitter
     while selection.selected and matters(fitter.problem, selection.fit, rest):
         fit, named = selection.fit, {each.effect.name for each in selection.selected}
         moved = moved_by(fitter.problem, fit, rest)
-        p_values = {e.name: robust_p(fit, e, block, moved=moved) for e in fit.effects if e.name in named}
+        covariance, blocks = robust_covariance(fitter.problem, fit)
+        covariance = covariance + np.outer(moved, moved)
+        p_values = {e.name: robust_p(fit, e, covariance, blocks) for e in fit.effects if e.name in named}
         worst = max(p_values, key=lambda name: p_values[name])
         if p_values[worst] < SETTINGS.robust_level:
             break

@@ -12,10 +12,10 @@ from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
 from ..fit.selection_criteria import (
     WINDOW_STEPS,
     best_of,
-    blocks_of,
     fit_without,
     log_p_in_place,
     price,
+    robust_covariance,
     robust_p,
     times_tried,
 )
@@ -40,12 +40,13 @@ def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
 def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """Return a fit without effects that chance or slow noise explains as well.
 
-    An effect is kept if its sandwich p-value over blocks is significant and it predicts held-out data beyond its price.
+    An effect is kept if the covariance of its interval makes it significant, and it predicts held-out data beyond its
+    price.
     """
     problem, n = fitter.problem, len(fit.seen)
-    block = blocks_of(problem)
     while fit.effects:
-        p_values = {effect.name: robust_p(fit, effect, block) for effect in fit.effects}
+        covariance = robust_covariance(problem, fit)
+        p_values = {effect.name: robust_p(fit, effect, *covariance) for effect in fit.effects}
         name = max(p_values, key=lambda each: p_values[each])
         if p_values[name] >= SETTINGS.robust_level:
             fit = fit_without(fitter, fit, next(effect for effect in fit.effects if effect.name == name))

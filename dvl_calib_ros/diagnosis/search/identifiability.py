@@ -11,7 +11,15 @@ from ...calibration.registration.registration import IN_TIME_STD_S
 from ...effects.base import Effect
 from ..fit.cross_validation import predictive_gain_of
 from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
-from ..fit.selection_criteria import blocks_of, fit_without, log_p_in_place, log_p_value, robust_p, times_tried
+from ..fit.selection_criteria import (
+    blocks_of,
+    fit_without,
+    log_p_in_place,
+    log_p_value,
+    robust_covariance,
+    robust_p,
+    times_tried,
+)
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
 from .arm_clock_ambiguity import (
@@ -137,7 +145,7 @@ def _clock_or_arm(
     delay within that ambiguity is insignificant. known: from `told_apart`; an insignificant arm cannot stand in for
     these clocks.
     """
-    threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
+    threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
     late = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
     is_late = opened is None or max(late, default=0.0) >= LATER * opened.late
@@ -145,7 +153,7 @@ def _clock_or_arm(
     def is_shown(each: Selected) -> bool:
         if each.effect.name == REFERENCE_CLOCK and not is_late:
             return False
-        return each.log_p <= threshold and robust_p(fit, each.effect, block) < SETTINGS.robust_level
+        return each.log_p <= threshold and robust_p(fit, each.effect, *covariance) < SETTINGS.robust_level
 
     own = {each.effect.name: each for each in selected}
     arm, clocks = own.get(ARM), [own[name] for name in TWO_CLOCKS if name in own]
