@@ -363,12 +363,12 @@ class _Spectrum:
         return best
 
     def drawn(self, memory: float, p: int, q: int, count: int, rng: np.random.Generator) -> list[tuple[float, float]]:
-        """Draw ar and ma from their posterior, with equal prior odds of equal ratios of memories."""
-        slowest = np.log(-1.0 / np.log(memory))
-        ars = np.exp(-np.exp(-np.linspace(0.0, slowest, POSTERIOR_POINTS))) if p else np.zeros(1)
+        """Draw ar and ma from their posterior; every memory up to the longest is equally likely a priori."""
+        memories = np.geomspace(1.0, -1.0 / np.log(memory), POSTERIOR_POINTS) if p else np.zeros(1)
+        ars = np.exp(-1.0 / memories) if p else np.zeros(1)
         mas = np.tanh(np.linspace(-MA_REACH, MA_REACH, POSTERIOR_POINTS)) if q else np.zeros(1)
         deviance = self.deviances(ars, mas)
-        weights = np.exp(-0.5 * (deviance - deviance.min()))
+        weights = np.exp(-0.5 * (deviance - deviance.min())) * (memories if p else 1.0)
         at = rng.choice(weights.size, count, p=weights.ravel() / weights.sum())
         return [(float(ars[i % ars.size]), float(mas[i // ars.size])) for i in at]
 
