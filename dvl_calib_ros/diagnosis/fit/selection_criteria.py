@@ -106,7 +106,10 @@ def _told_by_unshown(problem: Problem, fit: Fit) -> float:
 
 
 def robust_p(fit: Fit, effect: Effect, covariance: Array, blocks: int) -> float:
-    """Return p of a Wald test of an effect, with a covariance (6 + p, 6 + p) from a number of blocks."""
+    """Return p of a Wald test of an effect, adjusted for its alternatives.
+
+    covariance: (6 + p, 6 + p), from a number of blocks.
+    """
     at, start = np.zeros(0, dtype=int), 6
     for other in fit.effects:
         p = len(fit.hypothesis.parameters_of(other))
@@ -116,7 +119,7 @@ def robust_p(fit: Fit, effect: Effect, covariance: Array, blocks: int) -> float:
     defaults = np.array([each.spec.default for each in fit.hypothesis.parameters_of(effect)])
     values = fit.hypothesis.vector()[at] - defaults
     wald = float(values @ np.linalg.solve(covariance[np.ix_(at, at)], values)) / len(at)
-    return float(f_sf(wald, len(at), max(blocks - len(at), 2)))
+    return min(1.0, times_tried(effect) * float(f_sf(wald, len(at), max(blocks - len(at), 2))))
 
 
 def robust_covariance(problem: Problem, fit: Fit) -> tuple[Array, int]:

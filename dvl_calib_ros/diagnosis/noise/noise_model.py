@@ -235,9 +235,8 @@ class Noise:
         from `taken_by`.
         """
         each = [
-            [spectrum.arma(ar, ma, series, self.segments) for ar, ma in
-             spectrum.drawn(self.memory, len(arma.ar), int(arma.ma != 0.0), count, rng)]
-            for series, arma, lost in zip(self._scaled(residual).T, self.axes, taken, strict=True)
+            [spectrum.arma(*drawn, series, self.segments) for drawn in spectrum.drawn(self.memory, count, rng)]
+            for series, lost in zip(self._scaled(residual).T, taken, strict=True)
             for spectrum in [_spectrum(series, lost)]
         ]  # fmt: skip
         for axes in zip(*each, strict=True):
@@ -362,13 +361,12 @@ class _Spectrum:
             reach = reach / 4.0
         return best
 
-    def drawn(self, memory: float, p: int, q: int, count: int, rng: np.random.Generator) -> list[tuple[float, float]]:
+    def drawn(self, memory: float, count: int, rng: np.random.Generator) -> list[tuple[float, float]]:
         """Draw ar and ma from their posterior; every memory up to the longest is equally likely a priori."""
-        memories = np.geomspace(1.0, -1.0 / np.log(memory), POSTERIOR_POINTS) if p else np.zeros(1)
-        ars = np.exp(-1.0 / memories) if p else np.zeros(1)
-        mas = np.tanh(np.linspace(-MA_REACH, MA_REACH, POSTERIOR_POINTS)) if q else np.zeros(1)
+        memories = np.geomspace(1.0, -1.0 / np.log(memory), POSTERIOR_POINTS)
+        ars, mas = np.exp(-1.0 / memories), np.tanh(np.linspace(-MA_REACH, MA_REACH, POSTERIOR_POINTS))
         deviance = self.deviances(ars, mas)
-        weights = np.exp(-0.5 * (deviance - deviance.min())) * (memories if p else 1.0)
+        weights = np.exp(-0.5 * (deviance - deviance.min())) * memories
         at = rng.choice(weights.size, count, p=weights.ravel() / weights.sum())
         return [(float(ars[i % ars.size]), float(mas[i // ars.size])) for i in at]
 

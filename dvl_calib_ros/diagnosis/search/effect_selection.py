@@ -60,7 +60,8 @@ class EffectSelection:
     """Selected effects, strongest first, with the fits without (`base`) and with them under the same noise.
 
     testable: effects with their observable parameters. opened: trade-off of lever arm and clock at one speed. moved: by
-    arm parameter, the difference (m) to a fit with another clock that explains the data equally well.
+    arm parameter, the difference (m) to a fit with another clock that explains the data equally well. wider: the
+    hypothesis with effects that slow noise explains as well, which may nevertheless be there.
     """
 
     selected: tuple[Selected, ...]
@@ -71,6 +72,7 @@ class EffectSelection:
     testable: Mapping[str, Effect]
     opened: OpenArm | None = None
     moved: Mapping[str, float] = field(default_factory=dict)
+    wider: Hypothesis | None = None
 
     def without(self, names: Collection[str]) -> EffectSelection:
         """Return the selection without the named effects; re-estimate the others."""
@@ -156,7 +158,8 @@ def select(
         if names in seen_before:
             break
         seen_before.add(names)
-    fit = only_predictive(fitter, eliminate(fitter, fit, len(effects)), len(effects))
+    wider = eliminate(fitter, fit, len(effects))
+    fit = only_predictive(fitter, wider, len(effects))
     fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
     fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
@@ -164,7 +167,9 @@ def select(
     guesses = _beside_moving_clocks(fitter, fit, guesses)
     told = identify_effects(fitter, fit, guesses, effects, alike)
     base = fitter.fit_kept(told.fit.hypothesis.with_effects([], len(recordings), {}), told.fit.noise)
-    return EffectSelection(told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved)
+    return EffectSelection(
+        told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved, wider.hypothesis
+    )
 
 
 def _beside_moving_clocks(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess]) -> tuple[FirstGuess, ...]:
