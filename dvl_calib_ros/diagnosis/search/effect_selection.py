@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.samples import VelocityFrame
-from ...effects.base import ActsOn, Effect, late
+from ...effects.base import ActsOn, Effect, true_times
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.selection_criteria import best_of, finer_steps, price_of_a_time
 from ..model.forward_model import Problem, make_problem
@@ -361,7 +361,6 @@ FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0
 ALIKE = (0.6, 1.7)
 # Fewest samples for a scatter
 FEWEST = 30
-_PASSES = 3
 
 
 def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
@@ -400,9 +399,7 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
     if curve.interval <= FAST_ENOUGH_S or len(curve.time) < FEWEST:
         return kept
     injections = hypothesis.injections(index)
-    true = curve.time
-    for _ in range(_PASSES):
-        true = curve.time - late(injections, clock, true)
+    true = true_times(injections, clock, curve.time)
     seen = problem.seen(hypothesis, index, true)
     measured = np.array(problem.measured)
     error = (seen.error if of_dvl else -seen.error) * measured

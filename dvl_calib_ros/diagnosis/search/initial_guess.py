@@ -13,14 +13,11 @@ from ...calibration.registration.motion_streams import MotionStreams, make_motio
 from ...calibration.registration.registration import Registration, register
 from ...calibration.registration.unregistrable_clocks import far_clocks
 from ...calibration.streams.interpolation import ImuColumns
-from ...effects.base import ActsOn, EffectNeeds, Injection, late
+from ...effects.base import ActsOn, EffectNeeds, Injection, true_times
 from ...errors import InputError
 from ..model.recorded_streams import RecordedStreams
 from ..model.stream_curve import Curve
 from ..model.time_grid import Offsets
-
-# Fixed-point iterations for the true time of a delayed stamp
-_PASSES = 3
 
 
 @dataclass(frozen=True)
@@ -69,9 +66,7 @@ def guess_beside(
     """Repeat the guess of a recording with the jumps and drifts (`moved`) of its DVL clock corrected. Return None if
     the corrected samples are out of order."""
     curve = recording.dvl
-    time = curve.time
-    for _ in range(_PASSES):
-        time = curve.time - late(moved, ActsOn.DVL_CLOCK, time)
+    time = true_times(moved, ActsOn.DVL_CLOCK, curve.time)
     if not (np.diff(time) > 0.0).all():
         return None
     dvl = Curve(time, curve.values, curve.claimed, claims=curve.claims)
