@@ -9,7 +9,7 @@ import numpy as np
 from ...effects.base import Effect
 from ..fit.cross_validation import surprise_elsewhere
 from ..fit.gauss_newton import Fit
-from ..fit.selection_criteria import NuisanceFit, robust_covariance, robust_p
+from ..fit.selection_criteria import NuisanceFit
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
@@ -19,7 +19,6 @@ from ..search.unexplained import (
     Unexplained,
     is_of_group,
     matters,
-    moved_by,
     unexplained,
 )
 from .gap_closure import Gap
@@ -45,30 +44,7 @@ def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
         gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop
         if gain > 0.0 and (best is None or gain > best[0]):
             best = gain, reduced, other
-    return _sure_beside(*((selection, rest) if best is None else best[1:]))
-
-
-def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectSelection, Unexplained]:
-    """Reject effects that are insignificant with the residual's regressor as nuisance.
-
-    The unknown cause's part in them is undetermined: a current and two drifts may replace a step in a bias.
-    """
-    fitter = selection.fitter
-    while selection.selected and matters(fitter.problem, selection.fit, rest):
-        fit, named = selection.fit, {each.effect.name for each in selection.selected}
-        moved = moved_by(fitter.problem, fit, rest)
-        covariance, blocks = robust_covariance(fitter.problem, fit)
-        covariance = covariance + np.outer(moved, moved)
-        p_values = {e.name: robust_p(fit, e, covariance, blocks) for e in fit.effects if e.name in named}
-        worst = max(p_values, key=lambda name: p_values[name])
-        if p_values[worst] < SETTINGS.robust_level:
-            break
-        reduced = selection.without({worst})
-        other = unexplained(fitter, reduced.fit)
-        if not matters(fitter.problem, reduced.fit, other):
-            break
-        selection, rest = reduced, other
-    return selection, rest
+    return (selection, rest) if best is None else best[1:]
 
 
 def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:

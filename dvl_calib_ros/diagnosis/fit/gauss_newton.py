@@ -196,15 +196,12 @@ class Fitter:
         max_steps: int = MAX_STEPS,
         only_of_the_day: bool = False,
         fixed: frozenset[str] = frozenset(),
-        careful: bool = False,
         looked: _Looked | None = None,
         evaluated: Evaluated | None = None,
     ) -> Fit:
         """Fit a hypothesis under a noise. only_of_the_day: fit parameters per recording only.
 
-        fixed: names of effects whose values are fixed. careful: omit a failed ordinary step from the last step, which
-        corrects for noise in the columns; such steps fail at the kink of a slow attitude. If a fit is stuck far from
-        the optimum, the whole last step frees it. looked, evaluated: linearisation or evaluation of the start, if
+        fixed: names of effects whose values are fixed. looked, evaluated: linearisation or evaluation of the start, if
         known.
         """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
@@ -245,8 +242,6 @@ class Fitter:
         if len(free):
             step = np.zeros(len(kept))
             step[free] = system.part(free).solution()
-            if careful and not moved:
-                step[free] -= plain.part(free).solution()
             last = hypothesis.moved(step)
             last_seen, last_residual = self.evaluated(last)
             last_misfit = self._misfit(noise, last_residual, last)
@@ -338,16 +333,6 @@ class Fitter:
                 for spec in (spec for spec in effect.parameters if is_time_of_run(spec)):
                     fit = self._finer(fit, effect, spec.name, step)
         return fit
-
-    def refined_as_white(self, fit: Fit, steps: Sequence[float]) -> Fit:
-        """Refine the times under white noise, if the fit is better.
-
-        Coloured noise absorbs the residual of a wrong time except the step itself: only the exact time is better.
-        """
-        if not fit.noise.is_coloured or not any(is_time_of_run(s) for e in fit.effects for s in e.parameters):
-            return fit
-        found = self.fit(self.refined(self.fit(fit.hypothesis, fit.noise.white), steps).hypothesis, fit.noise)
-        return found if found.deviance < fit.deviance else fit
 
     def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
         at_rest: tuple[Fit, float] | None = None

@@ -50,12 +50,6 @@ def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0)
     return float(chi2_isf(SETTINGS.level / n_effects / tried, dof))
 
 
-def price_of_a_time(effect: Effect, n_effects: int) -> float:
-    """Return the deviance that the best start time of an effect adds under the null to an effect throughout. The
-    probability is `SETTINGS.level`."""
-    return float(chi2_isf(SETTINGS.level / n_effects / times_tried(effect), 1))
-
-
 def criterion(fit: Fit, n_effects: int) -> float:
     """Return the deviance plus the price of every effect."""
     n = len(fit.seen)

@@ -27,7 +27,7 @@ from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.samples import VelocityFrame
 from ...effects.base import ActsOn, Effect, true_times
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.selection_criteria import best_of, finer_steps, price_of_a_time
+from ..fit.selection_criteria import best_of, finer_steps
 from ..model.forward_model import Problem, make_problem
 from ..model.hypothesis import Hypothesis, Values, is_time_of_run, no_effect
 from ..model.recorded_streams import RecordedStreams
@@ -36,17 +36,17 @@ from ..model.stream_curve import FAST_ENOUGH_S
 from ..noise.noise_level import estimated
 from ..noise.noise_model import Noise, white_noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
-from .arm_clock_ambiguity import ARM, TWO_CLOCKS, OpenArm, guessed_arm
+from .arm_clock_ambiguity import ARM, OpenArm, guessed_arm
 from .backward_elimination import (
     eliminate,
     only_predictive,
     repeated_effects,
 )
-from .candidates import by_other_clocks, intermittent_effects, jumps_at_start, proposed, variants_about
-from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, leaping
+from .candidates import proposed, variants_about
+from .clock_jumps import in_gaps, leaping
 from .identifiability import Selected, identify_effects
-from .initial_guess import FirstGuess, first_guess, guess_beside
-from .observable_parameters import observable_parts, unobservable_parts, without_insignificant
+from .initial_guess import FirstGuess, first_guess
+from .observable_parameters import observable_parts, unobservable_parts
 
 # The most common causes of a gap; the first fit includes all of them.
 START = (ARM, "dvl_time_offset", "reference_time_offset")
@@ -146,12 +146,8 @@ def select(
         fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
         fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
-        for hypothesis in intermittent_effects(fitter, fit, effects):
-            as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
-            fits.append(fitter.fit(as_white.hypothesis, fit.noise))
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
-        best = fitter.refined_as_white(fitter.refined(best_of(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
-        best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))
+        best = in_gaps(fitter, fitter.refined(best_of(fits, effects), finer[3:]))
         best = eliminate(fitter, best, len(effects))
         fitter, fit = _about(fitter, best, every)
         names = frozenset(effect.name for effect in fit.effects)
@@ -160,27 +156,13 @@ def select(
         seen_before.add(names)
     wider = eliminate(fitter, fit, len(effects))
     fit = only_predictive(fitter, wider, len(effects))
-    fit = _by_fewer_clocks(fitter, fit, effects)
     fitter, fit = _about(fitter, fit, every)
-    fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
-    guesses = _beside_moving_clocks(fitter, fit, guesses)
     told = identify_effects(fitter, fit, guesses, effects, alike)
     base = fitter.fit_kept(told.fit.hypothesis.with_effects([], len(recordings), {}), told.fit.noise)
     return EffectSelection(
         told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved, wider.hypothesis
     )
-
-
-def _beside_moving_clocks(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess]) -> tuple[FirstGuess, ...]:
-    """Repeat the guess of recordings whose DVL clock jumps or drifts in a fit, with that motion corrected."""
-    problem, found = fitter.problem, list(guesses)
-    for number, recording in enumerate(problem.recordings):
-        moved = [each for each in fit.hypothesis.injections(number) if each.effect.name in MOVING_CLOCK]
-        if moved:
-            again = guess_beside(recording, moved, problem.rotation_dvl_from_body, problem.lever_arm)
-            found[number] = again or found[number]
-    return tuple(found)
 
 
 def _check_size(problem: Problem) -> None:
@@ -254,34 +236,6 @@ def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Arra
     system = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge))
     of_noise = sum((joined.T @ joined for joined in map(noise.whiten, own)), np.zeros_like(system.gram))
     return np.asarray(columns @ system.solution_without(of_noise)), ridge
-
-
-def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
-    """Return a fit with two clocks, or a better one with one clock: candidates were combined with two only."""
-    if not set(TWO_CLOCKS) <= set(fit.values) and not jumps_at_start(fitter, fit):
-        return fit
-    others = [fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in by_other_clocks(fitter, fit, effects)]
-    if others and jumps_at_start(fitter, fit):  # a constant delay chooses no time
-        throughout = best_of(others, effects)
-        if throughout.deviance < fit.deviance + price_of_a_time(effects[LEAP], len(effects)):
-            return throughout
-    return best_of([fit, *others], effects)
-
-
-def _with_what_is_shown_of_the_arm(
-    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
-) -> tuple[Fitter, Fit, Mapping[str, Effect]]:
-    """Return a fit and effects with only the observable parts of the lever arm.
-
-    every: effects with all parameters; effects: with those observable by their columns alone.
-    """
-    arm = without_insignificant(fitter.problem, fit)
-    if arm is not None:
-        effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
-        values = tuple(dict(each) for each in fit.values[ARM])  # unobservable parts are held at their values
-        hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
-        fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
-    return fitter, fit, effects
 
 
 __all__ = ["EffectSelection", "Selected", "select"]
