@@ -10,7 +10,7 @@ import numpy as np
 from ...calibration.numerics.frames import Array
 from ...effects.base import MountingEffect
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.parametric_bootstrap import simulated_recordings
+from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..fit.selection_criteria import NuisanceFit, robust_covariance
 from ..model.forward_model import Problem
 from ..model.hypothesis import is_time_of_run
@@ -20,9 +20,9 @@ from ..search.effect_selection import EffectSelection
 Triple = tuple[float, float, float]
 Times = dict[tuple[str, int, str], Triple]
 
-# Number of simulated recordings. Thresholds of significance: of the mean error, in σ; of the relative scatter, exceeded
-# by chance in one of thirty such sets
-MADE_UP, OFF_BY, SCATTER = 12, 1.0, 1.35
+# Thresholds of significance: of the mean error, in σ; of the relative scatter, exceeded by chance in one of thirty sets
+# of simulated recordings
+OFF_BY, SCATTER = 1.0, 1.35
 # True motion between samples lies between fitted and simulated interpolation: half of their difference counts
 HALF_WAY = 0.5
 
@@ -51,7 +51,7 @@ def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
     steps = np.array(
         [
             fitter.step_of(other, seen, left, fit)
-            for other, seen, left in simulated_recordings(fitter.problem, fit, MADE_UP)
+            for other, seen, left in simulated_recordings(fitter.problem, fit, SIMULATED)
         ]
     )
     std = np.sqrt(np.diag(covariance))

@@ -34,14 +34,10 @@ BY_CHANCE = 1.5
 PRIOR_IN_TYPICAL = 50.0
 # Bounds below which a fit is skipped as worse: deviance, plus a share of its first step's gain for nonlinearity
 SURELY, BENT = 2.0, 0.2
-# Multiple of the first if the gain of a converged fit's step is subtracted
-NEARBY = 2.0
-# A burst: bins beyond BURST robust standard deviations with neighbours beyond ABOUT_BURST, of at most this share of the
-# recording; instrument errors, not an effect
-BURST, ABOUT_BURST, RARE = 6.0, 3.0, 0.02
-# Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2), and deviance from
-# which its search stops: turns make a clock jump observable, straight legs do not, so there may be a second minimum
-OF_A_TIME, NO_TIME_BEYOND = -2.0 * float(np.log(1.0 - np.sqrt(0.95))), 40.0
+# A burst: outliers with neighbours beyond half of that, of at most this share of the recording
+RARE = 0.02
+# Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2)
+OF_A_TIME = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 # Half width, in standard deviations, of a 95 per cent interval
 OF_INTERVAL = 1.96
 Mask = NDArray[np.bool_]
@@ -157,8 +153,8 @@ class Fitter:
         """
         raw = (fit.residual + self.outliers) / fit.noise.level
         size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
-        run = np.cumsum(np.diff(size > ABOUT_BURST, prepend=False))  # odd in the runs, even between them
-        far = np.isin(run, run[size > BURST])
+        run = np.cumsum(np.diff(size > 0.5 * SETTINGS.outlying, prepend=False))  # odd in the runs, even between them
+        far = np.isin(run, run[size > SETTINGS.outlying])
         return far & (np.count_nonzero(far) <= RARE * len(far))
 
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
@@ -372,7 +368,7 @@ class Fitter:
         if least > deviance + SURELY + BENT * gained:
             return True
         alike = min(promised, gained)
-        return least + alike > deviance + NEARBY * SURELY + BENT * (gained - alike)
+        return least + alike > deviance + 2.0 * SURELY + BENT * (gained - alike)
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """Return the time at which an effect begins or ends, with its 95 per cent interval."""
@@ -387,7 +383,7 @@ class Fitter:
                 worse = self._worse_at(_with_time(fit, effect, name, recording, at), fit)
                 if was_as_good or worse < OF_A_TIME:  # the first rejected time bounds the interval
                     end = at
-                if worse > NO_TIME_BEYOND:
+                if worse > SETTINGS.conclusive:
                     break
                 step, was_as_good = 1.6 * step, worse < OF_A_TIME
             ends.append(end)
@@ -396,7 +392,7 @@ class Fitter:
     def _worse_at(self, moved: Hypothesis, fit: Fit) -> float:
         """Return the deviance increase of a fit at another time, infinite if it is certainly too large."""
         looked = self._looked(moved, fit.noise)
-        if self._is_surely_worse(moved, looked, fit.noise, fit.deviance + NO_TIME_BEYOND):
+        if self._is_surely_worse(moved, looked, fit.noise, fit.deviance + SETTINGS.conclusive):
             return np.inf
         return self.fit(moved, fit.noise, 2, looked=looked).deviance - fit.deviance
 

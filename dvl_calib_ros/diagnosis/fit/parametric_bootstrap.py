@@ -24,6 +24,9 @@ from ..model.seen import Seen
 from ..model.stream_curve import FAST_ENOUGH_S, Curve
 from .gauss_newton import Fit
 
+# Number of simulated recordings for a null distribution
+SIMULATED = 12
+
 
 class _OtherWay(Curve):
     """A curve through the same samples on Akima's cubics, which bend within two samples of a corner."""

@@ -22,8 +22,6 @@ TWO_CLOCKS = DVL_CLOCK, REFERENCE_CLOCK
 # Alternatives for a delayed reference, and the delay from which each is tried for the other, s
 LAG_OR_DELAY, LAG_FROM_S = (LAG, REFERENCE_CLOCK), 0.2
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
-# Largest standard deviation of a registered arm that replaces an unobservable part, m
-GUESSED_STD_M = 0.2
 # Ambiguity of the arm, m, from which registration limits the precision of arm and clock
 OPEN_M = 0.1
 
@@ -85,7 +83,7 @@ def guessed_arm(guesses: Sequence[FirstGuess], effects: Mapping[str, Effect]) ->
     """
     shown = {spec.name for spec in effects[ARM].parameters} if ARM in effects else set(ARM_PARAMETERS)
     stds = [guess.registration.lever_arm_std for guess in guesses if guess.registration is not None]
-    known = np.min(stds, axis=0) < GUESSED_STD_M if stds else np.zeros(3, dtype=bool)
+    known = np.min(stds, axis=0) < OPEN_M if stds else np.zeros(3, dtype=bool)
     arm = np.median([guess.lever_arm for guess in guesses], axis=0)
     return {
         name: value if name in shown or is_known else 0.0

@@ -63,10 +63,6 @@ def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
-# Standard deviations from which a second occurrence is kept without a trial
-CLEAR = 6.0
-
-
 def repeated_effects(
     fitter: Fitter, fits: Sequence[Fit], every: Mapping[str, Effect], effects: Mapping[str, Effect]
 ) -> list[Fit]:
@@ -118,12 +114,12 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
 
 
 def either_alone(fit: Fit, once: Effect, whole: Effect) -> list[Hypothesis]:
-    """Return starts with the first or the second occurrence alone, if the other is within `CLEAR` σ of zero."""
+    """Return starts with the first or the second occurrence alone, if the other is near zero in σ."""
     std = np.sqrt(np.diag(fit.system.covariance()))
     clear = {
         each.spec.name
         for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
-        if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > CLEAR * own
+        if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > SETTINGS.outlying * own
     }
     clear = {name for name in clear if not any(is_time_of_run(s) for s in whole.parameters if s.name == name)}
     others = [effect for effect in fit.effects if effect.name != whole.name]

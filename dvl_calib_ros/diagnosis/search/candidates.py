@@ -25,8 +25,8 @@ from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .arm_clock_ambiguity import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
 from .clock_jumps import LEAP
 
-# Variants to combine; proposals fitted per round, and their largest deviance above the best
-SHORTLIST, FITTED, NOT_WORTH_IT = 12, 7, 40.0
+# Variants to combine; proposals fitted per round
+SHORTLIST, FITTED = 12, 7
 # Places for the largest gains on top of the fit: next to seconds of clock offset a drift adds little
 ADDING_MOST = 4
 # Start times kept per intermittent effect
@@ -96,7 +96,9 @@ def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Str
         ]
     scored.sort()
     scored = [each for each in scored if _is_told_by_two_clocks(table, each[1])]
-    worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
+    worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + SETTINGS.conclusive))[
+        :FITTED
+    ]
     if not any(_is_possible(table, chosen) for chosen in worth):  # outside the linear range
         worth += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
     return table, worth

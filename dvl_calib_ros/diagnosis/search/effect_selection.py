@@ -245,8 +245,6 @@ HEADING, MOVED, DRIFT = "heading_error", "mounting_moved", "misalignment_drift"
 # Effects that rotate DVL against reference by heading, recording or time
 BY_YAW = frozenset({HEADING, MOVED, DRIFT, "water_lock"})
 OF_DRIFT = "rad_per_hour"
-# Deviance drop in the linearised model from which two heading cycles are fitted
-PROMISING = 20.0
 
 
 def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hypothesis]:
@@ -261,7 +259,7 @@ def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hy
     if BY_YAW & fit.values.keys():
         return found
     straight = [fitter.straight_on(fit, each) for each in (fit.hypothesis, *found)]
-    return [each for misfit, each in straight[1:] if misfit < straight[0][0] - PROMISING]
+    return [each for misfit, each in straight[1:] if misfit < straight[0][0] - SETTINGS.conclusive]
 
 
 def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit, dict[str, str]]:
@@ -309,8 +307,8 @@ def _instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
     return fit.hypothesis.with_effects([*rest, heading], n, {HEADING: start})
 
 
-# Robust standard deviations from neighbours and from the other stream; an outlier exceeds both
-FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0
+# Robust standard deviations from the other stream; an outlier exceeds these and `SETTINGS.outlying` from its neighbours
+FROM_OTHER = 4.0
 # Bounds of the ratio of both deviations, projected: around a turn between samples they differ more
 ALIKE = (0.6, 1.7)
 # Fewest samples for a scatter
@@ -373,7 +371,7 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
     usual = _scatter(in_body(curve.from_neighbours))
     off = in_body((curve.values - others(curve.time)) / curve.loudness)
     along = (off * error).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-300) / curve.loudness.mean(axis=1)
-    bad = suspicious & others.covers(curve.time) & (np.abs(off / usual).max(axis=1) > FROM_NEIGHBOURS)
+    bad = suspicious & others.covers(curve.time) & (np.abs(off / usual).max(axis=1) > SETTINGS.outlying)
     bad &= (along > ALIKE[0]) & (along < ALIKE[1])
     return ~bad
 

@@ -10,7 +10,7 @@ import numpy as np
 from ...calibration.registration.registration import IN_TIME_STD_S
 from ...effects.base import Effect
 from ..fit.cross_validation import predictive_gain_of
-from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
+from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, n_amplitudes
 from ..fit.selection_criteria import (
     fit_without,
     log_p_in_place,
@@ -36,9 +36,6 @@ from .arm_clock_ambiguity import (
 )
 from .candidates import combined, straight_lines
 from .initial_guess import FirstGuess
-
-# A clock offset is significant from this multiple of registration's standard deviation
-LATER = 2.0
 
 
 @dataclass(frozen=True)
@@ -138,7 +135,7 @@ def _clock_or_arm(
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
     late = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
-    is_late = opened is None or max(late, default=0.0) >= LATER * opened.late
+    is_late = opened is None or max(late, default=0.0) >= OF_INTERVAL * opened.late
 
     def is_shown(each: Selected) -> bool:
         if each.effect.name == REFERENCE_CLOCK and not is_late:

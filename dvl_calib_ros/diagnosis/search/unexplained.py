@@ -19,24 +19,22 @@ from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
 from ..fit.cross_validation import predictive_gain
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.parametric_bootstrap import simulated_recordings
+from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..fit.selection_criteria import NuisanceFit, coloured_anew, with_slow_noise
 from ..model.forward_model import Problem
 from ..model.seen import Seen
+from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import ScoreTest, orthonormal
 from .alternative_regressors import ALTERNATIVES, dictionary
 from .event_scan import events
 
-LEVEL = 0.001
 # Spectral lines: longer than wave periods; more periods than the time dictionary resolves
 SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
 # Steps per bin of the series for the spectrum, at most: memory must not grow with pauses
 STEPS_OF_A_BIN = 16
-# Standard deviations of a subtracted outlier from which its bin is excluded
-OUTLYING = 5.0
-# Simulated recordings for the null distribution, and degrees of freedom of the prior on its scale of 1
-MADE_UP, PRIOR_DOF = 12, 4.0
+# Degrees of freedom of the prior on the null distribution's scale of 1
+PRIOR_DOF = 4.0
 # Share of the effects' explained deviance that inexact interpolation may leave
 INEXACT = 0.005
 # Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
@@ -52,7 +50,7 @@ class Unexplained:
 
     energy: excess over the null, in noise variances. about: name of the regressor, or a period (s). columns: (M, A, f),
     the dictionary; empty if insignificant. clearest: (M, A, c), the most significant columns. clear_energy: explained
-    by these. price: quantile of the best test under the null at LEVEL.
+    by these. price: quantile of the best test under the null at `SETTINGS.robust_level`.
     """
 
     log_p: float
@@ -66,7 +64,7 @@ class Unexplained:
     @property
     def found(self) -> bool:
         """Return whether the residual is systematic."""
-        return self.log_p < np.log(LEVEL)
+        return self.log_p < np.log(SETTINGS.robust_level)
 
     @property
     def follows(self) -> Reason:
@@ -91,7 +89,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
     tested = len(looks) + len(followed)
-    happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(LEVEL)]
+    happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
     if happened:  # slow noise explains a step as well, unless the step predicts better
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
         least = INEXACT * (base.deviance - fit.deviance)
@@ -115,7 +113,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
         *(look.log_p() for look in looks),
         *(line.log_p for line in followed),
     ]
-    if min(nominal) + looked_at > np.log(LEVEL):
+    if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
         return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
     grown = _grown(fitter, fit, looks)
     of_group = {look.name: by for look, by in zip(looks, grown, strict=True) if look.is_whole}
@@ -129,7 +127,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     whole = [(look.energy / by, look.dof) for look, by in zip(looks, grown, strict=True) if look.is_whole]
     energy = max(*(each - dof for each, dof in whole), 0.0)
     # the best of many lines would always explain some of the noise
-    clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
+    clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     clearest = noise.whiten(best[2])
     tested = next((tested + each.tried for each in happened if each.about == best[1]), tested)
@@ -145,8 +143,9 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
 
 
 def _price(tested: int, columns: int) -> float:
-    """Return the energy that the best of `tested` tests exceeds under the null with probability LEVEL."""
-    return float(chi2_isf(LEVEL / tested, columns))
+    """Return the energy that the best of `tested` tests exceeds under the null with probability
+    `SETTINGS.robust_level`."""
+    return float(chi2_isf(SETTINGS.robust_level / tested, columns))
 
 
 def _plainest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
@@ -212,14 +211,14 @@ def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
     """Return (M,) bins with an outlier in or next to them: it affects the motion regressors as well."""
     if not isinstance(fitter.outliers, np.ndarray):
         return np.zeros(len(noise.level), dtype=bool)
-    far = np.abs(noise.whiten(fitter.outliers)).reshape(noise.level.shape).max(axis=1) > OUTLYING
+    far = np.abs(noise.whiten(fitter.outliers)).reshape(noise.level.shape).max(axis=1) > SETTINGS.outlying
     return np.asarray(far | np.append(far[1:], False) | np.append(False, far[:-1]))
 
 
 def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]:
     """Return the inflation of each test's energy over chi-square in simulated recordings, at least 1."""
     energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
-    for other, seen, residual in simulated_recordings(fitter.problem, fit, MADE_UP):
+    for other, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
         found, *_ = _looked(fitter, fit, other, seen, residual)
         energy += [look.energy for look in found]
         dof += [look.dof for look in found]

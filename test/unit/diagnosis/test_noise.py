@@ -19,6 +19,7 @@ from dvl_calib_ros.diagnosis.model.claimed_noise import exponents, followed
 from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, make_recording
+from dvl_calib_ros.diagnosis.model.settings import SETTINGS
 from dvl_calib_ros.diagnosis.model.stream_curve import Curve
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise import noise_level
@@ -286,12 +287,12 @@ def test_a_few_quiet_rows_at_a_rare_speed_call_for_no_level(monkeypatch):
     innovations = np.random.default_rng(1).standard_normal((95, 2))
     innovations[40:44] *= 0.1
     monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": speed})
-    assert noise_level.fit_level(None, (), innovations).p > noise_level.SIGNIFICANT
+    assert noise_level.fit_level(None, (), innovations).p > SETTINGS.robust_level
     monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": np.where(speed < 1.5, speed, 2.0)})
-    assert noise_level.fit_level(None, (), innovations).p > noise_level.SIGNIFICANT
+    assert noise_level.fit_level(None, (), innovations).p > SETTINGS.robust_level
     monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": np.linspace(1.0, 2.0, 95)})
     grown = innovations * np.exp(3.0 * np.linspace(0.0, 1.0, 95))[:, None]
-    assert noise_level.fit_level(None, (), grown).p < noise_level.SIGNIFICANT
+    assert noise_level.fit_level(None, (), grown).p < SETTINGS.robust_level
 
 
 @pytest.mark.parametrize(("keep", "low"), [(0.0, 0.95), (0.5, 0.85)])
