@@ -23,6 +23,9 @@ from ..errors import InputError
 
 HOUR_S = 3600.0
 
+# Fixed-point iterations that undo a delay, or an effect on the motion it changes; both are small against the motion
+PASSES = 3
+
 
 @dataclass(frozen=True)
 class EffectInput:
@@ -365,3 +368,11 @@ def late(injections: Sequence[Injection], clock: ActsOn, elapsed: Array) -> Arra
         if isinstance(each.effect, ClockEffect) and each.effect.acts_on is clock:
             total += each.effect.late(elapsed, each.values)
     return total
+
+
+def true_times(injections: Sequence[Injection], clock: ActsOn, stamps: Array) -> Array:
+    """Return the true times (N,) s of a clock's stamps (N,) s, by fixed-point iteration."""
+    time = stamps
+    for _ in range(PASSES):
+        time = stamps - late(injections, clock, time)
+    return time

@@ -9,10 +9,9 @@ import numpy as np
 
 from ...calibration.numerics.frames import Array
 from ...effects.base import MountingEffect
-from ..fit.cross_validation import coloured_anew, with_slow_noise
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.parametric_bootstrap import simulated_recordings
-from ..fit.selection_criteria import NuisanceFit, blocks_of
+from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
+from ..fit.selection_criteria import NuisanceFit, robust_covariance
 from ..model.forward_model import Problem
 from ..model.hypothesis import is_time_of_run
 from ..search.clock_jumps import LEAP, time_by_stamps
@@ -21,11 +20,9 @@ from ..search.effect_selection import EffectSelection
 Triple = tuple[float, float, float]
 Times = dict[tuple[str, int, str], Triple]
 
-# Number of simulated recordings. Thresholds of significance: of the mean error, in σ; of the relative scatter, exceeded
-# by chance in one of thirty such sets
-MADE_UP, OFF_BY, SCATTER = 12, 1.0, 1.35
-# Recordings of slower noise
-DRAWN = 100
+# Thresholds of significance: of the mean error, in σ; of the relative scatter, exceeded by chance in one of thirty sets
+# of simulated recordings
+OFF_BY, SCATTER = 1.0, 1.35
 # True motion between samples lies between fitted and simulated interpolation: half of their difference counts
 HALF_WAY = 0.5
 
@@ -34,7 +31,7 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     """Return the covariance (6 + p, 6 + p) of a selection, and effects' times with 95 per cent intervals. Times are by
     effect, recording and name."""
     fitter, fit = selection.fitter, selection.fit
-    covariance = _with_slower_noise(fitter.problem, fit, fit.covariance(blocks_of(fitter.problem)))
+    covariance, _ = robust_covariance(fitter.problem, fit)
     if not selection.selected:
         return covariance, {}
     covariance = with_unshown_turns(fitter.problem, fit, _with_samples(fitter, fit, covariance))
@@ -49,26 +46,12 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     return covariance, times
 
 
-def _with_slower_noise(problem: Problem, fit: Fit, covariance: Array) -> Array:
-    """Inflate a covariance (n, n) to the scatter of the estimate under noise that lasts as the residual says.
-
-    The fit's own noise is bounded in memory, so that no effect is taken for it, and blocks are shorter than multipath.
-    """
-    known = NuisanceFit.of_fit(problem, fit)
-    slower = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)[0]
-    rng = np.random.default_rng(0)
-    drawn = np.stack([slower.unwhiten(rng.standard_normal(fit.residual.size)) for _ in range(DRAWN)], axis=2)
-    steps = fit.system.covariance() @ fit.noise.whiten(fit.columns).T @ fit.noise.whiten(drawn)
-    grown = np.sqrt(np.maximum((steps**2).mean(axis=1) / np.diag(covariance), 1.0))
-    return np.asarray(covariance * np.outer(grown, grown))
-
-
 def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
     """Add bias and excess scatter of fits to simulated recordings to a covariance (n, n)."""
     steps = np.array(
         [
             fitter.step_of(other, seen, left, fit)
-            for other, seen, left in simulated_recordings(fitter.problem, fit, MADE_UP)
+            for other, seen, left in simulated_recordings(fitter.problem, fit, SIMULATED)
         ]
     )
     std = np.sqrt(np.diag(covariance))

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_over, ends_of_stretches, integration_steps
 from ...calibration.numerics.frames import Array
-from ..fit.cross_validation import coloured_anew, fitted_without, folds_of, stretch_of, with_slow_noise
+from ..fit.cross_validation import fitted_without, folds_of, stretch_of
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.selection_criteria import NuisanceFit, blocks_of
+from ..fit.selection_criteria import NuisanceFit, blocks_of, coloured_anew, with_slow_noise
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
@@ -195,7 +195,8 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     """Return a gap with its closure, by the distribution of the true parameters about the estimated ones.
 
     covariance: (6 + p, 6 + p) of the parameters. The noise-free error is the estimated effects' and the error's of
-    their parameters, both after a calibration. Equivalent effects are equally likely.
+    their parameters, both after a calibration. Equivalent effects are equally likely, and so are the effects of
+    `EffectSelection.wider`: slow noise explains these as well.
     """
     fit, fitter = selection.fit, selection.fitter
     if not fit.effects:
@@ -212,8 +213,11 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     spread = np.sqrt(blocks / rng.chisquare(blocks, (RESAMPLES, 1)))  # the scatter of blocks is itself estimated
     moved = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
     columns = beside_calibration(fit.columns[:, :, 6:])
-    rivals = [fitter.evaluated(each)[1] for selected in selection.selected for each in selected.rivals]
-    truths = [beside_calibration(selection.base.residual - each)[:, 0] for each in (fit.residual, *rivals)]
+    others = [rival for selected in selection.selected for rival in selected.rivals]
+    if selection.wider is not None and len(selection.wider.effects) > len(fit.effects):
+        others.append(selection.wider)
+    residuals_of = [fit.residual, *(fitter.evaluated(each)[1] for each in others)]
+    truths = [beside_calibration(selection.base.residual - each)[:, 0] for each in residuals_of]
     corrected = truths[0]
     of_cause = rows * remainder(selection, residuals)
     gram = columns.T @ columns

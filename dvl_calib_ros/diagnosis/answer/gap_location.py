@@ -15,12 +15,12 @@ from ...effects.base import EffectInput, EffectNeeds
 from ..fit.gauss_newton import Fit, Fitter
 from ..model.forward_model import Problem
 from ..model.seen import Seen
+from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares, orthonormal
+from ..search.alternative_regressors import TURNING_RADPS
 from ..search.unexplained import explained
 
-LEVEL = 0.01
-TURNING_RADPS = np.deg2rad(2.0)
 ACCELERATING_MPS2 = 0.05
 STRETCHES = 6
 BANDS_HZ = (0.0, 0.01, 0.05, 0.2, np.inf)
@@ -98,7 +98,7 @@ def places(fitter: Fitter, base: Fit, fit: Fit, columns: Array) -> list[GapPlace
     kept = [
         GapPlace(place.axis, place.regime, place.segment_s, place.band_hz, place.share, float(p))
         for place, p in zip(found, adjusted, strict=True)
-        if p < LEVEL and place.share > 0.02
+        if p < SETTINGS.level and place.share > 0.02
     ]
     return sorted(kept, key=lambda place: -place.share)
 

@@ -9,7 +9,7 @@ import numpy as np
 from ...effects.base import Effect
 from ..fit.cross_validation import surprise_elsewhere
 from ..fit.gauss_newton import Fit
-from ..fit.selection_criteria import NuisanceFit, blocks_of, robust_p
+from ..fit.selection_criteria import NuisanceFit
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
@@ -19,7 +19,6 @@ from ..search.unexplained import (
     Unexplained,
     is_of_group,
     matters,
-    moved_by,
     unexplained,
 )
 from .gap_closure import Gap
@@ -45,28 +44,7 @@ def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
         gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop
         if gain > 0.0 and (best is None or gain > best[0]):
             best = gain, reduced, other
-    return _sure_beside(*((selection, rest) if best is None else best[1:]))
-
-
-def _sure_beside(selection: EffectSelection, rest: Unexplained) -> tuple[EffectSelection, Unexplained]:
-    """Reject effects that are insignificant with the residual's regressor as nuisance.
-
-    The unknown cause's part in them is undetermined: a current and two drifts may replace a step in a bias.
-    """
-    fitter, block = selection.fitter, blocks_of(selection.fitter.problem)
-    while selection.selected and matters(fitter.problem, selection.fit, rest):
-        fit, named = selection.fit, {each.effect.name for each in selection.selected}
-        moved = moved_by(fitter.problem, fit, rest)
-        p_values = {e.name: robust_p(fit, e, block, moved=moved) for e in fit.effects if e.name in named}
-        worst = max(p_values, key=lambda name: p_values[name])
-        if p_values[worst] < SETTINGS.robust_level:
-            break
-        reduced = selection.without({worst})
-        other = unexplained(fitter, reduced.fit)
-        if not matters(fitter.problem, reduced.fit, other):
-            break
-        selection, rest = reduced, other
-    return selection, rest
+    return (selection, rest) if best is None else best[1:]
 
 
 def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:

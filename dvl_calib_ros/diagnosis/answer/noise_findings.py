@@ -12,21 +12,18 @@ from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.tests import holm
 from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, around
-from ..fit.parametric_bootstrap import simulated_recordings
+from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..model.claimed_noise import followed
 from ..model.forward_model import Problem
-from ..noise.noise_level import SIGNIFICANT, claims_of, fit_claims, fit_level, stretches_of
+from ..model.settings import SETTINGS
+from ..noise.noise_level import claims_of, fit_claims, fit_level, stretches_of
 from ..noise.noise_model import Arma, Noise
 from .gap_closure import claimed_std, high_frequency_variance
 
-LEVEL = 0.01
-OUTLIER_SIGMA = 6.0
 # Rate of repeats under the null hypothesis, with a coarse resolution
 CHANCE_OF_REPEAT = 1e-3
 # Least ratio of actual to reported noise that is reported
 INFLATION = 1.2
-# Simulated recordings with white noise, for the colour from interpolation
-MADE_UP = 5
 # Exponent below which reported covariances are invalid; the other stream's noise lowers it even if they are valid
 HALF = 0.5
 
@@ -57,14 +54,16 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
         return []
     adjusted = holm([each.p for each in found])
     findings = [
-        NoiseFinding(each.name, each.parameters, float(p)) for each, p in zip(found, adjusted, strict=True) if p < LEVEL
+        NoiseFinding(each.name, each.parameters, float(p))
+        for each, p in zip(found, adjusted, strict=True)
+        if p < SETTINGS.level
     ]
     return sorted(findings, key=lambda each: each.p)
 
 
 def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
     scale = robust_std(innovations)
-    far = (np.abs(innovations) > OUTLIER_SIGMA * scale).any(axis=1)
+    far = (np.abs(innovations) > SETTINGS.outlying * scale).any(axis=1)
     off = problem.bursts // problem.grids[0].per_bin
     count, n = int(np.count_nonzero(far)) + off, len(innovations) + off
     spikes, received = (sum(getattr(r, name) for r in problem.recordings) for name in ("spikes", "received"))
@@ -72,7 +71,7 @@ def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
         count, n = spikes, received
     if count < 3:
         return None
-    p = binomial_sf(count, n, 6.0 * float(normal_sf(OUTLIER_SIGMA)))
+    p = binomial_sf(count, n, 6.0 * float(normal_sf(SETTINGS.outlying)))
     return NoiseFinding("outliers", {"share": (count / n, *binomial_interval(count, n))}, p)
 
 
@@ -97,7 +96,7 @@ def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
     constant = _time_constant(clearest, interval)
     if constant < 2.0 * interval:
         return None  # interpolated neighbours share samples
-    if float(chi2_sf(drop, dof)) < LEVEL:
+    if float(chi2_sf(drop, dof)) < SETTINGS.level:
         drop = min(drop, _made_by_comparing(problem, fit).deviance(residual) - noise.deviance(residual))
     spread = constant * 2.0 / np.sqrt(max(1.0, sum(r.seconds for r in problem.recordings) / max(constant, interval)))
     parameters = {"time_constant_s": (constant, max(0.0, constant - spread), constant + spread)}
@@ -111,7 +110,7 @@ def _made_by_comparing(problem: Problem, fit: Fit) -> Noise:
     motion.
     """
     noise, white = fit.noise, replace(fit, noise=fit.noise.white)
-    residuals = [residual for _, _, residual in simulated_recordings(problem, white, MADE_UP)]
+    residuals = [residual for _, _, residual in simulated_recordings(problem, white, SIMULATED // 2)]
     m = len(fit.residual)
     pooled = replace(
         noise,
@@ -148,13 +147,13 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
     even = innovations * fit.noise.level
     even = even / followed(log_claims, even, names, stretches_of(problem))
     level = fit_level(problem, fit.seen, even)
-    if level is not None and level.p < SIGNIFICANT:
+    if level is not None and level.p < SETTINGS.robust_level:
         units = {"speed": "log_per_mps", "turn_rate": "log_per_radps"}
         z = normal_isf(np.maximum(level.p_of, 1e-300) / 2.0)
         parameters = {
             units[name]: around(float(slope), float(abs(slope) / z_of))
             for name, slope, z_of, p in zip(level.names, level.slopes, z, level.p_of, strict=True)
-            if p < LEVEL
+            if p < SETTINGS.level
         }
         if parameters:
             found.append(NoiseFinding("noise_inflation", parameters, level.p))

@@ -10,15 +10,12 @@ import numpy as np
 from ...bags.writer import BagWriter, Compression, Storage
 from ...calibration.numerics.frames import Array, cross
 from ...calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, VelocityFrame
-from ...effects.base import ActsOn, EffectInput, at_dvl, late, traces, turns
+from ...effects.base import PASSES, ActsOn, EffectInput, at_dvl, late, traces, true_times, turns
 from ...messages.encode import SampleWriter
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.recorded_streams import RecordedStreams
 from ..search.effect_selection import EffectSelection
-
-# Fixed-point iterations for the true time of a delayed stamp, and for the true motion from the reference's
-_PASSES = 3
 
 
 @dataclass(frozen=True)
@@ -53,9 +50,7 @@ def with_quiet_reference(problem: Problem) -> Problem:
 def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     """Simulate the DVL velocity (N, 3) m/s from the reference's motion by the composed model."""
     recording, injections = problem.recordings[index], hypothesis.injections(index)
-    time = recording.dvl.time
-    for _ in range(_PASSES):
-        time = recording.dvl.time - late(injections, ActsOn.DVL_CLOCK, time)
+    time = true_times(injections, ActsOn.DVL_CLOCK, recording.dvl.time)
     oriented = time + late(injections, ActsOn.ATTITUDE_CLOCK, time)
     velocity = recording.reference(time + late(injections, ActsOn.REFERENCE_CLOCK, time))
     rotation = None if recording.attitude is None else recording.rotation_enu_from_body(oriented)
@@ -65,7 +60,7 @@ def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     rates = recording.angular_velocity(oriented) if has_rates else None
     nominal = problem.rotation_dvl_from_body
     motion = EffectInput(time, velocity, nominal, rotation, rates, recording.frame, 0.0)
-    for _ in range(_PASSES):  # the trace depends on the true motion
+    for _ in range(PASSES):  # the trace depends on the true motion
         motion = replace(motion, velocity_body=velocity + traces(injections, motion, ActsOn.REFERENCE))
     moved = at_dvl(injections, motion)
     if rates is not None:

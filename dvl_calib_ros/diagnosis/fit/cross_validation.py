@@ -15,15 +15,13 @@ from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .gauss_newton import Fit, Fitter
-from .selection_criteria import NuisanceFit
+from .selection_criteria import NuisanceFit, coloured_anew, with_slow_noise
 
 Integers = NDArray[np.intp]
 # Columns, and the residual (M, A) m/s to which they are fitted
 Predictor = tuple[NuisanceFit, Array]
 # Steps of a fit that starts from the fit to all data
 FOLD_STEPS = 6
-# Time constant, s, of the slowest noise as an alternative to an effect: GNSS multipath lasts minutes
-SLOWEST_S = 100.0
 
 
 def fitted_without(
@@ -99,17 +97,3 @@ def predictive_gain_of(problem: Problem, simpler: Fit, richer: Fit) -> float:
     own, other = ((NuisanceFit.of_fit(problem, each), each.residual) for each in (simpler, richer))
     smoothed = float(simpler.own_noise @ simpler.own_noise - richer.own_noise @ richer.own_noise)
     return predictive_gain(problem, richer.noise, own, other) + max(-smoothed, 0.0)
-
-
-def with_slow_noise(problem: Problem, noise: Noise) -> Noise:
-    """Return a noise whose memory may be as long as that of multipath."""
-    return replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
-
-
-def coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> tuple[Noise, Array]:
-    """Return the noise re-estimated from a residual (M, A) with fitted columns subtracted, and the difference."""
-    left = residual
-    for _ in range(2):
-        left = residual + fitted.columns @ fitted.step(noise, residual).solution()
-        noise = noise.refitted(left, taken=noise.taken_by(fitted.columns, fitted.std))
-    return noise, left

@@ -34,14 +34,10 @@ BY_CHANCE = 1.5
 PRIOR_IN_TYPICAL = 50.0
 # Bounds below which a fit is skipped as worse: deviance, plus a share of its first step's gain for nonlinearity
 SURELY, BENT = 2.0, 0.2
-# Multiple of the first if the gain of a converged fit's step is subtracted
-NEARBY = 2.0
-# A burst: bins beyond BURST robust standard deviations with neighbours beyond ABOUT_BURST, of at most this share of the
-# recording; instrument errors, not an effect
-BURST, ABOUT_BURST, RARE = 6.0, 3.0, 0.02
-# Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2), and deviance from
-# which its search stops: turns make a clock jump observable, straight legs do not, so there may be a second minimum
-OF_A_TIME, NO_TIME_BEYOND = -2.0 * float(np.log(1.0 - np.sqrt(0.95))), 40.0
+# A burst: outliers with neighbours beyond half of that, of at most this share of the recording
+RARE = 0.02
+# Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2)
+OF_A_TIME = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 # Half width, in standard deviations, of a 95 per cent interval
 OF_INTERVAL = 1.96
 Mask = NDArray[np.bool_]
@@ -157,8 +153,8 @@ class Fitter:
         """
         raw = (fit.residual + self.outliers) / fit.noise.level
         size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
-        run = np.cumsum(np.diff(size > ABOUT_BURST, prepend=False))  # odd in the runs, even between them
-        far = np.isin(run, run[size > BURST])
+        run = np.cumsum(np.diff(size > 0.5 * SETTINGS.outlying, prepend=False))  # odd in the runs, even between them
+        far = np.isin(run, run[size > SETTINGS.outlying])
         return far & (np.count_nonzero(far) <= RARE * len(far))
 
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
@@ -196,15 +192,12 @@ class Fitter:
         max_steps: int = MAX_STEPS,
         only_of_the_day: bool = False,
         fixed: frozenset[str] = frozenset(),
-        careful: bool = False,
         looked: _Looked | None = None,
         evaluated: Evaluated | None = None,
     ) -> Fit:
         """Fit a hypothesis under a noise. only_of_the_day: fit parameters per recording only.
 
-        fixed: names of effects whose values are fixed. careful: omit a failed ordinary step from the last step, which
-        corrects for noise in the columns; such steps fail at the kink of a slow attitude. If a fit is stuck far from
-        the optimum, the whole last step frees it. looked, evaluated: linearisation or evaluation of the start, if
+        fixed: names of effects whose values are fixed. looked, evaluated: linearisation or evaluation of the start, if
         known.
         """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
@@ -245,8 +238,6 @@ class Fitter:
         if len(free):
             step = np.zeros(len(kept))
             step[free] = system.part(free).solution()
-            if careful and not moved:
-                step[free] -= plain.part(free).solution()
             last = hypothesis.moved(step)
             last_seen, last_residual = self.evaluated(last)
             last_misfit = self._misfit(noise, last_residual, last)
@@ -339,16 +330,6 @@ class Fitter:
                     fit = self._finer(fit, effect, spec.name, step)
         return fit
 
-    def refined_as_white(self, fit: Fit, steps: Sequence[float]) -> Fit:
-        """Refine the times under white noise, if the fit is better.
-
-        Coloured noise absorbs the residual of a wrong time except the step itself: only the exact time is better.
-        """
-        if not fit.noise.is_coloured or not any(is_time_of_run(s) for e in fit.effects for s in e.parameters):
-            return fit
-        found = self.fit(self.refined(self.fit(fit.hypothesis, fit.noise.white), steps).hypothesis, fit.noise)
-        return found if found.deviance < fit.deviance else fit
-
     def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
         at_rest: tuple[Fit, float] | None = None
         for sign in (-1.0, 1.0):
@@ -387,7 +368,7 @@ class Fitter:
         if least > deviance + SURELY + BENT * gained:
             return True
         alike = min(promised, gained)
-        return least + alike > deviance + NEARBY * SURELY + BENT * (gained - alike)
+        return least + alike > deviance + 2.0 * SURELY + BENT * (gained - alike)
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """Return the time at which an effect begins or ends, with its 95 per cent interval."""
@@ -402,7 +383,7 @@ class Fitter:
                 worse = self._worse_at(_with_time(fit, effect, name, recording, at), fit)
                 if was_as_good or worse < OF_A_TIME:  # the first rejected time bounds the interval
                     end = at
-                if worse > NO_TIME_BEYOND:
+                if worse > SETTINGS.conclusive:
                     break
                 step, was_as_good = 1.6 * step, worse < OF_A_TIME
             ends.append(end)
@@ -411,7 +392,7 @@ class Fitter:
     def _worse_at(self, moved: Hypothesis, fit: Fit) -> float:
         """Return the deviance increase of a fit at another time, infinite if it is certainly too large."""
         looked = self._looked(moved, fit.noise)
-        if self._is_surely_worse(moved, looked, fit.noise, fit.deviance + NO_TIME_BEYOND):
+        if self._is_surely_worse(moved, looked, fit.noise, fit.deviance + SETTINGS.conclusive):
             return np.inf
         return self.fit(moved, fit.noise, 2, looked=looked).deviance - fit.deviance
 

@@ -16,7 +16,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.samples import VelocityFrame
-from ...effects.base import ActsOn, late
+from ...effects.base import ActsOn, true_times
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.recorded_streams import RecordedStreams
@@ -24,8 +24,8 @@ from ..model.seen import Seen
 from ..model.stream_curve import FAST_ENOUGH_S, Curve
 from .gauss_newton import Fit
 
-# Fixed-point iterations for the true time of a delayed stamp
-_PASSES = 3
+# Number of simulated recordings for a null distribution
+SIMULATED = 12
 
 
 class _OtherWay(Curve):
@@ -96,9 +96,7 @@ def _drawn(recording: RecordedStreams, reference: Array, share: float, rng: np.r
 def _reference(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:
     """Return the noise-free reference (M, k) m/s of a recording, in its frame, at its own stamps."""
     recording, injections = problem.recordings[index], hypothesis.injections(index)
-    time = recording.reference.time
-    for _ in range(_PASSES):
-        time = recording.reference.time - late(injections, ActsOn.REFERENCE_CLOCK, time)
+    time = true_times(injections, ActsOn.REFERENCE_CLOCK, recording.reference.time)
     seen = problem.seen(hypothesis, index, time)
     motion = seen.motion
     velocity: Array = motion.velocity_body - seen.on_reference(injections)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,10 @@ from .gauss_newton import Fit, Fitter, n_amplitudes, prior_std
 WINDOW_STEPS = 10
 # Deviance within which the more usual effects are preferred
 AS_WELL = 2.0
+# Time constant, s, of the slowest noise as an alternative to an effect: GNSS multipath lasts minutes
+SLOWEST_S = 100.0
+# Simulated residuals of slow noise
+DRAWN = 100
 
 
 def windows(effect: Effect, seconds: float) -> list[dict[str, float]]:
@@ -43,12 +48,6 @@ def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0)
     """Return the deviance that the best of all effects explains under the null with probability `SETTINGS.level`."""
     dof = n_amplitudes(effect, n_recordings)
     return float(chi2_isf(SETTINGS.level / n_effects / tried, dof))
-
-
-def price_of_a_time(effect: Effect, n_effects: int) -> float:
-    """Return the deviance that the best start time of an effect adds under the null to an effect throughout. The
-    probability is `SETTINGS.level`."""
-    return float(chi2_isf(SETTINGS.level / n_effects / times_tried(effect), 1))
 
 
 def criterion(fit: Fit, n_effects: int) -> float:
@@ -100,10 +99,10 @@ def _told_by_unshown(problem: Problem, fit: Fit) -> float:
     return alone.misfit(alone.solution()) - both.misfit(both.solution())
 
 
-def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "", moved: Array | float = 0.0) -> float:
-    """Return p of a Wald test, with the covariance of blocks, of an effect or of one parameter by name.
+def robust_p(fit: Fit, effect: Effect, covariance: Array, blocks: int) -> float:
+    """Return p of a Wald test of an effect, adjusted for its alternatives.
 
-    moved: (6 + p,) change of the parameters by a cause that is not in the fit.
+    covariance: (6 + p, 6 + p), from a number of blocks.
     """
     at, start = np.zeros(0, dtype=int), 6
     for other in fit.effects:
@@ -111,14 +110,25 @@ def robust_p(fit: Fit, effect: Effect, block: NDArray[np.intp], name: str = "", 
         if other is effect:
             at = np.arange(start, start + p)
         start += p
-    own = fit.hypothesis.parameters_of(effect)
-    is_asked = np.array([not name or each.spec.name == name for each in own])
-    at, defaults = at[is_asked], np.array([each.spec.default for each in own])[is_asked]
+    defaults = np.array([each.spec.default for each in fit.hypothesis.parameters_of(effect)])
     values = fit.hypothesis.vector()[at] - defaults
-    covariance = (fit.covariance(block) + np.outer(moved, moved))[np.ix_(at, at)]
-    wald = float(values @ np.linalg.solve(covariance, values)) / len(at)
-    blocks = int(block.max()) + 1
-    return float(f_sf(wald, len(at), max(blocks - len(at), 2)))
+    wald = float(values @ np.linalg.solve(covariance[np.ix_(at, at)], values)) / len(at)
+    return min(1.0, times_tried(effect) * float(f_sf(wald, len(at), max(blocks - len(at), 2))))
+
+
+def robust_covariance(problem: Problem, fit: Fit) -> tuple[Array, int]:
+    """Return the covariance (6 + p, 6 + p) from blocks, inflated to the scatter by slow noise, and their number.
+
+    The fit's own noise is bounded in memory, so that no effect is taken for it, and blocks are shorter than multipath.
+    The memory is uncertain as well: it is drawn from its posterior.
+    """
+    block = blocks_of(problem)
+    covariance, known, rng = fit.covariance(block), NuisanceFit.of_fit(problem, fit), np.random.default_rng(0)
+    slower, left = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)
+    drawn = np.stack(list(slower.drawn(left, slower.taken_by(known.columns, known.std), DRAWN, rng)), axis=2)
+    steps = fit.system.covariance() @ fit.noise.whiten(fit.columns).T @ fit.noise.whiten(drawn)
+    grown = np.sqrt(np.maximum((steps**2).mean(axis=1) / np.diag(covariance), 1.0))
+    return np.asarray(covariance * np.outer(grown, grown)), int(block.max()) + 1
 
 
 def blocks_of(problem: Problem) -> NDArray[np.intp]:
@@ -180,3 +190,17 @@ class NuisanceFit(NamedTuple):
 def _likely(raw: Array, residual: Array) -> float:
     """Return the size of each of columns (M, A, c) of unit size that jointly equal a residual (M, A) in size."""
     return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
+
+
+def with_slow_noise(problem: Problem, noise: Noise) -> Noise:
+    """Return a noise whose memory may be as long as that of multipath."""
+    return replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
+
+
+def coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> tuple[Noise, Array]:
+    """Return the noise re-estimated from a residual (M, A) with fitted columns subtracted, and the difference."""
+    left = residual
+    for _ in range(2):
+        left = residual + fitted.columns @ fitted.step(noise, residual).solution()
+        noise = noise.refitted(left, taken=noise.taken_by(fitted.columns, fitted.std))
+    return noise, left

@@ -9,25 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...calibration.numerics.distributions import normal_isf
 from ...calibration.numerics.frames import Array
+from .settings import SETTINGS
 
-if TYPE_CHECKING:
-    pass
-
-# Level (one-sided) at which a positive exponent is significant
-SURE = 1e-4
 # Largest exponent: if standard deviations are written as variances, the reported values are square roots
 LARGEST = 2.0
 # Least standard deviation of the logarithm of reported values that is informative
 DIFFER = 0.05
-# Stretch, s, within which squares may be correlated for any reason
-STRETCH_S = 20.0
 # Bound of the log noise level about its mean
 FARTHEST = 4.0
 
@@ -43,7 +36,7 @@ class Claims:
     @property
     def sure(self) -> NDArray[np.bool_]:
         """Return (c,) whether the noise depends significantly on the reported value."""
-        return np.asarray(self.exponents > normal_isf(SURE) * self.stds)
+        return np.asarray(self.exponents > normal_isf(SETTINGS.robust_level) * self.stds)
 
 
 def differ(log_claims: Array) -> bool:
@@ -104,7 +97,7 @@ def loudness(time: Array, claims: Array | None, differences: Array, weights: Arr
         return np.ones(shape)
     variance = np.stack([np.convolve(column, weights**2, "valid") for column in (claims**2).T], axis=1)
     middle = time[len(weights) // 2 :][: len(differences)]
-    stretch = np.floor((middle - middle[0]) / STRETCH_S).astype(np.intp)
+    stretch = np.floor((middle - middle[0]) / SETTINGS.block).astype(np.intp)
     found = exponents(["own"], 0.5 * np.log(variance)[:, :, None], differences, stretch)
     if not found.sure.all():
         return np.ones(shape)

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...calibration.numerics.frames import Array, skew
-from ...effects.base import ActsOn, Effect, EffectInput, EffectParameter, EffectWithMemory, Injection, traces
+from ...effects.base import PASSES, ActsOn, Effect, EffectInput, EffectParameter, EffectWithMemory, Injection, traces
 from .hypothesis import Hypothesis, Values, amplitudes
 from .stream_curve import Curve
-from .time_grid import PASSES
 
 
 @dataclass(frozen=True)

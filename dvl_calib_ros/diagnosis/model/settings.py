@@ -22,6 +22,8 @@ class DiagnosisSettings:
     within which two explanations are equivalent: for a rival better by d, the odds are those of a normal variable
     beyond √d. robust_level: p of an effect from the scatter of blocks, valid for noise of any colour.
 
+    outlying: robust standard deviations of an outlier. conclusive: deviance that leaves no doubt between two fits.
+
     Judging: block, folds: of hold-out. noise_tolerance: standard errors by which the noise of all frequencies may
     exceed the high ones. instead_of: deviance up to which an unknown cause may replace effects; a larger unknown cause
     would be significant without a test, and interpolation leaves more than noise of it. prior_angle, prior_scale:
@@ -46,6 +48,8 @@ class DiagnosisSettings:
     block: float = 20.0
     folds: int = 5
     noise_tolerance: float = 3.0
+    outlying: float = 6.0
+    conclusive: float = 40.0
     instead_of: float = 1500.0
     prior_angle: float = 0.1
     prior_scale: float = 0.02

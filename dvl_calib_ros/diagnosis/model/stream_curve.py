@@ -28,9 +28,9 @@ NOISE_ALONE, SOME_MOTION = 1.4, 2.5
 FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 # Longest interval, s, of a stream that resolves turns and waves: only its noise is removed; samples per smoothing cubic
 FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
-# Clipping of outliers, in standard deviations; relative excess of tails that is significant (3 σ): the median of
+# Relative excess of tails that is significant (3 σ): the median of
 # neighbours' differences has a relative σ of 1.6 / √n
-SPIKY, SURELY_HEAVY = 6.0, 3.0 * 1.6
+SURELY_HEAVY = 3.0 * 1.6
 # Largest product of the intervals to both neighbours, in usual intervals; at the middle of two samples it is 0.25
 TOLD = 0.4
 
@@ -143,7 +143,7 @@ class Curve:
         off, std = off[:, std > 0.0], std[std > 0.0]
         if not len(std):
             return 1.0
-        own = np.sqrt(np.mean((np.clip(off / std, -SPIKY, SPIKY)) ** 2))
+        own = np.sqrt(np.mean((np.clip(off / std, -SETTINGS.outlying, SETTINGS.outlying)) ** 2))
         return float(np.maximum(own / (1.0 + SURELY_HEAVY / np.sqrt(off.size)), 1.0) ** 2)
 
     @cached_property

@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...calibration.numerics.frames import Array
-from ...effects.base import ActsOn, Injection, late
+from ...effects.base import ActsOn, Injection, true_times
 from .recorded_streams import RecordedStreams
 from .settings import SETTINGS
 from .stream_curve import FAST_ENOUGH_S
 
 # Longer silences (s) are pauses: they do not widen the bins
 PAUSE_S = 60.0
-# Fixed-point iterations that undo an effect on the motion it changes; the effect is small against the motion
-PASSES = 3
 # Interval, s, of the motion that a filter follows if the grid is slower than `FAST_ENOUGH_S`: from slopes at 1 Hz, a
 # wave of 5 s is a quarter too small
 CLOSE_S = 0.1
@@ -71,9 +69,7 @@ class Grid:
         A tried clock jump where there is none reverses some samples. These follow at half the usual interval until they
         have the jump's delay. An actual jump leaves a gap in the stamps, not in time.
         """
-        time = self.stamps
-        for _ in range(PASSES):
-            time = self.stamps - late(injections, self.clock, time)
+        time = true_times(injections, self.clock, self.stamps)
         least = self._least
         return time if (np.diff(time - least) > 0.0).all() else np.maximum.accumulate(time - least) + least
 

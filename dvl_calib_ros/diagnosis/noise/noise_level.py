@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 from ...calibration.numerics.distributions import chi2_sf
 from ...calibration.numerics.frames import Array
 from ...effects.base import EffectNeeds
-from ..model.claimed_noise import STRETCH_S, Claims, differ, exponents, followed
+from ..model.claimed_noise import Claims, differ, exponents, followed
 from ..model.forward_model import Problem
 from ..model.seen import Seen
+from ..model.settings import SETTINGS
 from .noise_model import Noise, white_noise
 
-SIGNIFICANT = 1e-4
 # Extreme rows that alone do not establish a level
 FEW = 6
-# Rounds of alternating estimates of colour and absorbed noise, which depend weakly on each other
-TAKEN_ROUNDS = 2
 
 
 @dataclass(frozen=True)
@@ -50,10 +48,10 @@ def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Lev
     log_square = np.log(np.maximum((innovations**2).mean(axis=1), 1e-12))
     slopes, covariance, wald = _sloped(list(found.values()), log_square)
     p, p_of = float(chi2_sf(wald, len(slopes))), chi2_sf(slopes**2 / np.diag(covariance), 1)
-    if p < SIGNIFICANT:
+    if p < SETTINGS.robust_level:
         common = [each for values in found.values() if np.ptp(each := _common(values)) > 0.0]
         p_common = float(chi2_sf(_sloped(common, log_square)[2], len(common))) if common else 1.0
-        p = p if p_common < SIGNIFICANT else p_common
+        p = p if p_common < SETTINGS.robust_level else p_common
     x = np.column_stack([values - values.mean() for values in found.values()])
     level = np.exp(np.clip(0.5 * x @ slopes, -2.0, 2.0))
     return Level(tuple(found), 0.5 * slopes, p, p_of, level)
@@ -85,7 +83,7 @@ def estimated(
     columns, std: (M, A, p) and (p,) of the fit that the residual is from, which has absorbed some of the noise.
     """
     noise = white_noise(left, problem.segments, rotation, problem.interval).refitted(left)
-    for _ in range(TAKEN_ROUNDS):
+    for _ in range(2):  # colour and absorbed noise depend weakly on each other
         taken = noise.taken_by(columns, std)
         noise = noise.refitted(noise.robust(left), taken=taken)
     names, log_claims = claims_of(problem, seen, rotation)
@@ -94,7 +92,7 @@ def estimated(
         noise = replace(noise, level=noise.level * followed(log_claims, innovations, names, stretches_of(problem)))
         noise = noise.refitted(noise.robust(left), taken=taken)
     level = fit_level(problem, seen, noise.whiten(left).reshape(left.shape))
-    if level is not None and level.p < SIGNIFICANT:
+    if level is not None and level.p < SETTINGS.robust_level:
         noise = replace(noise, level=noise.level * level.values[:, None])
     robust = noise.robust(left)
     return noise.refitted(robust, taken=taken), robust
@@ -150,6 +148,6 @@ def _of_stream(problem: Problem, seen: Sequence[Seen], rotation: Array | None, n
 
 def stretches_of(problem: Problem) -> NDArray[np.intp]:
     """Return (M,) index of the stretch of time of each bin."""
-    index = np.floor(problem.time / STRETCH_S).astype(int)
+    index = np.floor(problem.time / SETTINGS.block).astype(int)
     keys = problem.recording_of * (int(np.ptp(index)) + 1) + index - index.min()
     return np.asarray(np.unique(keys, return_inverse=True)[1], dtype=np.intp)

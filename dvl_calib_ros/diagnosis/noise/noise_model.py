@@ -6,7 +6,7 @@ filter and the sky in the reference. The level may depend on reported covariance
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,6 +30,8 @@ LONGEST_S = 15.0
 ORDERS = ((0, 0), (1, 0), (1, 1))
 # Periodogram bins after averaging neighbours
 MAX_FREQUENCIES = 300
+# Points per coefficient of an ARMA's posterior, and largest inverse hyperbolic tangent of a moving average
+POSTERIOR_POINTS, MA_REACH = 40, 2.5
 # Upper bound of the share of noise at a frequency that a fit absorbs
 MOST_TAKEN = 0.99
 # m/s; below any instrument's resolution: streams equal to rounding would otherwise have no noise
@@ -226,6 +228,20 @@ class Noise:
         )
         return replace(self, axes=axes)
 
+    def drawn(self, residual: Array, taken: Array, count: int, rng: np.random.Generator) -> Iterator[Array]:
+        """Yield `count` simulated residuals (M, A) under colours drawn from their posterior, given a residual (M, A).
+
+        Few independent values of slow noise determine its memory, and a mean of noise varies with it. taken: (A, F),
+        from `taken_by`.
+        """
+        each = [
+            [spectrum.arma(*drawn, series, self.segments) for drawn in spectrum.drawn(self.memory, count, rng)]
+            for series, lost in zip(self._scaled(residual).T, taken, strict=True)
+            for spectrum in [_spectrum(series, lost)]
+        ]  # fmt: skip
+        for axes in zip(*each, strict=True):
+            yield replace(self, axes=axes).unwhiten(rng.standard_normal(residual.size))
+
     def deviance(self, residual: Array) -> float:
         """Return -2 log likelihood of a residual (M, A), up to a constant."""
         white = self.whiten(residual)
@@ -285,22 +301,78 @@ def _fit_arma(
     With g the spectrum over that of its innovations, and k the share of each frequency that a fit has left, n mean(k)
     log(mean(periodogram / g) / mean(k)) + n mean(k log g) is the deviance; the mean of log g is 0.
     """
-    n = len(series)
-    frequency, power, counts, lost = _periodogram(series, taken)
-    best = (np.inf, 0.0, 0.0)
+    spectrum, best = _spectrum(series, taken), (np.inf, 0.0, 0.0)
     for p, q in orders:
-        deviance, ar, ma = _searched(frequency, power, counts, lost, n, memory, p, q)
-        best = min(best, (deviance + (p + q) * np.log(n), ar, ma))
-    _, ar, ma = best
-    coefficients = np.array([ar]) if ar else np.zeros(0)
-    arma = Arma(coefficients, ma, 1.0, _ratio(coefficients, ma))
-    left = 1.0 if taken is None else 1.0 - (2.0 * taken.sum() - taken[0] - (taken[-1] if n % 2 == 0 else 0.0)) / n
-    std = float(np.sqrt(np.mean(arma.innovations(series, _starts_of(segments)) ** 2) / left))
-    return replace(arma, std=max(std, LEAST_MPS))
+        deviance, ar, ma = spectrum.searched(memory, p, q)
+        best = min(best, (deviance + (p + q) * np.log(len(series)), ar, ma))
+    return spectrum.arma(*best[1:], series, segments)
 
 
-def _periodogram(series: Array, taken: Array | None) -> tuple[Array, Array, Array, Array]:
-    """Return angular frequency per sample (F,), power, count and absorbed share: means over bands."""
+@dataclass(frozen=True)
+class _Spectrum:
+    """Periodogram of n samples in F bands: angular frequency per sample, share of all frequencies, power and absorbed
+    share times that."""
+
+    n: int
+    frequency: Array
+    share: Array
+    power: Array
+    lost: Array
+
+    @property
+    def left(self) -> float:
+        """Return the share of the noise that no fit has absorbed."""
+        return 1.0 - float(self.lost.sum())
+
+    def arma(self, ar: float, ma: float, series: Array, segments: Sequence[slice]) -> Arma:
+        """Return the ARMA with the standard deviation of the innovations of a series."""
+        coefficients = np.array([ar]) if ar else np.zeros(0)
+        unit = Arma(coefficients, ma, 1.0, _ratio(coefficients, ma))
+        std = float(np.sqrt(np.mean(unit.innovations(series, _starts_of(segments)) ** 2) / self.left))
+        return replace(unit, std=max(std, LEAST_MPS))
+
+    def deviances(self, ars: Array, mas: Array) -> Array:
+        """Return the deviance (Q, P) of ARMA(1, 1) noise by coefficients ars (P,) and mas (Q,)."""
+        ars, mas, wave = ars[None, :], mas[:, None], np.cos(self.frequency)
+        moments = np.column_stack([self.power, self.power * wave])
+        # the mean of power over spectrum, with |1 - ar e^iω|² = 1 + ar² - 2 ar cos ω and the like of ma
+        of_ma = 1.0 + mas**2 + 2.0 * mas * wave
+        even, odd = ((1.0 / of_ma) @ moments).T[:, :, None]
+        mean = (1.0 + ars**2) * even - 2.0 * ars * odd
+        logarithm = np.log(1.0 + ars.T**2 - 2.0 * ars.T * wave) @ self.lost - (np.log(of_ma) @ self.lost)[:, None]
+        # noise at low frequencies is no smaller than at high ones; if it seems so, a fit has absorbed it
+        value = self.n * (self.left * np.log(np.maximum(mean, 1e-300) / self.left) + logarithm)
+        return np.asarray(np.where(ars + mas >= -1e-12, value, np.inf))
+
+    def searched(self, memory: float, p: int, q: int) -> tuple[float, float, float]:
+        """Return deviance, ar and ma of the best ARMA(p, q), by a grid search refined about its best point."""
+        bound = float(np.arctanh(memory))
+        centre, reach = np.zeros(2), np.array([bound if p else 0.0, MA_REACH if q else 0.0])
+        best = (np.inf, 0.0, 0.0)
+        for _ in range(5 if p or q else 1):
+            ars, mas = (
+                np.tanh(np.unique(np.clip(np.linspace(c - r, c + r, 15), -b, b))) if r else np.zeros(1)
+                for c, r, b in zip(centre, reach, (bound, MA_REACH), strict=True)
+            )
+            deviance = self.deviances(ars, mas)
+            row, column = divmod(int(np.argmin(deviance)), ars.size)
+            best = min(best, (float(deviance[row, column]), float(ars[column]), float(mas[row])))
+            centre = np.arctanh(np.clip(best[1:], -0.9999, 0.9999))
+            reach = reach / 4.0
+        return best
+
+    def drawn(self, memory: float, count: int, rng: np.random.Generator) -> list[tuple[float, float]]:
+        """Draw ar and ma from their posterior; every memory up to the longest is equally likely a priori."""
+        memories = np.geomspace(1.0, -1.0 / np.log(memory), POSTERIOR_POINTS)
+        ars, mas = np.exp(-1.0 / memories), np.tanh(np.linspace(-MA_REACH, MA_REACH, POSTERIOR_POINTS))
+        deviance = self.deviances(ars, mas)
+        weights = np.exp(-0.5 * (deviance - deviance.min())) * memories
+        at = rng.choice(weights.size, count, p=weights.ravel() / weights.sum())
+        return [(float(ars[i % ars.size]), float(mas[i // ars.size])) for i in at]
+
+
+def _spectrum(series: Array, taken: Array | None) -> _Spectrum:
+    """Return the spectrum of a series (n,): means over bands. taken: (n // 2 + 1,) share that a fit has absorbed."""
     power = np.abs(np.fft.rfft(series)[1:]) ** 2 / len(series)
     frequency = np.pi * np.arange(1, len(power) + 1) / max(len(power), 1)
     # the lowest frequencies unaveraged: colour is there
@@ -309,37 +381,8 @@ def _periodogram(series: Array, taken: Array | None) -> tuple[Array, Array, Arra
     counts = np.diff(np.append(starts, len(power)))
     lost = np.zeros_like(power) if taken is None else taken[1:]
     frequency, power, lost = (np.add.reduceat(each, starts) / counts for each in (frequency, power, lost))
-    return frequency, power, counts, lost
-
-
-def _searched(
-    frequency: Array, power: Array, counts: Array, lost: Array, n: int, memory: float, p: int, q: int
-) -> tuple[float, float, float]:
-    """Return deviance, ar and ma of the best ARMA(p, q), by a grid search refined about its best point."""
-    share, wave = counts / counts.sum(), np.cos(frequency)
-    power, lost = power * share, lost * share
-    left = 1.0 - float(lost.sum())
-    moments = np.column_stack([power, power * wave])
-    bound = float(np.arctanh(memory))
-    centre, reach = np.zeros(2), np.array([bound if p else 0.0, 2.5 if q else 0.0])
-    best = (np.inf, 0.0, 0.0)
-    for _ in range(5 if p or q else 1):
-        axes = [np.unique(np.clip(np.linspace(c - r, c + r, 15), -b, b)) if r else np.zeros(1)
-                for c, r, b in zip(centre, reach, (bound, 2.5), strict=True)]  # fmt: skip
-        ars, mas = np.tanh(axes[0])[None, :], np.tanh(axes[1])[:, None]
-        # the mean of power over spectrum, with |1 - ar e^iω|² = 1 + ar² - 2 ar cos ω and the like of ma
-        of_ma = 1.0 + mas**2 + 2.0 * mas * wave
-        even, odd = ((1.0 / of_ma) @ moments).T[:, :, None]
-        mean = (1.0 + ars**2) * even - 2.0 * ars * odd
-        logarithm = np.log(1.0 + ars.T**2 - 2.0 * ars.T * wave) @ lost - (np.log(of_ma) @ lost)[:, None]
-        # noise at low frequencies is no smaller than at high ones; if it seems so, a fit has absorbed it
-        value = n * (left * np.log(np.maximum(mean, 1e-300) / left) + logarithm)
-        deviance = np.where(ars + mas >= -1e-12, value, np.inf)
-        row, column = divmod(int(np.argmin(deviance)), ars.size)
-        best = min(best, (float(deviance[row, column]), float(ars[0, column]), float(mas[row, 0])))
-        centre = np.arctanh(np.clip(best[1:], -0.9999, 0.9999))
-        reach = reach / 4.0
-    return best
+    share = counts / counts.sum()
+    return _Spectrum(len(series), frequency, share, power * share, lost * share)
 
 
 def _ratio(ar: Array, ma: float) -> float:

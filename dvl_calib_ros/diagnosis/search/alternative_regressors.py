@@ -12,8 +12,8 @@ from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.time_grid import Grid
 
-TIME_KNOTS = 7
-SPEED_KNOTS = 7
+# Of piecewise linear functions of time and of speed
+KNOTS = 7
 # Time constants, s, with which the effect of a turn decays
 FADES_S = (4.0, 12.0, 40.0)
 # rad/s; threshold of a turn, whose side may act until the next
@@ -34,13 +34,11 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
     velocity, speed = motion.velocity_body, motion.speed
     acceleration = np.gradient(velocity[:, 0], motion.time)
     typical = max(float(np.median(speed)), 0.1)
-    hats = _hats(motion.time, np.linspace(motion.time[0], motion.time[-1], TIME_KNOTS))
+    hats = _hats(motion.time, np.linspace(motion.time[0], motion.time[-1], KNOTS))
     s = speed / typical
     found: dict[str, Array] = {
         "speed": np.column_stack([np.ones_like(s), s, s**2, s**3, np.maximum(s - 1.0, 0.0)]),
-        "a band of speeds": _hats(
-            speed, np.quantile(speed, 0.01) + np.linspace(0.0, 1.0, SPEED_KNOTS) * _spread(speed)
-        ),
+        "a band of speeds": _hats(speed, np.quantile(speed, 0.01) + np.linspace(0.0, 1.0, KNOTS) * _spread(speed)),
         "acceleration": np.column_stack([acceleration, np.abs(acceleration)]),
         "sway and heave": np.column_stack([velocity[:, 1:], np.abs(velocity[:, 1:])]),
         "time": np.column_stack([hats, hats * s[:, None]]),

@@ -12,10 +12,10 @@ from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
 from ..fit.selection_criteria import (
     WINDOW_STEPS,
     best_of,
-    blocks_of,
     fit_without,
     log_p_in_place,
     price,
+    robust_covariance,
     robust_p,
     times_tried,
 )
@@ -40,12 +40,13 @@ def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
 def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """Return a fit without effects that chance or slow noise explains as well.
 
-    An effect is kept if its sandwich p-value over blocks is significant and it predicts held-out data beyond its price.
+    An effect is kept if the covariance of its interval makes it significant, and it predicts held-out data beyond its
+    price.
     """
     problem, n = fitter.problem, len(fit.seen)
-    block = blocks_of(problem)
     while fit.effects:
-        p_values = {effect.name: robust_p(fit, effect, block) for effect in fit.effects}
+        covariance = robust_covariance(problem, fit)
+        p_values = {effect.name: robust_p(fit, effect, *covariance) for effect in fit.effects}
         name = max(p_values, key=lambda each: p_values[each])
         if p_values[name] >= SETTINGS.robust_level:
             fit = fit_without(fitter, fit, next(effect for effect in fit.effects if effect.name == name))
@@ -60,10 +61,6 @@ def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             return fit
         fit = rest
     return fit
-
-
-# Standard deviations from which a second occurrence is kept without a trial
-CLEAR = 6.0
 
 
 def repeated_effects(
@@ -117,12 +114,12 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
 
 
 def either_alone(fit: Fit, once: Effect, whole: Effect) -> list[Hypothesis]:
-    """Return starts with the first or the second occurrence alone, if the other is within `CLEAR` σ of zero."""
+    """Return starts with the first or the second occurrence alone, if the other is near zero in σ."""
     std = np.sqrt(np.diag(fit.system.covariance()))
     clear = {
         each.spec.name
         for each, own in zip(fit.hypothesis.parameters(), std[6:].tolist(), strict=True)
-        if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > CLEAR * own
+        if each.effect.name == whole.name and abs(fit.hypothesis.value(each)) > SETTINGS.outlying * own
     }
     clear = {name for name in clear if not any(is_time_of_run(s) for s in whole.parameters if s.name == name)}
     others = [effect for effect in fit.effects if effect.name != whole.name]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,16 +25,12 @@ from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .arm_clock_ambiguity import ATTITUDE_CLOCK, CLOCKS, DVL_CLOCK, LAG_OR_DELAY, REFERENCE_CLOCK, lags_and_delays
 from .clock_jumps import LEAP
 
-# Variants to combine; proposals fitted per round, and their largest deviance above the best
-SHORTLIST, FITTED, NOT_WORTH_IT = 12, 7, 40.0
+# Variants to combine; proposals fitted per round
+SHORTLIST, FITTED = 12, 7
 # Places for the largest gains on top of the fit: next to seconds of clock offset a drift adds little
 ADDING_MOST = 4
 # Start times kept per intermittent effect
 KEPT_VARIANTS = 2
-# Ratio of the standard deviations of noise and innovations from which noise is coloured
-WITH_A_MEMORY = 1.2
-# Share of the coloured noise's misfit that an intermittent effect may leave
-MOST_OF_NOISE = 0.5
 
 
 @dataclass(frozen=True)
@@ -50,12 +46,6 @@ class Variant:
     def p(self) -> int:
         """Return the number of columns."""
         return self.columns.shape[2]
-
-    @property
-    def comes_and_goes(self) -> bool:
-        """Return whether the effect acts during a part of the run only."""
-        times = [spec.name for spec in self.effect.parameters if is_time_of_run(spec)]
-        return any(each[name] != self.effect.defaults[name] for each in self.values for name in times)
 
 
 @dataclass(frozen=True)
@@ -83,26 +73,6 @@ def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hy
     ]
 
 
-def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
-    """Return the best hypotheses with intermittent effects under white noise.
-
-    Coloured noise absorbs the residual of a wrong time, so no time on a grid improves the fit. Only effects that
-    explain most of the noise are proposed: an intermittent effect explains a part of any coloured noise.
-    """
-    if max(arma.ratio for arma in fit.noise.axes) < WITH_A_MEMORY:
-        return []
-    fit = replace(fit, noise=fit.noise.white)
-    table, worth = _worth(fitter, fit, effects)
-    own = len(fit.effects)
-    most = MOST_OF_NOISE * table.drop(range(own))
-    come = [
-        chosen
-        for chosen in worth
-        if any(i >= own and table.variants[i].comes_and_goes for i in chosen) and table.drop(chosen) < most
-    ]
-    return [combined(fitter, fit, table, chosen) for chosen in come[:KEPT_VARIANTS]]
-
-
 def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[StraightLines, list[tuple[int, ...]]]:
     """Return the linearised model about a fit, and the combinations to fit, best first."""
     table = straight_lines(fitter, fit, effects)
@@ -126,7 +96,9 @@ def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Str
         ]
     scored.sort()
     scored = [each for each in scored if _is_told_by_two_clocks(table, each[1])]
-    worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + NOT_WORTH_IT))[:FITTED]
+    worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + SETTINGS.conclusive))[
+        :FITTED
+    ]
     if not any(_is_possible(table, chosen) for chosen in worth):  # outside the linear range
         worth += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
     return table, worth

@@ -29,9 +29,8 @@ STANDS_IN = (DVL_CLOCK, *MOVING_CLOCK)
 # identifiable from the ends of a run
 DELAYS = np.arange(-4.0, 4.01, 0.25)
 PARTS, FEWEST_PARTS = 60, 3
-# Drop in whitened squares from which a jump is fitted; delay below which a clock is synchronised, s
-WORTH_FITTING, NO_DELAY = 40.0, 0.13
-# Largest gaps that may be jumps ahead: their number, least length, s, and tolerance of the jump's size, s
+# Largest gaps that may be jumps ahead: their number, least length (s), which is a least delay too, and tolerance of the
+# size of a jump (s)
 GAPS, GAP_FROM_S, AS_LARGE_S = 6, 0.15, 0.3
 # Lost samples leave a gap of whole steps; a clock jump differs from that by this share of a step
 OF_A_STEP = 0.15
@@ -160,7 +159,7 @@ def _hypotheses(
     if ARM in once and ARM not in {effect.name for effect in usual}:
         usual.append(once[ARM])
     made: dict[frozenset[str], Hypothesis] = {}
-    clocks = [{}, {DVL_CLOCK: before}] if abs(before) > NO_DELAY and DVL_CLOCK in once else [{}]
+    clocks = [{}, {DVL_CLOCK: before}] if abs(before) > GAP_FROM_S and DVL_CLOCK in once else [{}]
     lags = [{}, *lags_and_delays(fit, once)]
     for others, lag, clock in itertools.product((list(rest), usual), lags, clocks):
         if lag:
@@ -204,9 +203,9 @@ def _found(squares: Array) -> Delays:
         if k - m >= FEWEST_PARTS
     )
     edges = [0, n]
-    if one[0] - two[0] > WORTH_FITTING and none[0] - two[0] > 2.0 * WORTH_FITTING:
+    if one[0] - two[0] > SETTINGS.conclusive and none[0] - two[0] > 2.0 * SETTINGS.conclusive:
         edges = [0, two[1], two[2], n]
-    elif none[0] - one[0] > WORTH_FITTING:
+    elif none[0] - one[0] > SETTINGS.conclusive:
         edges = [0, one[1], n]
     delays = tuple(float(DELAYS[best(a, b)[1]]) for a, b in itertools.pairwise(edges))
     return Delays(delays, tuple(edges[1:-1]))

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.samples import VelocityFrame
-from ...effects.base import ActsOn, Effect, late
+from ...effects.base import ActsOn, Effect, true_times
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.selection_criteria import best_of, finer_steps, price_of_a_time
+from ..fit.selection_criteria import best_of, finer_steps
 from ..model.forward_model import Problem, make_problem
 from ..model.hypothesis import Hypothesis, Values, is_time_of_run, no_effect
 from ..model.recorded_streams import RecordedStreams
@@ -36,17 +36,17 @@ from ..model.stream_curve import FAST_ENOUGH_S
 from ..noise.noise_level import estimated
 from ..noise.noise_model import Noise, white_noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
-from .arm_clock_ambiguity import ARM, TWO_CLOCKS, OpenArm, guessed_arm
+from .arm_clock_ambiguity import ARM, OpenArm, guessed_arm
 from .backward_elimination import (
     eliminate,
     only_predictive,
     repeated_effects,
 )
-from .candidates import by_other_clocks, intermittent_effects, jumps_at_start, proposed, variants_about
-from .clock_jumps import LEAP, MOVING_CLOCK, in_gaps, leaping
+from .candidates import proposed, variants_about
+from .clock_jumps import in_gaps, leaping
 from .identifiability import Selected, identify_effects
-from .initial_guess import FirstGuess, first_guess, guess_beside
-from .observable_parameters import observable_parts, unobservable_parts, without_insignificant
+from .initial_guess import FirstGuess, first_guess
+from .observable_parameters import observable_parts, unobservable_parts
 
 # The most common causes of a gap; the first fit includes all of them.
 START = (ARM, "dvl_time_offset", "reference_time_offset")
@@ -60,7 +60,8 @@ class EffectSelection:
     """Selected effects, strongest first, with the fits without (`base`) and with them under the same noise.
 
     testable: effects with their observable parameters. opened: trade-off of lever arm and clock at one speed. moved: by
-    arm parameter, the difference (m) to a fit with another clock that explains the data equally well.
+    arm parameter, the difference (m) to a fit with another clock that explains the data equally well. wider: the
+    hypothesis with effects that slow noise explains as well, which may nevertheless be there.
     """
 
     selected: tuple[Selected, ...]
@@ -71,6 +72,7 @@ class EffectSelection:
     testable: Mapping[str, Effect]
     opened: OpenArm | None = None
     moved: Mapping[str, float] = field(default_factory=dict)
+    wider: Hypothesis | None = None
 
     def without(self, names: Collection[str]) -> EffectSelection:
         """Return the selection without the named effects; re-estimate the others."""
@@ -144,38 +146,23 @@ def select(
         fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
         fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
-        for hypothesis in intermittent_effects(fitter, fit, effects):
-            as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
-            fits.append(fitter.fit(as_white.hypothesis, fit.noise))
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
-        best = fitter.refined_as_white(fitter.refined(best_of(fits, effects), finer[3:]), [2.0 * finer[0], *finer])
-        best = in_gaps(fitter, _by_fewer_clocks(fitter, best, effects))
+        best = in_gaps(fitter, fitter.refined(best_of(fits, effects), finer[3:]))
         best = eliminate(fitter, best, len(effects))
         fitter, fit = _about(fitter, best, every)
         names = frozenset(effect.name for effect in fit.effects)
         if names in seen_before:
             break
         seen_before.add(names)
-    fit = only_predictive(fitter, eliminate(fitter, fit, len(effects)), len(effects))
-    fit = _by_fewer_clocks(fitter, fit, effects)
+    wider = eliminate(fitter, fit, len(effects))
+    fit = only_predictive(fitter, wider, len(effects))
     fitter, fit = _about(fitter, fit, every)
-    fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
-    guesses = _beside_moving_clocks(fitter, fit, guesses)
     told = identify_effects(fitter, fit, guesses, effects, alike)
     base = fitter.fit_kept(told.fit.hypothesis.with_effects([], len(recordings), {}), told.fit.noise)
-    return EffectSelection(told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved)
-
-
-def _beside_moving_clocks(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess]) -> tuple[FirstGuess, ...]:
-    """Repeat the guess of recordings whose DVL clock jumps or drifts in a fit, with that motion corrected."""
-    problem, found = fitter.problem, list(guesses)
-    for number, recording in enumerate(problem.recordings):
-        moved = [each for each in fit.hypothesis.injections(number) if each.effect.name in MOVING_CLOCK]
-        if moved:
-            again = guess_beside(recording, moved, problem.rotation_dvl_from_body, problem.lever_arm)
-            found[number] = again or found[number]
-    return tuple(found)
+    return EffectSelection(
+        told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved, wider.hypothesis
+    )
 
 
 def _check_size(problem: Problem) -> None:
@@ -251,34 +238,6 @@ def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Arra
     return np.asarray(columns @ system.solution_without(of_noise)), ridge
 
 
-def _by_fewer_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Fit:
-    """Return a fit with two clocks, or a better one with one clock: candidates were combined with two only."""
-    if not set(TWO_CLOCKS) <= set(fit.values) and not jumps_at_start(fitter, fit):
-        return fit
-    others = [fitter.fit(hypothesis, fit.noise, careful=True) for hypothesis in by_other_clocks(fitter, fit, effects)]
-    if others and jumps_at_start(fitter, fit):  # a constant delay chooses no time
-        throughout = best_of(others, effects)
-        if throughout.deviance < fit.deviance + price_of_a_time(effects[LEAP], len(effects)):
-            return throughout
-    return best_of([fit, *others], effects)
-
-
-def _with_what_is_shown_of_the_arm(
-    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
-) -> tuple[Fitter, Fit, Mapping[str, Effect]]:
-    """Return a fit and effects with only the observable parts of the lever arm.
-
-    every: effects with all parameters; effects: with those observable by their columns alone.
-    """
-    arm = without_insignificant(fitter.problem, fit)
-    if arm is not None:
-        effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
-        values = tuple(dict(each) for each in fit.values[ARM])  # unobservable parts are held at their values
-        hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
-        fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
-    return fitter, fit, effects
-
-
 __all__ = ["EffectSelection", "Selected", "select"]
 
 
@@ -286,8 +245,6 @@ HEADING, MOVED, DRIFT = "heading_error", "mounting_moved", "misalignment_drift"
 # Effects that rotate DVL against reference by heading, recording or time
 BY_YAW = frozenset({HEADING, MOVED, DRIFT, "water_lock"})
 OF_DRIFT = "rad_per_hour"
-# Deviance drop in the linearised model from which two heading cycles are fitted
-PROMISING = 20.0
 
 
 def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hypothesis]:
@@ -302,7 +259,7 @@ def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hy
     if BY_YAW & fit.values.keys():
         return found
     straight = [fitter.straight_on(fit, each) for each in (fit.hypothesis, *found)]
-    return [each for misfit, each in straight[1:] if misfit < straight[0][0] - PROMISING]
+    return [each for misfit, each in straight[1:] if misfit < straight[0][0] - SETTINGS.conclusive]
 
 
 def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit, dict[str, str]]:
@@ -350,13 +307,12 @@ def _instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
     return fit.hypothesis.with_effects([*rest, heading], n, {HEADING: start})
 
 
-# Robust standard deviations from neighbours and from the other stream; an outlier exceeds both
-FROM_NEIGHBOURS, FROM_OTHER = 6.0, 4.0
+# Robust standard deviations from the other stream; an outlier exceeds these and `SETTINGS.outlying` from its neighbours
+FROM_OTHER = 4.0
 # Bounds of the ratio of both deviations, projected: around a turn between samples they differ more
 ALIKE = (0.6, 1.7)
 # Fewest samples for a scatter
 FEWEST = 30
-_PASSES = 3
 
 
 def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[RecordedStreams, ...] | None:
@@ -395,9 +351,7 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
     if curve.interval <= FAST_ENOUGH_S or len(curve.time) < FEWEST:
         return kept
     injections = hypothesis.injections(index)
-    true = curve.time
-    for _ in range(_PASSES):
-        true = curve.time - late(injections, clock, true)
+    true = true_times(injections, clock, curve.time)
     seen = problem.seen(hypothesis, index, true)
     measured = np.array(problem.measured)
     error = (seen.error if of_dvl else -seen.error) * measured
@@ -417,7 +371,7 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
     usual = _scatter(in_body(curve.from_neighbours))
     off = in_body((curve.values - others(curve.time)) / curve.loudness)
     along = (off * error).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-300) / curve.loudness.mean(axis=1)
-    bad = suspicious & others.covers(curve.time) & (np.abs(off / usual).max(axis=1) > FROM_NEIGHBOURS)
+    bad = suspicious & others.covers(curve.time) & (np.abs(off / usual).max(axis=1) > SETTINGS.outlying)
     bad &= (along > ALIKE[0]) & (along < ALIKE[1])
     return ~bad
 

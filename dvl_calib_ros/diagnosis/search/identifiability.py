@@ -10,8 +10,15 @@ import numpy as np
 from ...calibration.registration.registration import IN_TIME_STD_S
 from ...effects.base import Effect
 from ..fit.cross_validation import predictive_gain_of
-from ..fit.gauss_newton import Fit, Fitter, n_amplitudes
-from ..fit.selection_criteria import blocks_of, fit_without, log_p_in_place, log_p_value, robust_p, times_tried
+from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, n_amplitudes
+from ..fit.selection_criteria import (
+    fit_without,
+    log_p_in_place,
+    log_p_value,
+    robust_covariance,
+    robust_p,
+    times_tried,
+)
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
 from .arm_clock_ambiguity import (
@@ -23,17 +30,12 @@ from .arm_clock_ambiguity import (
     OpenArm,
     is_open,
     moved_arm,
-    moved_lag,
     opened_arm,
     told_apart,
     with_arm,
-    with_clocks,
 )
 from .candidates import combined, straight_lines
 from .initial_guess import FirstGuess
-
-# A clock offset is significant from this multiple of registration's standard deviation
-LATER = 2.0
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,6 @@ def identify_effects(
         selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened, told_apart(guesses))
     selected = [_or_else(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
     rivals = [one for each in selected if opened is not None and each.effect.name in CLOCKS for one in each.rivals]
-    freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), opened)
-    clocks = tuple(effect.name for effect in (freed or fit).effects if effect not in fit.effects)
-    if freed is None:
-        clocks = tuple(name for name in TWO_CLOCKS if name not in fit.values)
-    if clocks:
-        selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
     if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
         opened = replace(opened, late=IN_TIME_STD_S)  # only their combination is observable
     if opened is not None:  # a lag differs from a delay by less than interpolation errors
@@ -83,10 +79,9 @@ def identify_effects(
             _or_else(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
         ]
-    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
-    return Identifiability(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
+    return Identifiability(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved_arm(fit, rivals))
 
 
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
@@ -137,15 +132,15 @@ def _clock_or_arm(
     delay within that ambiguity is insignificant. known: from `told_apart`; an insignificant arm cannot stand in for
     these clocks.
     """
-    threshold, block = float(np.log(SETTINGS.level / n_effects)), blocks_of(fitter.problem)
+    threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
     late = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
-    is_late = opened is None or max(late, default=0.0) >= LATER * opened.late
+    is_late = opened is None or max(late, default=0.0) >= OF_INTERVAL * opened.late
 
     def is_shown(each: Selected) -> bool:
         if each.effect.name == REFERENCE_CLOCK and not is_late:
             return False
-        return each.log_p <= threshold and robust_p(fit, each.effect, block) < SETTINGS.robust_level
+        return each.log_p <= threshold and robust_p(fit, each.effect, *covariance) < SETTINGS.robust_level
 
     own = {each.effect.name: each for each in selected}
     arm, clocks = own.get(ARM), [own[name] for name in TWO_CLOCKS if name in own]

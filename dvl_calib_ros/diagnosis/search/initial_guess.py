@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,14 +12,10 @@ from ...calibration.registration.motion_streams import MotionStreams, make_motio
 from ...calibration.registration.registration import Registration, register
 from ...calibration.registration.unregistrable_clocks import far_clocks
 from ...calibration.streams.interpolation import ImuColumns
-from ...effects.base import ActsOn, EffectNeeds, Injection, late
+from ...effects.base import EffectNeeds
 from ...errors import InputError
 from ..model.recorded_streams import RecordedStreams
-from ..model.stream_curve import Curve
 from ..model.time_grid import Offsets
-
-# Fixed-point iterations for the true time of a delayed stamp
-_PASSES = 3
 
 
 @dataclass(frozen=True)
@@ -61,21 +56,6 @@ def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever
         return FirstGuess(Offsets(), np.zeros(3), np.zeros(3))
     phi = turn_between(rotation_dvl_from_body, found.rotation_body_from_dvl.T)
     return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi, found)
-
-
-def guess_beside(
-    recording: RecordedStreams, moved: Sequence[Injection], rotation_dvl_from_body: Array, lever_arm: Array
-) -> FirstGuess | None:
-    """Repeat the guess of a recording with the jumps and drifts (`moved`) of its DVL clock corrected. Return None if
-    the corrected samples are out of order."""
-    curve = recording.dvl
-    time = curve.time
-    for _ in range(_PASSES):
-        time = curve.time - late(moved, ActsOn.DVL_CLOCK, time)
-    if not (np.diff(time) > 0.0).all():
-        return None
-    dvl = Curve(time, curve.values, curve.claimed, claims=curve.claims)
-    return first_guess(replace(recording, dvl=dvl, registration=None), rotation_dvl_from_body, lever_arm)
 
 
 def _motion(recording: RecordedStreams) -> MotionStreams | None:

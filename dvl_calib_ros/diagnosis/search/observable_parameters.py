@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...calibration.numerics.frames import Array
 from ...effects.base import Effect
-from ..fit.gauss_newton import Fit
 from ..model.forward_model import Problem
 from ..model.hypothesis import Values, amplitudes, is_time_of_run, no_effect
 from ..model.seen import Seen
@@ -19,8 +17,8 @@ from .arm_clock_ambiguity import ARM
 # 1°/s does. A level vehicle makes neither the upward bias nor roll and pitch of the mounting observable.
 SHOWN_FROM, USUAL_MPS = 0.2, 0.02
 # A part of the lever arm is kept if this length (m) is observable: metres left out would rotate the rest. An AUV that
-# rolls at 0.5°/s is such a case. It must be this multiple of the model error.
-ARM_FROM_M, FAINT = 0.6, 2.0
+# rolls at 0.5°/s is such a case.
+ARM_FROM_M = 0.6
 
 
 def observable_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
@@ -49,37 +47,6 @@ def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effec
         by_metre = zip(specs, np.sqrt(of_each).tolist(), strict=True)
         out &= {spec.name for spec, size in by_metre if ARM_FROM_M * size < SHOWN_FROM * USUAL_MPS}
     return effect.without(out)
-
-
-def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
-    """Return the lever arm without parts below 2 σ of the model error. Return None if all are significant."""
-    known = _known_to(problem, fit)
-    faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < FAINT * std}
-    (arm,) = (effect for effect in fit.effects if effect.name == ARM) if faint else (None,)
-    return arm and arm.without(faint)
-
-
-def with_observable(problem: Problem, fit: Fit, covariance: Array) -> Array:
-    """Add the model error of the lever arm to a fit's covariance (6 + p, 6 + p)."""
-    found, known = covariance.copy(), _known_to(problem, fit)
-    for number, each in enumerate(fit.hypothesis.parameters(), start=6):
-        if each.effect.name == ARM:
-            found[number, number] += known.get(each.spec.name, 0.0) ** 2
-    return found
-
-
-def _known_to(problem: Problem, fit: Fit) -> dict[str, float]:
-    """Return the model error, m, of lever arm parameters whose typical size is unobservable."""
-    if problem.measured[2] or ARM not in fit.values:
-        return {}
-    sizes = np.sqrt((fit.columns[:, :, 6:] ** 2).sum(axis=1).mean(axis=0)).tolist()
-    own = [
-        (each.spec, size)
-        for each, size in zip(fit.hypothesis.parameters(), sizes, strict=True)
-        if each.effect.name == ARM
-    ]
-    least = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
-    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < least}
 
 
 def somewhere(effect: Effect, problem: Problem) -> list[Values]:

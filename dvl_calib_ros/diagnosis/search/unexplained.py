@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,24 +19,22 @@ from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
 from ..fit.cross_validation import predictive_gain
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.parametric_bootstrap import simulated_recordings
-from ..fit.selection_criteria import NuisanceFit
+from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
+from ..fit.selection_criteria import NuisanceFit, coloured_anew, with_slow_noise
 from ..model.forward_model import Problem
 from ..model.seen import Seen
+from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
-from ..noise.whitened_least_squares import INDEPENDENT, ScoreTest, orthonormal
+from ..noise.whitened_least_squares import ScoreTest, orthonormal
 from .alternative_regressors import ALTERNATIVES, dictionary
 from .event_scan import events
 
-LEVEL = 0.001
 # Spectral lines: longer than wave periods; more periods than the time dictionary resolves
 SHORTEST_PERIOD_S, FEWEST_PERIODS = 16.0, 3.0
 # Steps per bin of the series for the spectrum, at most: memory must not grow with pauses
 STEPS_OF_A_BIN = 16
-# Standard deviations of a subtracted outlier from which its bin is excluded
-OUTLYING = 5.0
-# Simulated recordings for the null distribution, and degrees of freedom of the prior on its scale of 1
-MADE_UP, PRIOR_DOF = 12, 4.0
+# Degrees of freedom of the prior on the null distribution's scale of 1
+PRIOR_DOF = 4.0
 # Share of the effects' explained deviance that inexact interpolation may leave
 INEXACT = 0.005
 # Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
@@ -53,7 +50,7 @@ class Unexplained:
 
     energy: excess over the null, in noise variances. about: name of the regressor, or a period (s). columns: (M, A, f),
     the dictionary; empty if insignificant. clearest: (M, A, c), the most significant columns. clear_energy: explained
-    by these. price: quantile of the best test under the null at LEVEL.
+    by these. price: quantile of the best test under the null at `SETTINGS.robust_level`.
     """
 
     log_p: float
@@ -67,7 +64,7 @@ class Unexplained:
     @property
     def found(self) -> bool:
         """Return whether the residual is systematic."""
-        return self.log_p < np.log(LEVEL)
+        return self.log_p < np.log(SETTINGS.robust_level)
 
     @property
     def follows(self) -> Reason:
@@ -91,8 +88,8 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     left = noise.whiten(fit.residual)
     left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
-    tested = len(looks) + len(followed) + noise.is_coloured * (len(raw) - 1)
-    happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(LEVEL)]
+    tested = len(looks) + len(followed)
+    happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
     if happened:  # slow noise explains a step as well, unless the step predicts better
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
         least = INEXACT * (base.deviance - fit.deviance)
@@ -110,22 +107,13 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
         prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
         if max(each - prices[columns] for each, columns in most) < asked:
             return Unexplained(0.0, 0.0, "", nothing, nothing)
-    recoloured: list[FollowTest] = []
-    if noise.is_coloured:  # a function of time alone may be coloured noise
-        beside = NuisanceFit.of_fit(problem, fit)
-        alone = _coloured_anew(noise, beside, nothing, fit.residual)
-        for name, columns in raw.items():
-            if name != "time":
-                drop, rank = alone.lowered_by(_coloured_anew(noise, beside, columns, fit.residual))
-                recoloured.append(FollowTest(name, np.arange(columns.shape[2]), True, drop, rank))
     looked_at = float(np.log(tested))
     nominal = [
         *(each.log_p for each in happened),
         *(look.log_p() for look in looks),
         *(line.log_p for line in followed),
-        *(each.log_p() for each in recoloured),
     ]
-    if min(nominal) + looked_at > np.log(LEVEL):
+    if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
         return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
     grown = _grown(fitter, fit, looks)
     of_group = {look.name: by for look, by in zip(looks, grown, strict=True) if look.is_whole}
@@ -133,22 +121,13 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     tests = [(look.log_p(by), look.name, raw[look.name][:, :, look.at]) for look, by in zip(looks, grown, strict=True)]
     tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
     tests += [(each.log_p, each.about, each.columns) for each in happened]
-    recoloured = [replace(each, energy=each.energy / of_group[each.name]) for each in recoloured]
-    others: list[tuple[float, str | float, Array]] = []
-    for number, each in enumerate(recoloured):
-        if each.log_p() + looked_at < np.log(LEVEL):
-            recoloured[number] = each = replace(each, energy=each.energy / _chance(fitter, fit, each.name))
-        others.append((each.log_p(), each.name, raw[each.name]))
     best = min(tests, key=_first)
-    if best[0] + looked_at > np.log(LEVEL):  # otherwise the best test under one noise names the regressor
-        tests += others
-        best = min(tests, key=_first)
     about = _plainest(tests, best[0])
-    log_p = min(best[0], *(each[0] for each in others), 0.0) + looked_at
+    log_p = best[0] + looked_at
     whole = [(look.energy / by, look.dof) for look, by in zip(looks, grown, strict=True) if look.is_whole]
-    energy = max(*(each - dof for each, dof in whole), *(each.energy - each.dof for each in recoloured), 0.0)
+    energy = max(*(each - dof for each, dof in whole), 0.0)
     # the best of many lines would always explain some of the noise
-    clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(LEVEL)]
+    clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     clearest = noise.whiten(best[2])
     tested = next((tested + each.tried for each in happened if each.about == best[1]), tested)
@@ -164,8 +143,9 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
 
 
 def _price(tested: int, columns: int) -> float:
-    """Return the energy that the best of `tested` tests exceeds under the null with probability LEVEL."""
-    return float(chi2_isf(LEVEL / tested, columns))
+    """Return the energy that the best of `tested` tests exceeds under the null with probability
+    `SETTINGS.robust_level`."""
+    return float(chi2_isf(SETTINGS.robust_level / tested, columns))
 
 
 def _plainest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
@@ -231,14 +211,14 @@ def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
     """Return (M,) bins with an outlier in or next to them: it affects the motion regressors as well."""
     if not isinstance(fitter.outliers, np.ndarray):
         return np.zeros(len(noise.level), dtype=bool)
-    far = np.abs(noise.whiten(fitter.outliers)).reshape(noise.level.shape).max(axis=1) > OUTLYING
+    far = np.abs(noise.whiten(fitter.outliers)).reshape(noise.level.shape).max(axis=1) > SETTINGS.outlying
     return np.asarray(far | np.append(far[1:], False) | np.append(False, far[:-1]))
 
 
 def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]:
     """Return the inflation of each test's energy over chi-square in simulated recordings, at least 1."""
     energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
-    for other, seen, residual in simulated_recordings(fitter.problem, fit, MADE_UP):
+    for other, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
         found, *_ = _looked(fitter, fit, other, seen, residual)
         energy += [look.energy for look in found]
         dof += [look.dof for look in found]
@@ -305,10 +285,8 @@ def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     """Return the shift (6 + p,) of a fit's parameters with the most significant columns as nuisance."""
-    noise, raw, known = fit.noise, rest.clearest, NuisanceFit.of_fit(problem, fit)
-    if noise.is_coloured:
-        noise = _coloured_anew(noise, known, raw, fit.residual).noise
-    both = known.and_rest(raw, fit.residual)
+    both = NuisanceFit.of_fit(problem, fit).and_rest(rest.clearest, fit.residual)
+    noise = coloured_anew(with_slow_noise(problem, fit.noise), both, fit.residual)[0]
     stands = both._replace(centre=np.zeros_like(both.centre))  # linearised at the fit, whatever its prior
     return stands.step(noise, fit.residual).solution()[: fit.columns.shape[2]]
 
@@ -330,51 +308,6 @@ def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: st
     group = orthonormal(np.concatenate([calibration, noise.whiten(functions)], axis=1))
     left = asked - group @ (group.T @ asked)
     return bool(((left**2).sum(axis=0) < OF_GROUP * (asked**2).sum(axis=0)).all())
-
-
-def _chance(fitter: Fitter, fit: Fit, name: str) -> float:
-    """Return the inflation, at least 1, of a group's deviance drop in simulated recordings by re-estimated noise."""
-    lowered, dof, sound = PRIOR_DOF, PRIOR_DOF, ~_upset(fitter, fit.noise)[:, None]
-    for other, seen, residual in simulated_recordings(fitter.problem, fit, MADE_UP // 2):
-        columns = replace(fitter, problem=other).columns(fit.hypothesis, seen)
-        known = NuisanceFit.of(other, fit.hypothesis, seen, columns)
-        raw = _along_axes(dictionary(other, seen)[name] * sound, other.axes)
-        alone = _coloured_anew(fit.noise, known, raw[:, :, :0], residual)
-        drop, rank = alone.lowered_by(_coloured_anew(fit.noise, known, raw, residual))
-        lowered, dof = lowered + drop, dof + rank
-    return max(1.0, lowered / dof)
-
-
-class _Coloured(NamedTuple):
-    """Deviance of a residual corrected by columns, under noise re-estimated from it. rank: of the columns.
-
-    Without re-estimation the noise would have the columns' colour.
-    """
-
-    deviance: float
-    rank: int
-    noise: Noise
-
-    def lowered_by(self, beside: _Coloured) -> tuple[float, int]:
-        """Return the deviance drop by further columns and their rank, at least 1."""
-        return max(self.deviance - beside.deviance, 0.0), max(beside.rank - self.rank, 1)
-
-
-def _coloured_anew(noise: Noise, known: NuisanceFit, raw: Array, residual: Array) -> _Coloured:
-    """Fit columns (M, A, c) and nuisance columns to a residual (M, A); re-estimate the noise."""
-    joined = np.concatenate([known.columns, raw], axis=2)
-    size = np.maximum(np.sqrt((joined**2).mean(axis=(0, 1))), 1e-12)
-    joined = joined / size
-    std = known.std * size[: len(known.std)]
-    held = np.eye(joined.shape[2])[: len(std)] / std[:, None]
-    left, colour = residual, noise.white
-    for _ in range(2):
-        white = colour.whiten(joined)
-        rows = np.concatenate([white, held])
-        series = np.concatenate([colour.whiten(residual), known.centre / known.std])
-        left = residual - joined @ np.linalg.lstsq(rows, series, rcond=INDEPENDENT)[0]
-        colour = noise.like(left)
-    return _Coloured(colour.deviance(left), orthonormal(white).shape[1], colour)
 
 
 def _along_axes(functions: Array, axes: int) -> Array:

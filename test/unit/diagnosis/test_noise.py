@@ -19,6 +19,7 @@ from dvl_calib_ros.diagnosis.model.claimed_noise import exponents, followed
 from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, make_recording
+from dvl_calib_ros.diagnosis.model.settings import SETTINGS
 from dvl_calib_ros.diagnosis.model.stream_curve import Curve
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise import noise_level
@@ -286,12 +287,12 @@ def test_a_few_quiet_rows_at_a_rare_speed_call_for_no_level(monkeypatch):
     innovations = np.random.default_rng(1).standard_normal((95, 2))
     innovations[40:44] *= 0.1
     monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": speed})
-    assert noise_level.fit_level(None, (), innovations).p > noise_level.SIGNIFICANT
+    assert noise_level.fit_level(None, (), innovations).p > SETTINGS.robust_level
     monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": np.where(speed < 1.5, speed, 2.0)})
-    assert noise_level.fit_level(None, (), innovations).p > noise_level.SIGNIFICANT
+    assert noise_level.fit_level(None, (), innovations).p > SETTINGS.robust_level
     monkeypatch.setattr(noise_level, "covariates", lambda *_: {"speed": np.linspace(1.0, 2.0, 95)})
     grown = innovations * np.exp(3.0 * np.linspace(0.0, 1.0, 95))[:, None]
-    assert noise_level.fit_level(None, (), grown).p < noise_level.SIGNIFICANT
+    assert noise_level.fit_level(None, (), grown).p < SETTINGS.robust_level
 
 
 @pytest.mark.parametrize(("keep", "low"), [(0.0, 0.95), (0.5, 0.85)])
@@ -317,6 +318,22 @@ def test_noise_keeps_the_colour_of_what_a_fit_has_taken_in(keep, low):
     assert low < np.median(restricted) < 1.1
     assert np.median(plain) < 0.96 * np.median(restricted)
     assert not keep or np.median(plain) < 0.7
+
+
+def test_the_mean_of_slow_noise_is_inside_the_interval_of_what_its_memory_may_be():
+    """Five memories long, a series says little of its memory: by the best one 75 % of means were inside."""
+    rng, n, keep = np.random.default_rng(3), 300, float(np.exp(-1.0 / 60.0))
+    white = white_noise(np.ones((n, 3)), (slice(0, n),), None)
+    slow = replace(white, axes=(Arma(np.array([keep]), 0.0, 0.02 * np.sqrt(1 - keep**2), (1 - keep**2) ** -0.5),) * 3)
+    columns, std, inside = np.tile(np.eye(3), (n, 1, 1)), np.full(3, 1e3), []
+    for _ in range(50):
+        series = slow.unwhiten(rng.standard_normal(3 * n)) + rng.normal(0.0, 0.01, (n, 3))
+        noise, left = replace(white, memory=float(np.exp(-0.01))), series - series.mean(axis=0)
+        for _ in range(3):
+            noise = noise.refitted(left, taken=noise.taken_by(columns, std))
+        drawn = noise.drawn(left, noise.taken_by(columns, std), 100, rng)
+        inside.append(np.abs(series.mean(axis=0)) < 1.96 * np.std([each.mean(axis=0) for each in drawn], axis=0))
+    assert np.mean(inside) > 0.88
 
 
 def _at_rest(noise):
