@@ -342,9 +342,18 @@ class FrameChooser:
                 )
                 reasons += (finding("FRAMES_AMBIGUOUS", taken=taken, other=instead),)
                 break
-        if mounting is not None and best.mounting is None:
-            given, fitting = in_degrees(rpy_from_rotation(mounting.T)), nominal_rpy(fits[best].rotation_dvl_from_body.T)
-            fields = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting)}
+        turn = fits[best].rotation_dvl_from_body
+        if (
+            mounting is not None
+            and best.mounting is None
+            and not readings.are_axes_mirrored(best.reading, turn, mounting)
+        ):
+            given, fitting = in_degrees(rpy_from_rotation(mounting.T)), nominal_rpy(turn.T)
+            kept = np.diag(turn @ mounting.T)
+            is_half_turn = np.abs(kept).min() > math.cos(TURNED_FROM)
+            negated = " and ".join(axis for axis, share in zip("xyz", kept, strict=True) if share < 0.0)
+            also = f", or, if that mounting is right, negate {negated} in the DVL's driver" if is_half_turn else ""
+            fields = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting), "also": also}
             reasons += (finding("MOUNTING_CONTRADICTED", **fields),)
         return FrameChoice(best.agreement, imus[best.reading], reasons)
 

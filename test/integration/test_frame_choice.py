@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from situations import DVL, long_motion, sound
 from stacks import LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, true_mounting
 
 from dvl_calib_ros import doctor, replay
@@ -130,6 +131,21 @@ def test_a_yaw_of_the_wrong_sign_in_a_transform_is_named_and_its_remedy_works(tm
     mended = replay(bag, mounting_rpy=(0.0, 0.0, -quarter))
     assert mended.verdict != "reject"
     assert is_right(mended, truth_deg((0.0, 0.0, -quarter)), (2.0, 2.0, 0.5))
+
+
+def test_two_negated_axes_are_a_mounting_or_the_drivers_and_three_the_drivers_alone(tmp_path):
+    """Of a vehicle that heaves."""
+    for signs, said in (
+        ((-1.0, 1.0, -1.0), "negate x and z in the DVL's driver"),
+        ((-1.0, -1.0, -1.0), "negate each of x"),
+    ):
+        told = Told(motion=long_motion())
+        sound(told)
+        for _, topic, _, message in told.rows:
+            if topic == DVL:
+                v = message.twist.twist.linear
+                v.x, v.y, v.z = signs[0] * v.x, signs[1] * v.y, signs[2] * v.z
+        assert said in doctor(told.write(tmp_path / f"bag{sum(signs):.0f}")).reasons[0].sentence
 
 
 def test_a_reading_that_cannot_be_registered_is_judged_by_its_agreement(tmp_path, monkeypatch):
