@@ -233,7 +233,7 @@ CONFIGURATIONS = on_page(
         "MOUNTING_CONTRADICTED",
         "DVL and reference do not agree with the mounting {given}; they do with {found}",
         means="A heading without its magnetic declination (setting EB of an RDI) looks the same.",
-        remedy="try -p mounting_rpy:={option}{also}",
+        remedy="{first}try -p mounting_rpy:={option}{also}",
     ),
     reject(
         "TRAVELS_SIDEWAYS",
