@@ -84,12 +84,10 @@ FITS_BELOW, BETTER_BY = math.sqrt(0.05), 0.5
 SAME_WITHIN = math.radians(12.0)
 # Step of mounting angles in drawings, rad; a fitted mounting near a multiple is reported as the multiple.
 DRAWN = math.pi / 4.0
-# Signs of the DVL axes: as configured, y or z mirrored, both, x mirrored, all. Mirroring x and one other is a mounting.
-SIGNS: Sequence[Array] = [
-    *(np.array([1.0, y, z]) for y in (1.0, -1.0) for z in (1.0, -1.0)),
-    np.array([-1.0, 1.0, 1.0]),
-    -np.ones(3),
-]
+# Signs of the DVL axes: as configured, y or z mirrored, both. Next to a mounting that does not fit also x mirrored, and
+# all axes; x and one other are a mounting.
+SIGNS: Sequence[Array] = [np.array([1.0, y, z]) for y in (1.0, -1.0) for z in (1.0, -1.0)]
+SIGNS_OF_X: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
 # Largest residual of an explanation as a multiple of the registered one, and an extra factor for few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
 # σ from which an axis factor is significant (two-sided p = 6e-7: eight tests per check, a check every few blocks), and
@@ -140,7 +138,7 @@ def fitting_configuration(
         as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
     if as_given < WRONG_FROM:
         assert given is not None
-        return wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes)
+        return wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes, SIGNS)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
@@ -210,7 +208,13 @@ def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame)
 
 
 def wrong_axes(
-    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, most: float, dvl_axes: str
+    motion: MotionStreams,
+    curves: Curves,
+    nominal: Array,
+    lever_arm: Array,
+    most: float,
+    dvl_axes: str,
+    patterns: Sequence[Array] = SIGNS_OF_X,
 ) -> Reason | None:
     """Return the finding of DVL axes that are mirrored, turned over, or scaled alone, else None.
 
@@ -218,7 +222,7 @@ def wrong_axes(
     of the best pattern decide. most: largest residual, m/s per axis.
     """
     found: list[tuple[float, Array, Fitted]] = []
-    for signs in SIGNS:
+    for signs in patterns:
         quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FEW_ROWS)
         near = nearest(quick, nominal, (REFERENCE,), FAR_WORSE * most)
         # a fit that rotates the axes back is the configured pattern
