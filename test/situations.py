@@ -227,7 +227,7 @@ NOISY = "accept", "marginal"  # speed over ground is noisy, and without a refere
 SITUATIONS = {
     "meaningless covariances": Situation(told_by(meaningless_covariances)),
     "one axis negated": Situation(
-        told_by(one_axis_negated, long_motion), "DVL_LEFT_HANDED", "negate this axis in the DVL's driver"
+        told_by(one_axis_negated, long_motion), "DVL_LEFT_HANDED", "negate z in the DVL's driver"
     ),
     "one beam low": Situation(told_by(one_beam_low, long_motion), "BEAM_OFF", "at 135°"),
     "quaternion components mixed up": Situation(

@@ -68,14 +68,12 @@ def diagnose(
         See `replay`.
     """
     topics = (dvl_topic, gnss_topic, imu_topic)
-    sides = [
-        discovered_in(as_paths(each), topics, params, {"min_speed": 0.0} | parameters)
-        for each in ([bags] if simulator is None else [bags, simulator])
-    ]
+    slow = {"min_speed": 0.0} | parameters
     if simulator is not None:
         from ..unpaired.both_sides import RecordedSide
         from ..unpaired.simulator_rounds import against
 
+        sides = [discovered_in(as_paths(each), topics, params, slow) for each in (bags, simulator)]
         real, made = (RecordedSide(recording, found.parameters, found.topics) for recording, found in sides)
         return against(real, made, rounds, None if keep is None else Path(keep))
     if rounds is not None or keep is not None:
@@ -83,8 +81,8 @@ def diagnose(
     from ..diagnosis.diagnose import diagnose as run
     from ..examination.examine import rejection
 
-    ((recording, discovery),) = sides
-    diagnosis = run(recording, discovery.diagnosed, discovery.topics)
+    recording, discovery = discovered_in(as_paths(bags), topics, params, parameters)
+    diagnosis = run(recording, discovery.diagnosed.replace(min_speed=slow["min_speed"]), discovery.topics)
     return diagnosis.led_by(lambda: rejection(recording, discovery))
 
 

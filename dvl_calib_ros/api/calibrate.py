@@ -60,19 +60,11 @@ def replay(
     ----------
     The models M1 to M7 are by Yampolsky and Klein, Information-Aided DVL Calibration; see the page Models.
     """
-    from ..bag_replay.checked_replay import checked_replay
+    from ..examination.examine import judged_replay
 
     paths = as_paths(bags)
     recording, discovery = discovered_in(paths, (dvl_topic, gnss_topic, imu_topic), params, parameters)
-    replayed = checked_replay(
-        recording,
-        discovery.parameters,
-        discovery.topics,
-        merge=merge,
-        with_history=history,
-        mounting_is_guessed=bool(discovery.mounting_because),
-        contradictions=discovery.contradictions,
-    )
+    replayed = judged_replay(recording, discovery, merge=merge, with_history=history)
     return Calibration(replayed, discovery.with_mounting(replayed.result.parameters["mounting_rpy"]), tuple(paths))
 
 

@@ -146,6 +146,9 @@ def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reas
         for each in contradictions
         if each.severity is Severity.MARGINAL or each.code in DECISIVE or (is_rejected and is_cause(each))
     ]
+    if any(each.code == "MOUNTING_CONTRADICTED" for each in kept):  # which says it with the option to type
+        reasons = (each for each in verification.reasons if "MOUNTING_FITS" not in {one.code for one in each.causes})
+        verification = replace(verification, reasons=tuple(reasons))
     return verification.with_objections(kept) if kept else verification
 
 

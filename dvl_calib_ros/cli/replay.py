@@ -37,9 +37,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Examine the bags, replay them, save, print. Return 1 for a rejected calibration."""
-    from ..bag_replay.checked_replay import checked_replay
     from ..bag_replay.replay import replay_document
     from ..calibration.models import MODELS
+    from ..examination.examine import judged_replay
     from ..files.result_file import result_document, save_result
     from ..verdict.kinds import Severity
 
@@ -51,15 +51,8 @@ def run(arguments: argparse.Namespace) -> int:
     recording = common.opened(arguments.bags, parameters)
     discovery = common.discovered(arguments, recording, parameters)
     with common.progress("replaying") as on_progress:
-        replayed = checked_replay(
-            recording,
-            discovery.parameters,
-            discovery.topics,
-            on_progress,
-            merge=arguments.merge,
-            with_history=arguments.report is not None,
-            mounting_is_guessed=bool(discovery.mounting_because),
-            contradictions=discovery.contradictions,
+        replayed = judged_replay(
+            recording, discovery, on_progress, merge=arguments.merge, with_history=arguments.report is not None
         )
     result = replayed.result
     if asked and not any(name in result.estimates for name in asked):

@@ -23,10 +23,11 @@ from ..calibration.numerics.frames import (
     rpy_from_rotation,
 )
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.registration.configuration_check import angle_between
+from ..calibration.registration.configuration_check import DRAWN, angle_between
 from ..calibration.registration.frame_hypotheses import (
     CLEARLY,
     FITS,
+    MEANT_WITHIN,
     Agreement,
     ImuFrame,
     Reading,
@@ -342,10 +343,13 @@ class FrameChooser:
                 )
                 reasons += (finding("FRAMES_AMBIGUOUS", taken=taken, other=instead),)
                 break
-        if mounting is not None and best.mounting is None:
-            given, fitting = in_degrees(rpy_from_rotation(mounting.T)), nominal_rpy(fits[best].rotation_dvl_from_body.T)
-            fields = {"given": given, "found": in_degrees(fitting), "option": as_option(fitting)}
-            reasons += (finding("MOUNTING_CONTRADICTED", **fields),)
+        turn = fits[best].rotation_dvl_from_body
+        if (
+            mounting is not None
+            and best.mounting is None
+            and not readings.are_axes_mirrored(best.reading, turn, mounting)
+        ):
+            reasons += (_mounting_contradicted(mounting.T, turn.T, None if best.reading.in_body else best.reading.imu),)
         return FrameChoice(best.agreement, imus[best.reading], reasons)
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
@@ -357,6 +361,32 @@ class FrameChooser:
             "dvl_axes": FRD if reading.turned != z_down else FLU,
             "imu_frame": IMU_ENU if imu is None else imu.frame.world,
         }
+
+
+def _mounting_contradicted(given: Array, found: Array, imu: ImuFrame | None) -> Reason:
+    """Return the finding of another mounting; its remedy names what looks the same.
+
+    given, found: (3, 3) rotation_body_from_dvl. imu: by which the reference is turned into the body, None for none.
+    """
+    rpy, fitting = rpy_from_rotation(given), nominal_rpy(found)
+    first = also = ""
+    about_z = fitting[2] - float(rpy[2])
+    is_drawn = abs(math.remainder(about_z, DRAWN)) < MEANT_WITHIN
+    if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=MEANT_WITHIN):
+        heading = rpy_from_rotation(rotation_from_rpy((0.0, 0.0, -about_z)) @ imu.rotation_body_from_imu) + 0.0
+        first = f"set the declination of the compass, here -p imu_rpy:={as_option(heading)}; if the heading is right, "
+    shares = np.diag(given.T @ found)
+    if np.abs(shares).min() > math.cos(TURNED_FROM):  # a half turn
+        negated = " and ".join(axis for axis, share in zip("xyz", shares, strict=True) if share < 0.0)
+        also = f", or, if that mounting is right, negate {negated} in the DVL's driver"
+    return finding(
+        "MOUNTING_CONTRADICTED",
+        given=in_degrees(rpy),
+        found=in_degrees(fitting),
+        option=as_option(fitting),
+        first=first,
+        also=also,
+    )
 
 
 def _arm_odds(fit: Registered) -> float:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -108,12 +108,9 @@ class Examination(Answering):
     @property
     def why(self) -> str:
         """Sentence on why it cannot calibrate fully; '' if it can or the findings explain it."""
-        is_explained = bool(self.against) and is_cause(self.against[0])  # why DVL and reference disagree
-        errors = [
-            each
-            for each in self.findings
-            if each.severity is Severity.ERROR and not (is_explained and each.code == "DOCTOR_DISAGREE")
-        ]
+        if self.verdict == "no" and self.against and is_cause(self.against[0]):
+            return self.against[0].full_sentence
+        errors = [each for each in self.findings if each.severity is Severity.ERROR]
         if errors:
             return "" if errors[0].code.startswith(NO_IMU) else f"{errors[0].says}."
         if not self.has_reference and self.verdict != "no":
@@ -158,17 +155,14 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     if not isinstance(recording, Recording):
         recording = open_recording(recording, parameters=parameters)
     discovery = discover(recording, parameters, given)
-    topics = discovery.topics
-    wanted = {"dvl": topics.dvl, "reference": topics.gnss, "imu": topics.imu}
-    present = {role: name for role, name in wanted.items() if name in recording.types}
-    looks = {role: recording.survey.looks.get(name) for role, name in present.items()}
+    streams = _streams(recording, discovery)
+    looks = {role: recording.survey.looks.get(each.topic) for role, each in streams.items()}
     start_ns, end_ns = recording.span_ns
-    streams = {role: recording.recorded(name, discovery.parameters) for role, name in present.items()}
     recorded_s = 1e-9 * (end_ns - start_ns)
     seconds = {role: recorded_s * (1.0 if look is None else look.clock_rate) for role, look in looks.items()}
     velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
-    replayed, cannot = _replayed(recording, discovery)
+    replayed, cannot = _replayed(recording, discovery, findings)
     verification = None if replayed is None else replayed.result.verifications[replayed.result.selected]
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
@@ -197,7 +191,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
 
 def rejection(recording: Recording, discovery: Discovery) -> Reason | None:
     """Return the reason for which the calibration rejects a recording; None if it is usable."""
-    replayed, cannot = _replayed(recording, discovery)
+    replayed, cannot = _replayed(recording, discovery, None)
     if replayed is None:
         return finding("CALIBRATION_REJECTS", says=cannot)
     verification = replayed.result.verifications[replayed.result.selected]
@@ -205,20 +199,68 @@ def rejection(recording: Recording, discovery: Discovery) -> Reason | None:
     return finding("CALIBRATION_REJECTS", says=verification.reasons[0]) if is_rejected else None
 
 
-def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | None, str]:
+def judged_replay(
+    recording: Recording,
+    discovery: Discovery,
+    on_progress: Callable[[float], None] = lambda _: None,
+    *,
+    merge: bool = False,
+    with_history: bool = False,
+    findings: Sequence[Reason] | None = None,
+) -> Replayed:
+    """Replay as discovered. A rejection that names no cause begins with the first error of the recording's streams.
+
+    findings: of the streams; None to compute them if needed. Other arguments: see `checked_replay`. Raises InputError.
+    """
+    replayed = checked_replay(
+        recording,
+        discovery.parameters,
+        discovery.topics,
+        on_progress,
+        merge=merge,
+        with_history=with_history,
+        mounting_is_guessed=bool(discovery.mounting_because),
+        contradictions=discovery.contradictions,
+    )
+    result = replayed.result
+    judged = result.verifications.get(result.selected)
+    if judged is None or judged.verdict is not Severity.REJECT or is_cause(judged.reasons[0]):
+        return replayed
+    if findings is None:
+        streams = _streams(recording, discovery)
+        look = recording.survey.looks.get(streams["dvl"].topic)
+        findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
+    errors = [each for each in findings if _has_error([each]) and not each.code.startswith((NO_IMU, "DOCTOR_FRAMES"))]
+    if not errors:
+        return replayed
+    verifications = {
+        **result.verifications,
+        result.selected: judged.with_objections([errors[0].weighed(Severity.REJECT)]),
+    }
+    return replace(
+        replayed,
+        result=replace(result, verifications=verifications),
+        findings=(*replayed.findings, errors[0]),
+        notes=(*replayed.notes, str(errors[0])),
+    )
+
+
+def _streams(recording: Recording, discovery: Discovery) -> dict[str, Recorded]:
+    """Return the messages of DVL, reference and IMU, by role, as far as there are any."""
+    topics = discovery.topics
+    wanted = {"dvl": topics.dvl, "reference": topics.gnss, "imu": topics.imu}
+    present = {role: name for role, name in wanted.items() if name in recording.types}
+    return {role: recording.recorded(name, discovery.parameters) for role, name in present.items()}
+
+
+def _replayed(
+    recording: Recording, discovery: Discovery, findings: Sequence[Reason] | None
+) -> tuple[Replayed | None, str]:
     """Return the replay of `dvl-calib replay`, whose verdict is the doctor's; or the reason why there is none."""
-    guessed = bool(discovery.mounting_because)
     try:
-        replayed = checked_replay(
-            recording,
-            discovery.parameters,
-            discovery.topics,
-            mounting_is_guessed=guessed,
-            contradictions=discovery.contradictions,
-        )
+        return judged_replay(recording, discovery, findings=findings), ""
     except InputError as error:
         return None, str(error).rstrip(".")
-    return replayed, ""
 
 
 def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> Content:

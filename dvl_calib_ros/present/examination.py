@@ -30,7 +30,7 @@ def examination(examined: Examination, is_live: bool = False, named: Sequence[st
     names = ", ".join(path.name or str(path) for path in examined.paths)
     found, discovery = examined.findings, examined.discovery
     lead, found = (found[0], found[1:]) if found and found[0].code.startswith(NO_IMU) else (None, found)
-    found = (*found, *examined.against)
+    found = (*found, *(each for each in examined.against if each.says not in {one.says for one in found}))
     notes = (note.sentence for note in discovery.notes)
     lines = [Sentence(each, soft=True) for each in (*discovery.found[1:], *notes)]
     motion = f"Observable from the motion (median speed {examined.speed_mps:.2f} m/s)"

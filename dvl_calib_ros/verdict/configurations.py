@@ -37,9 +37,7 @@ CONFIGURATIONS = on_page(
     reject(
         "DVL_LEFT_HANDED",
         "the DVL's axes look left-handed: {axis} points the other way{alike}",
-        remedy=(
-            "negate this axis in the DVL's driver; of z, check the sign of the reference's vertical velocity as well"
-        ),
+        remedy=("negate {axis} in the DVL's driver; of z, check the sign of the reference's vertical velocity as well"),
     ),
     reject(
         "DVL_SIDE_INVERTED",
@@ -235,7 +233,7 @@ CONFIGURATIONS = on_page(
         "MOUNTING_CONTRADICTED",
         "DVL and reference do not agree with the mounting {given}; they do with {found}",
         means="A heading without its magnetic declination (setting EB of an RDI) looks the same.",
-        remedy="try -p mounting_rpy:={option}",
+        remedy="{first}try -p mounting_rpy:={option}{also}",
     ),
     reject(
         "TRAVELS_SIDEWAYS",

@@ -545,7 +545,7 @@ DOCTOR = on_page(
     error(
         "DOCTOR_UNITS",
         "DVL and reference differ by a factor of {factor:.4g}{guess}",
-        remedy="let its driver convert to m/s",
+        remedy="let its driver convert to m/s; of a DVL, check the beam angle and the beam order as well",
     ),
     error(
         "DOCTOR_DISAGREE",

@@ -111,13 +111,11 @@ def finding(code: str, **numbers: object) -> Reason:
     return found
 
 
+# Causes in causal order, by the beginnings of their codes: frames and signs, clocks, mounting.
 _CAUSES = (
-    "FRAMES_AMBIGUOUS",
-    "DVL_SIDE_INVERTED",
-    "MOUNTING_CONTRADICTED",
-    "TRAVELS_",
-    "CONFIGURATION_WRONG",
-    "GRAVITY_",
+    ("DOCTOR_", "DVL_SIDE_INVERTED", "FRAMES_AMBIGUOUS", "GRAVITY_"),
+    ("CLOCK_DRIFTS", "CLOCK_FAR", "CLOCK_LEAPS", "CLOCKS_APART"),
+    ("MOUNTING_CONTRADICTED", "MOUNTING_FITS", "TRAVELS_"),
 )
 
 
@@ -146,14 +144,22 @@ def of_consequence(reasons: Iterable[Reason], target_m_per_km: float) -> list[Re
     ]
 
 
+def causal_rank(reason: Reason) -> int:
+    """Return the place of a reason in causal order, from 0: frames and signs, clocks, mounting, all others."""
+    is_wrong = reason.code == "CONFIGURATION_WRONG"
+    code = reason.causes[0].code if is_wrong else reason.code
+    first_not_listed = 0 if is_wrong else len(_CAUSES)
+    return next((rank for rank, codes in enumerate(_CAUSES) if code.startswith(codes)), first_not_listed)
+
+
 def is_cause(reason: Reason) -> bool:
-    """Return whether a reason concerns frames or clocks, which cause most other reasons."""
-    return reason.code.startswith(_CAUSES)
+    """Return whether a reason concerns frames, clocks or the configured mounting, which cause most other reasons."""
+    return causal_rank(reason) < len(_CAUSES)
 
 
 def by_severity(reasons: Iterable[Reason]) -> list[Reason]:
-    """Sort by severity, the worst first; within one severity frames and clocks first, as likely causes."""
-    return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), not is_cause(each)))
+    """Sort by severity, the worst first; within one severity in causal order."""
+    return sorted(reasons, key=lambda each: (_WORST_FIRST.index(each.severity), causal_rank(each)))
 
 
 def lookup(kinds: Iterable[Kind]) -> str:

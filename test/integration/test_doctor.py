@@ -288,7 +288,9 @@ def test_nothing_is_observable_without_a_sample_and_the_next_command_keeps_the_o
     assert out.startswith("no: ") and "Nothing is observable without a usable sample." in out
     assert "Without a reference" not in out
     out, _ = succeed(capsys, "replay", bag, *fast)
-    assert out.startswith("reject: Do not use this calibration. No sample was used")
+    assert out.startswith(
+        "reject: Do not use this calibration. dvl/twist: the vehicle does not move faster than min_speed"
+    )
     commands = out[out.index("\nnext") :].strip().splitlines()
     assert commands and all("-p min_speed:=4.9" in command for command in commands)
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from stacks import LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, true_mounting
+from situations import DVL, long_motion, sound
+from stacks import IMU, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, true_mounting
 
 from dvl_calib_ros import doctor, replay
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -130,6 +134,40 @@ def test_a_yaw_of_the_wrong_sign_in_a_transform_is_named_and_its_remedy_works(tm
     mended = replay(bag, mounting_rpy=(0.0, 0.0, -quarter))
     assert mended.verdict != "reject"
     assert is_right(mended, truth_deg((0.0, 0.0, -quarter)), (2.0, 2.0, 0.5))
+
+
+@pytest.mark.spread(1)
+def test_a_heading_without_its_declination_is_said_before_another_mounting_and_its_remedy_works(tmp_path):
+    declination, told = math.radians(14.0), Told()
+    sound(told)
+    for _, _, kind, message in told.rows:
+        if kind == IMU:
+            q = message.orientation
+            turned = Rotation.from_euler("z", -declination) * Rotation.from_quat([q.x, q.y, q.z, q.w])
+            q.x, q.y, q.z, q.w = turned.as_quat().tolist()
+    bag = told.write(tmp_path / "bag")
+    said = doctor(bag).reasons[0].sentence
+    found = re.search(
+        r"set the declination of the compass, here -p imu_rpy:=\[0deg,0deg,(.*)deg\]; if the heading", said
+    )
+    heading = -float(found[1]) if found else 0.0
+    assert heading == pytest.approx(14.0, abs=3.0)  # the DVL's misalignment is in it
+    assert replay(bag, imu_rpy=(0.0, 0.0, -math.radians(heading))).verdict != "reject"
+
+
+def test_two_negated_axes_are_a_mounting_or_the_drivers_and_three_the_drivers_alone(tmp_path):
+    """Of a vehicle that heaves."""
+    for signs, said in (
+        ((-1.0, 1.0, -1.0), "negate x and z in the DVL's driver"),
+        ((-1.0, -1.0, -1.0), "negate each of x"),
+    ):
+        told = Told(motion=long_motion())
+        sound(told)
+        for _, topic, _, message in told.rows:
+            if topic == DVL:
+                v = message.twist.twist.linear
+                v.x, v.y, v.z = signs[0] * v.x, signs[1] * v.y, signs[2] * v.z
+        assert said in doctor(told.write(tmp_path / f"bag{sum(signs):.0f}")).reasons[0].sentence
 
 
 def test_a_reading_that_cannot_be_registered_is_judged_by_its_agreement(tmp_path, monkeypatch):

@@ -56,7 +56,10 @@ class Cleaned(NamedTuple):
 
 def cleaned(block: Block, parameters: Parameters, epoch_ns: int) -> Cleaned:
     """Return the samples of a block without outliers. epoch_ns: stamp of time 0."""
-    block = block._replace(reference=_of_moments(block.reference, parameters))
+    if are_positions(parameters):  # their velocities are means over a window
+        around, imu = block.reference, _imu(block.imu, epoch_ns)
+        velocity = of_moments(seconds(around.stamps_ns, epoch_ns), around.values[:, :3], imu, parameters)
+        block = block._replace(reference=around._replace(values=np.hstack([velocity, around.values[:, 3:]])))
     own = _own(block)
     raw = block.reference.part(own)
     reference, good = _reference(block, own, raw, parameters, epoch_ns)
@@ -137,14 +140,6 @@ def _reference(
         velocity = np.where(ned[:, None], velocity @ ENU_FROM_NED.T, velocity)
         noise = np.where(ned[:, None, None], ENU_FROM_NED @ noise @ ENU_FROM_NED.T, noise)
     return ReferenceColumns(seconds(stamps_ns, epoch_ns), velocity, noise, frames == _BODY, given), good
-
-
-def _of_moments(around: ReferenceSamples, p: Parameters) -> ReferenceSamples:
-    """Correct velocities from positions, which are means over a window, to the times of their stamps."""
-    if not are_positions(p):
-        return around
-    velocity = of_moments(1e-9 * (around.stamps_ns - around.stamps_ns[:1]), around.values[:, :3], p.position_window)
-    return around._replace(values=np.hstack([velocity, around.values[:, 3:]]))
 
 
 def _own(block: Block) -> Index:

@@ -124,7 +124,7 @@ class Displacements(Estimator):
         parameters, start = self._parameters, self._start
 
         def looked() -> _Look:
-            noise_mps = _noise_of_velocities(known, parameters.position_window)
+            noise_mps = _noise_of_velocities(known, parameters)
             return _Look(solve(known, parameters, start) if noise_mps > NOISY_MPS else None, noise_mps)
 
         self._coming.append((at_ns + SOLVED_WITHIN_NS, self._worker.submit(looked)))
@@ -248,14 +248,14 @@ class Displacements(Estimator):
         return [[Terms(terms @ state.x, np.zeros(3), 0.0)] * n_days for state in states]
 
 
-def _noise_of_velocities(legs: Legs, window_s: float) -> float:
+def _noise_of_velocities(legs: Legs, parameters: Parameters) -> float:
     """Return the noise of velocities from positions, m/s; inf if fixes are too sparse, 0 if too few."""
     if len(legs.seconds) < N_ERRORS:
         return 0.0
-    interval = float(np.median(np.diff(legs.seconds)))
+    interval, window_s = float(np.median(np.diff(legs.seconds))), parameters.position_window
     if interval > LONGEST_WINDOWS * window_s:
         return math.inf
-    return math.sqrt(2.0) * white_noise(legs) / max(window_s, interval)
+    return math.sqrt(2.0) * white_noise(legs, np.array(parameters.lever_arm)) / max(window_s, interval)
 
 
 # Time before a fix over which a velocity error is averaged, s; over less, position noise dominates.

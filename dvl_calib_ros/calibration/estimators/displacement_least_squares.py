@@ -83,10 +83,14 @@ class _Blocks(NamedTuple):
     columns: Array
 
 
-def white_noise(legs: Legs) -> float:
-    """Return the white σ (m) per axis of fixes against their neighbours, with the nominal mounting."""
+def white_noise(legs: Legs, lever_arm: Array) -> float:
+    """Return the white σ (m) per axis of fixes against their neighbours, with the nominal mounting.
+
+    lever_arm: (3,) m configured DVL position from the reference point, body frame.
+    """
     step = np.diff(legs.seconds)[:, None]
-    moved = np.diff(legs.position, axis=0) - 0.5 * step * (legs.velocity[1:] + legs.velocity[:-1])
+    position = legs.position + legs.rotation @ lever_arm
+    moved = np.diff(position, axis=0) - 0.5 * step * (legs.velocity[1:] + legs.velocity[:-1])
     return float(robust_std(moved[:, :2]).mean()) / math.sqrt(2.0)
 
 

@@ -84,8 +84,10 @@ FITS_BELOW, BETTER_BY = math.sqrt(0.05), 0.5
 SAME_WITHIN = math.radians(12.0)
 # Step of mounting angles in drawings, rad; a fitted mounting near a multiple is reported as the multiple.
 DRAWN = math.pi / 4.0
-# Signs of the DVL axes: as configured, y or z mirrored, both. Motion ahead determines the sign of x.
+# Signs of the DVL axes: as configured, y or z mirrored, both. Next to a mounting that does not fit also x mirrored, and
+# all axes; x and one other are a mounting.
 SIGNS: Sequence[Array] = [np.array([1.0, y, z]) for y in (1.0, -1.0) for z in (1.0, -1.0)]
+SIGNS_OF_X: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
 # Largest residual of an explanation as a multiple of the registered one, and an extra factor for few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
 # σ from which an axis factor is significant (two-sided p = 6e-7: eight tests per check, a check every few blocks), and
@@ -136,7 +138,7 @@ def fitting_configuration(
         as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
     if as_given < WRONG_FROM:
         assert given is not None
-        return _wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes)
+        return wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes, SIGNS)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
@@ -155,7 +157,7 @@ def fitting_configuration(
     best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
     if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
-    wrong = _wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
+    wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
     return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
@@ -205,8 +207,14 @@ def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame)
     return replace(motion, reference=reference, in_earth=frame is not VelocityFrame.BODY)
 
 
-def _wrong_axes(
-    motion: MotionStreams, curves: Curves, nominal: Array, lever_arm: Array, most: float, dvl_axes: str
+def wrong_axes(
+    motion: MotionStreams,
+    curves: Curves,
+    nominal: Array,
+    lever_arm: Array,
+    most: float,
+    dvl_axes: str,
+    patterns: Sequence[Array] = SIGNS_OF_X,
 ) -> Reason | None:
     """Return the finding of DVL axes that are mirrored, turned over, or scaled alone, else None.
 
@@ -214,7 +222,7 @@ def _wrong_axes(
     of the best pattern decide. most: largest residual, m/s per axis.
     """
     found: list[tuple[float, Array, Fitted]] = []
-    for signs in SIGNS:
+    for signs in patterns:
         quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FEW_ROWS)
         near = nearest(quick, nominal, (REFERENCE,), FAR_WORSE * most)
         # a fit that rotates the axes back is the configured pattern
@@ -229,6 +237,9 @@ def _wrong_axes(
         return None
     factors, std = fit.axis_factors(fitted, nominal)
     is_shown, is_turned = factors > SIGNIFICANT * std, signs < 0.0
+    if is_turned[0]:  # a mounting unless all signs are observable
+        axis = "each of x, y and z" if is_turned.all() else "x"
+        return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None
     if (is_shown & is_turned).any():
         if is_turned.sum() == 1 and (is_shown & ~is_turned)[1:].any():
             axis, other = ("y", "z") if is_turned[1] else ("z", "y")

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..models.parameters import FROM_MESSAGE
 from ..numerics.frames import (
     ENU_FROM_NED,
     ENU_FROM_NWU,
@@ -31,7 +32,7 @@ from ..numerics.frames import (
 from ..numerics.samples import VelocityFrame
 from ..streams.imu_frame import ENU_FROM, quaternion_product
 from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
-from .configuration_check import DRAWN, Directions, angle_between, misfit, nearest
+from .configuration_check import DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
 from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
 from .motion_streams import GAP_S, Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at
@@ -246,6 +247,16 @@ class Readings:
         turned = of(best.rotation_dvl_from_body @ FLU_FROM_FRD)
         upright, other = sorted((best, turned), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
         return other if other.left < CLEARLY * upright.left else upright
+
+    def are_axes_mirrored(self, reading: Reading, found: Array, rotation_dvl_from_body: Array) -> bool:
+        """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
+        motion, turn = self._read(reading), FLU_FROM_FRD if reading.turned else np.eye(3)
+        rotated = nearest(self._fits[reading], found.T @ turn, (REFERENCE,))
+        if motion is None or rotated is None:
+            return False
+        mounting = rotation_dvl_from_body.T @ turn
+        wrong = wrong_axes(motion, Curves(motion), mounting, self._position, rotated.level, FROM_MESSAGE)
+        return wrong is not None and wrong.code == "DVL_LEFT_HANDED"
 
     def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
         """Return a rotation (3, 3) without roll about the direction of travel, unless the data need it."""

@@ -83,12 +83,14 @@ def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     times = 1e-9 * (clocks.dvl(dvl.stamps_ns, first_ns) - first_ns)
     dvl_times, velocity = in_order(times, dvl.values)
     reference_times, seen = in_order(1e-9 * (reference.stamps_ns - clocks.reference_ns - first_ns), reference.values)
-    if are_positions(parameters):
-        seen = of_moments(reference_times, seen, parameters.position_window)
     imu_times, numbers = in_order(
         1e-9 * (imu.stamps_ns - clocks.imu_ns - first_ns),
         np.hstack([unit_quaternions(imu.orientation), imu.angular_velocity]),
     )
+    # contiguous, because each use of a slice of wider rows would copy it
+    columns = ImuColumns(imu_times, *map(np.ascontiguousarray, np.split(numbers, [4], axis=1)))
+    if are_positions(parameters):
+        seen = of_moments(reference_times, seen, columns, parameters)
     if code == FRAME_CODES[VelocityFrame.NED]:
         seen = seen @ ENU_FROM_NED.T
     measured = measured_axes(reference.values, screen_columns(reference.covariances).unmeasured, parameters.gnss_axes)
@@ -99,8 +101,7 @@ def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
         (reference_times, seen),
         code != FRAME_CODES[VelocityFrame.BODY],
         measured,
-        # contiguous, because each use of a slice of wider rows would copy it
-        ImuColumns(imu_times, *map(np.ascontiguousarray, np.split(numbers, [4], axis=1))),
+        columns,
     )
     return None if made is None else replace(made, epoch_ns=first_ns)
 

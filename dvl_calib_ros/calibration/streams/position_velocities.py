@@ -6,12 +6,15 @@ import numpy as np
 
 from ..models import WITH_POSITIONS
 from ..models.parameters import ParameterError, Parameters
-from ..numerics.frames import Array
+from ..numerics.frames import Array, cross
+from .interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 
 # Noise from which velocities derived from positions are useless, m/s.
 NOISY_MPS = 0.3
 # Factors of the second, fourth and sixth difference in the inverse of a mean (arcsine series).
 SERIES = -1.0 / 24.0, 3.0 / 640.0, -5.0 / 7168.0
+# Longest interpolated gap of an IMU, s.
+GAP_S = 1.0
 
 
 def are_positions(parameters: Parameters) -> bool:
@@ -28,8 +31,24 @@ def check_model(parameters: Parameters) -> None:
         )
 
 
-def of_moments(times: Array, velocity: Array, window_s: float) -> Array:
-    """Correct mean velocities (N, 3) m/s over windows to those at the middles (N,) s of the windows.
+def of_moments(times: Array, velocity: Array, imu: ImuColumns, parameters: Parameters) -> Array:
+    """Correct mean velocities (N, 3) m/s over `position_window` to those at the middles (N,) s of the windows.
+
+    The configured lever arm's part is known from the attitude, whatever its frequency.
+    """
+    window_s, arm = parameters.position_window, np.array(parameters.lever_arm)
+    if not arm.any() or len(times) < 2:
+        return _deconvolved(times, velocity, window_s)
+    now, before, after = (attitude_at(imu, times + half, GAP_S) for half in (0.0, -0.5 * window_s, 0.5 * window_s))
+    rates = angular_velocity_at(TurnRates.of(imu), times, GAP_S)
+    known = before[1] & after[1] & now[1] & np.isfinite(rates).all(axis=1)
+    of_window = np.where(known[:, None], (after[0] - before[0]) @ arm / window_s, 0.0)
+    of_moment = np.where(known[:, None], np.einsum("nij,nj->ni", now[0], cross(rates, arm)), 0.0)
+    return _deconvolved(times, velocity + of_window, window_s) - of_moment
+
+
+def _deconvolved(times: Array, velocity: Array, window_s: float) -> Array:
+    """Return velocities (N, 3) m/s whose means over windows around times (N,) s are given.
 
     The mean attenuates a wave of frequency f by sin(x) / x with x = π f window_s, which on a circle looks like a delay.
     The inverse is a series in differences over the window: x / sin(x) = arcsin(s) / s with s = sin(x).

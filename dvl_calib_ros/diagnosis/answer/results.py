@@ -9,7 +9,7 @@ from typing import Any
 
 from ...effects.registry import EFFECTS
 from ...verdict.answering import Answering
-from ...verdict.reasons import Reason
+from ...verdict.reasons import Reason, is_cause
 from ..model.hypothesis import is_time_of_run
 from ..search.arm_clock_ambiguity import Combination
 from ..search.effect_selection import EffectSelection
@@ -86,10 +86,15 @@ class Diagnosis(Answering):
     selection: EffectSelection | None = field(default=None, repr=False, compare=False)
 
     def led_by(self, rejection: Callable[[], Reason | None]) -> Diagnosis:
-        """Return the diagnosis with the calibration's reason against the recording first, unless an effect is named."""
+        """Return the diagnosis with the calibration's reason against the recording first.
+
+        A named effect comes before it, unless that reason is in frames, clocks or mounting, which look like effects.
+        """
+        first = rejection()
         is_named = self.verdict not in (DiagnosisVerdict.NO_GAP, DiagnosisVerdict.UNKNOWN)
-        first = None if is_named else rejection()
-        return self if first is None else replace(self, reasons=(first, *self.reasons))
+        if first is None or (is_named and not any(map(is_cause, first.causes))):
+            return self
+        return replace(self, reasons=(first, *self.reasons))
 
     @property
     def sentence(self) -> str:
