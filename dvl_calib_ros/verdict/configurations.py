@@ -57,7 +57,7 @@ CONFIGURATIONS = on_page(
     ),
     reject(
         "DVL_AXIS_SCALED",
-        "the DVL's {axis} is {factor:.2g} times its true value, and its x is not",
+        "the DVL's {axis} is {factor:.2g} times its true value, and its {other} is not",
         means="Wrong beam angles or beam matrix.",
         remedy="check the beam angle and the beam order in the DVL's driver",
     ),
