@@ -162,7 +162,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     seconds = {role: recorded_s * (1.0 if look is None else look.clock_rate) for role, look in looks.items()}
     velocity = _body_velocity(streams["dvl"], looks["dvl"], discovery.parameters)
     findings = _findings(streams, discovery, velocity)
-    replayed, cannot = _replayed(recording, discovery, findings)
+    replayed, cannot = _replayed(recording, discovery)
     verification = None if replayed is None else replayed.result.verifications[replayed.result.selected]
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
@@ -191,7 +191,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
 
 def rejection(recording: Recording, discovery: Discovery) -> Reason | None:
     """Return the reason for which the calibration rejects a recording; None if it is usable."""
-    replayed, cannot = _replayed(recording, discovery, None)
+    replayed, cannot = _replayed(recording, discovery)
     if replayed is None:
         return finding("CALIBRATION_REJECTS", says=cannot)
     verification = replayed.result.verifications[replayed.result.selected]
@@ -206,11 +206,10 @@ def judged_replay(
     *,
     merge: bool = False,
     with_history: bool = False,
-    findings: Sequence[Reason] | None = None,
 ) -> Replayed:
     """Replay as discovered. A rejection that names no cause begins with the first error of the recording's streams.
 
-    findings: of the streams; None to compute them if needed. Other arguments: see `checked_replay`. Raises InputError.
+    Other arguments: see `checked_replay`. Raises InputError.
     """
     replayed = checked_replay(
         recording,
@@ -226,10 +225,9 @@ def judged_replay(
     judged = result.verifications.get(result.selected)
     if judged is None or judged.verdict is not Severity.REJECT or is_cause(judged.reasons[0]):
         return replayed
-    if findings is None:
-        streams = _streams(recording, discovery)
-        look = recording.survey.looks.get(streams["dvl"].topic)
-        findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
+    streams = _streams(recording, discovery)
+    look = recording.survey.looks.get(streams["dvl"].topic)
+    findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
     errors = [each for each in findings if _has_error([each]) and not each.code.startswith((NO_IMU, "DOCTOR_FRAMES"))]
     if not errors:
         return replayed
@@ -253,12 +251,10 @@ def _streams(recording: Recording, discovery: Discovery) -> dict[str, Recorded]:
     return {role: recording.recorded(name, discovery.parameters) for role, name in present.items()}
 
 
-def _replayed(
-    recording: Recording, discovery: Discovery, findings: Sequence[Reason] | None
-) -> tuple[Replayed | None, str]:
+def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | None, str]:
     """Return the replay of `dvl-calib replay`, whose verdict is the doctor's; or the reason why there is none."""
     try:
-        return judged_replay(recording, discovery, findings=findings), ""
+        return judged_replay(recording, discovery), ""
     except InputError as error:
         return None, str(error).rstrip(".")
 
@@ -302,9 +298,6 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
     for role, topic in streams.items():
         found += topic_checks.stamp_findings(topic, Stream(role), discovery.parameters)
         found += topic_checks.gap_findings(topic)
-    # clock offsets estimated from velocities and turns make times of arrival irrelevant
-    if not _has_error(found) and not _are_clocks_known(discovery):
-        found += topic_checks.clock_findings(streams, discovery.parameters)
     found += topic_checks.velocity_findings(dvl, True)
     if reference is not None:
         if not _has_error(found):  # an error would explain it
@@ -323,13 +316,7 @@ def _findings(streams: dict[str, Recorded], discovery: Discovery, velocity: Arra
         in_body = reference is None or discovery.reference_frame is VelocityFrame.BODY
         what = "no lever arm is corrected or estimated" if reference is not None else "nothing tells the heading"
         found.append(finding("DOCTOR_NO_IMU", what=what) if in_body else finding("DOCTOR_NO_IMU_EARTH"))
-    told_by_log = any(each.code == "DOCTOR_CLOCKS" for each in found)  # the clock and its offset are already reported
-    without = None if discovery.clocks is None else discovery.clocks.doubt  # this doubt prevents every calibration
-    found += [
-        finding("DOCTOR_FRAMES", says=doubt).weighed(Severity.ERROR if doubt == without else Severity.WARNING)
-        for doubt in discovery.contradictions
-        if not (told_by_log and doubt.code == "CLOCKS_NOT_TOLD_APART")
-    ]
+    found += [finding("DOCTOR_FRAMES", says=doubt) for doubt in discovery.contradictions]
     parameters = discovery.parameters
     speed = np.linalg.norm(velocity, axis=1)
     units = [] if reference is None or over_legs else _units(dvl, reference)
@@ -349,10 +336,6 @@ def _is_compared_over_legs(reference: Recorded) -> bool:
     is_position = VELOCITY_TYPES[reference.msgtype].position is not None
     is_noisy = len(reference) > 0 and topic_checks.shown_noise(reference.values) > NOISY_MPS
     return is_position and (is_noisy or topic_checks.interval_s(reference) > SELDOM_S)
-
-
-def _are_clocks_known(discovery: Discovery) -> bool:
-    return discovery.clocks is not None and discovery.clocks.registration.are_known
 
 
 def _has_error(found: Sequence[Reason]) -> bool:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from ..calibration.checks.data_warnings import STREAMS
-from ..calibration.models.parameters import SCHEMA, Parameters
+from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import Stream
-from ..calibration.registration.clock_domains import arrival_offset
 from ..calibration.streams.stream_order import strays
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Recorded
@@ -116,30 +113,6 @@ def apart_findings(dvl: Recorded, reference: Recorded) -> list[Reason]:
     )
     share = float((near <= GAP * SECOND_NS).mean())
     return [finding("DOCTOR_APART", topic=dvl.topic, other=reference.topic, share=share)] if share <= MANY else []
-
-
-def clock_offset_s(topic: Recorded) -> float | None:
-    """Return how far the stamps are ahead of the log, s; None without stamps."""
-    stamped = topic.stamps_ns != 0
-    return float(np.median(topic.stamps_ns[stamped] - topic.log_ns[stamped])) * 1e-9 if stamped.any() else None
-
-
-def clock_findings(topics: Mapping[str, Recorded], parameters: Parameters) -> list[Reason]:
-    """Report streams (by dvl, reference, imu) with another clock than the others."""
-    offsets = {Stream(role): clock_offset_s(topic) for role, topic in topics.items()}
-    found = []
-    for each in arrival_offset({stream: ahead for stream, ahead in offsets.items() if ahead is not None}, parameters):
-        name = f"{each.stream.value}_time_offset"
-        late, bound = getattr(parameters, name) + each.ahead, SCHEMA[name].high
-        can_be_taken_off = bound is not None and abs(late) <= bound
-        fields = {
-            "seconds": abs(each.ahead),
-            "side": "after" if each.ahead > 0.0 else "before",
-        }
-        topic, other = topics[each.stream.value].topic, topics[each.other.value].topic
-        remedy = f"-p {name}:={late:.2f}" if can_be_taken_off else f"--restamp {topic}"
-        found.append(finding("DOCTOR_CLOCKS", topic=topic, other=other, here=remedy, **fields))
-    return found
 
 
 def gap_findings(topic: Recorded) -> list[Reason]:

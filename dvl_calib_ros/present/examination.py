@@ -83,8 +83,8 @@ def next_commands(examined: Examination, is_live: bool, named: Sequence[str]) ->
         return [("next", typed("run --watch", (), *arguments, "-p", "result_file:=calibration.yaml"))]
     given = [
         word
-        for found in examined.findings
-        if found.code in ("DOCTOR_CLOCKS", "DOCTOR_COVARIANCE")
+        for found in (*examined.findings, *examined.against)
+        if found.code in ("CLOCKS_APART", "DOCTOR_COVARIANCE")
         for word in found.remedy.partition("for this bag: ")[2].split(" leaves")[0].split()
     ]
     if examined.verdict == "no" and not given:

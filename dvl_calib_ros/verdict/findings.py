@@ -463,11 +463,6 @@ DOCTOR = on_page(
         remedy="set clocks before the recording, or cut the recording there",
     ),
     error(
-        "DOCTOR_CLOCKS",
-        "{topic}: stamps are {seconds:.2f} s {side} those of {other}",
-        remedy="synchronise clocks (PTP, NTP or GNSS); for this bag: {here}",
-    ),
-    error(
         "DOCTOR_APART",
         "{topic} and {other}: only {share:.0%} of the DVL's messages have a reference within seconds of their stamps",
         remedy="record both together; if they were, check the clocks, and for import the times of both files",

@@ -108,7 +108,7 @@ VERDICTS = on_page(
     reject(
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
-        remedy="set the clocks by one source; this recording: --restamp log (recording times)",
+        remedy="set the clocks by one source; by the recording times for this bag: --restamp log",
     ),
     # several recordings
     reject(

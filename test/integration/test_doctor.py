@@ -28,6 +28,7 @@ from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.results.mounting_quantities import quantities
 from dvl_calib_ros.cli.main import main
 from dvl_calib_ros.examination.examine import Examination, _units, examine
+from dvl_calib_ros.present.examination import next_commands
 from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import START_NS, Scenario, simulate
 from dvl_calib_ros.simulation.sensors import DvlErrors
@@ -195,7 +196,6 @@ FAULTS: dict[str, tuple[str, Callable[[str, int, Any, int], int | None]]] = {
     "stamps of reception": ("DOCTOR_STAMP_RECEPTION", dvl_only(reception)),
     "stamps of zero": ("DOCTOR_STAMP_ZERO", reference_only(zero_stamps)),
     "a clock set back": ("DOCTOR_STAMP_BACK", dvl_only(clock_set_back)),
-    "another clock": ("DOCTOR_CLOCKS", dvl_only(other_clock)),
     "a DVL that is off while there is a fix": ("DOCTOR_APART", one_after_the_other),
     "a stamp that stands still": ("DOCTOR_STANDING_STAMP", dvl_only(standing_stamp)),
     "seven messages": ("DOCTOR_TOO_FEW", reference_only(hardly_recorded)),
@@ -232,6 +232,13 @@ def test_a_fault_that_is_put_in_is_named(fault, tmp_path):
     assert code in codes(examined), [str(found) for found in examined.findings]
     also = {"DOCTOR_UNITS": {"DOCTOR_COVARIANCE"}, "DOCTOR_DISAGREE": {"DOCTOR_FRAMES"}}.get(code, set())
     assert codes(examined) <= {code, *also}
+
+
+def test_another_clock_is_the_first_reason_and_the_next_command_has_its_remedy(tmp_path):
+    examined = examine([faulty(tmp_path / "bag", dvl_only(other_clock))], Parameters())
+    assert examined.reasons[0].code == "CLOCKS_APART" and examined.why == examined.reasons[0].full_sentence
+    ((_, command),) = next_commands(examined, False, ())
+    assert "--restamp log --save" in command
 
 
 def test_a_dvl_that_pings_unevenly_is_not_said_to_be_stamped_at_reception(tmp_path):

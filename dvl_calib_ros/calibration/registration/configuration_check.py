@@ -237,8 +237,9 @@ def wrong_axes(
         return None
     factors, std = fit.axis_factors(fitted, nominal)
     is_shown, is_turned = factors > SIGNIFICANT * std, signs < 0.0
-    if is_turned[0]:  # a mounting unless all signs are observable
-        axis = "each of x, y and z" if is_turned.all() else "x"
+    ahead = int(np.argmin(std))  # the axis along which the vehicle moves most
+    if is_turned[ahead]:  # a mounting unless all signs are observable
+        axis = "each of x, y and z" if is_turned.all() else "xyz"[ahead]
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None
     if (is_shown & is_turned).any():
         if is_turned.sum() == 1 and (is_shown & ~is_turned)[1:].any():
@@ -247,18 +248,12 @@ def wrong_axes(
             alike = f" (read as {dvl_axes}; read as {instead}, {other} does)" if instead else ""
             return finding("DVL_LEFT_HANDED", axis=axis, alike=alike)
         return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
-    return None if is_turned.any() else scaled_axis(factors, std)
-
-
-def scaled_axis(factors: Array, std: Array) -> Reason | None:
-    """Return the finding of a DVL axis that reads less than the best known one, from factors (3,) with σ, else None."""
-    best = int(np.argmin(std))  # the axis ahead in any mounting: sway is small, and so its factor is badly known
-    is_shown = factors > SIGNIFICANT * std
-    too_small = np.where(is_shown, (factors - SIGNIFICANT * std) / factors[best] - SCALED_ALONE, 0.0)
-    at = int(np.argmax(too_small))
-    if too_small[at] <= 1.0:
-        return None
-    return finding("DVL_AXIS_SCALED", axis="xyz"[at], other="xyz"[best], factor=float(factors[best] / factors[at]))
+    too_small = np.where(is_shown, (factors - SIGNIFICANT * std) / factors[ahead] - SCALED_ALONE, 0.0)
+    if not is_turned.any() and too_small.max() > 1.0:
+        at = int(np.argmax(too_small))
+        factor = float(factors[ahead] / factors[at])
+        return finding("DVL_AXIS_SCALED", axis="xyz"[at], factor=factor, other="xyz"[ahead])
+    return None
 
 
 def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:

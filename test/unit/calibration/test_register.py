@@ -302,6 +302,16 @@ def test_a_left_handed_driver_is_named_with_its_axis(signs, axis):
     assert axis not in ("y", "z") or f"(read as frd; read as flu, {'zy'['yz'.index(axis)]} does)" in said.sentence
 
 
+def test_noise_of_the_axis_across_is_no_scale_of_the_axis_ahead(rng):
+    """A DVL at 90 degrees, whose y points ahead, was rejected: "y is 0.22 times its true value"."""
+    (td, v), (tg, g), imu = run("box", 5.0)
+    quarter = rotation_from_rpy((0.0, 0.0, 0.5 * np.pi))
+    measured = v @ quarter + rng.normal(0.0, 0.05, v.shape)
+    made = make_motion((td, measured), (tg, g), True, (True,) * 3, ImuColumns(*imu))
+    found = register(made, quarter, np.zeros(3))
+    assert fitting_configuration(made, VelocityFrame.ENU, quarter, np.zeros(3), found) is None
+
+
 @pytest.mark.parametrize("late", [0.0, 0.06, 0.1])
 def test_an_imu_too_little_late_to_be_shown_is_in_the_arm(late):
     """An arm of 0.26 m ± 0.01 for 0.40 was accepted of one that is 0.1 s late."""
