@@ -42,7 +42,7 @@ from .backward_elimination import (
     only_predictive,
     repeated_effects,
 )
-from .candidates import proposed, variants_about
+from .candidates import intermittent_effects, proposed, variants_about
 from .clock_jumps import in_gaps, leaping
 from .identifiability import Selected, identify_effects
 from .initial_guess import FirstGuess, first_guess
@@ -146,6 +146,9 @@ def select(
         fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
         fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
+        for hypothesis in intermittent_effects(fitter, fit, effects):
+            as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
+            fits.append(fitter.fit(as_white.hypothesis, fit.noise))
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
         best = in_gaps(fitter, fitter.refined(best_of(fits, effects), finer[3:]))
         best = eliminate(fitter, best, len(effects))
