@@ -234,7 +234,7 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
     if matters(selection.fitter.problem, selection.fit, rest):
         return DiagnosisVerdict.UNKNOWN
     # effects that leave more than the noise on held-out data explain it no better than their equivalents
-    if gap.not_expected > gap.noise_floor:
+    if gap.fails_elsewhere:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected and gap.closure < MATERIAL:
         return DiagnosisVerdict.UNKNOWN

@@ -39,7 +39,7 @@ from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
     repeated_effects,
 )
-from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks
+from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks, intermittent_effects
 from dvl_calib_ros.diagnosis.search.clock_jumps import (
     DELAYS,
     PARTS,
@@ -155,6 +155,19 @@ def test_what_comes_and_goes_does_so_at_another_time_by_another_clock():
     assert [its for *_, its in found[:2]] == [{"attitude_time_offset"}, {"dvl_time_offset"}]
     assert [its["from_s"] for its, *_ in found] == pytest.approx([110.9, 110.8, 110.9, 110.0])
     assert all(its["to_s"] == np.inf and leap["at_s"] == 0.0 for its, leap, _ in found)
+
+
+def test_a_current_that_was_taken_for_noise_is_proposed_when_it_came_and_went():
+    """With a memory of 15 s, it was for as long as it takes in least: all after it began. 0.4 m/s were unknown."""
+    given = scenario(effects=["water_lock:east_mps=0.2,north_mps=-0.34,from_s=120,to_s=241"], gnss_std=0.02)
+    fitter, fit, _ = fitted(given, {})
+    assert not intermittent_effects(fitter, fit, EFFECTS)
+    fitter, fit = _about(fitter, fit, {})
+    assert max(arma.ratio for arma in fit.noise.axes) > 2.0
+    effects = {name: EFFECTS[name].once for name in ("water_lock", "heading_error", "velocity_bias", "scale_drift")}
+    (best, *_) = intermittent_effects(fitter, fit, effects)
+    assert best.values["water_lock"][0]["to_s"] == pytest.approx(240.0, abs=1.0)
+    assert best.values["water_lock"][0]["east_mps"] == pytest.approx(0.2, abs=0.05)
 
 
 @pytest.mark.parametrize(("seconds", "between_samples"), [(387.0, 1.0), (400.0, 0.4), (370.0, 0.2)])
@@ -1100,7 +1113,8 @@ def test_what_exceeds_the_noise_by_as_much_is_unknown_and_no_sound_bag():
     selection: Any = SimpleNamespace(selected=[], fit=None, fitter=Mock())
     nothing_left = Unexplained(0.0, 0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
     for not_explained, verdict in ((0.99, DiagnosisVerdict.NO_GAP), (1.01, DiagnosisVerdict.UNKNOWN)):
-        gap = Gap(1.4, 1.4, 1.0, np.nan, (np.nan, np.nan), not_explained)
+        after = float(np.hypot(1.0, not_explained))
+        gap = Gap(after, after, 1.0, np.nan, (np.nan, np.nan), not_explained)
         assert _verdict(selection, nothing_left, gap, 1.0) is verdict
 
 
@@ -1109,7 +1123,7 @@ def test_what_the_very_stretch_that_is_held_out_tells_is_no_unknown_cause():
     current = "water_lock:east_mps=0.4,north_mps=0.1,from_s=101,to_s=119"
     diagnosis = diagnosed(effects=[LEVER, "dvl_time_offset:seconds=1.2", current], seconds=300.0, gnss_std=0.02)
     assert set(found(diagnosis)) == {"lever_arm", "dvl_time_offset", "water_lock"}
-    assert diagnosis.gap.not_explained > 2.0 * diagnosis.gap.noise_floor
+    assert diagnosis.gap.after > 2.0 * diagnosis.gap.noise_floor
     assert diagnosis.gap.not_expected < 0.3 * diagnosis.gap.noise_floor
     assert diagnosis.verdict is DiagnosisVerdict.KNOWN
 
