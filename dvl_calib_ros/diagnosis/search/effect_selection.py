@@ -199,14 +199,15 @@ def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fit
         np.concatenate([each / size - columns, (residual - raw)[:, :, None]], axis=2)
         for each, residual in _shaken(fitter, fit, effects)
     ]
+    frames = _frames(problem)
     for _ in range(2):
         explained, std = _explained(noise, columns, raw - fitter.outliers, own)
         left = raw - explained
         noise, robust = min(
-            (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in _frames(problem)),
+            (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in frames),
             key=lambda each: each[0].deviance(each[1]),
         )
-        fitter = Fitter(problem, left - robust)
+        frames, fitter = [noise.rotation], Fitter(problem, left - robust)
     return fitter, fitter.fit(fit.hypothesis, noise)
 
 
