@@ -56,6 +56,8 @@ from dvl_calib_ros.diagnosis.search.effect_selection import (
 from dvl_calib_ros.diagnosis.search.identifiability import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.search.observable_parameters import (
     observable_parts,
+    with_observable,
+    without_insignificant,
 )
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.base import ActsOn
@@ -1203,10 +1205,10 @@ def test_a_height_that_is_known_and_not_fitted_is_no_part_of_the_derivatives_of_
 
 
 @pytest.mark.parametrize(
-    ("by_metre", "is_shown"),
-    [(0.005, False), (0.0096, True), (0.02, True)],
+    ("by_metre", "is_shown", "std"),
+    [(0.005, False, 0.004 / 0.005), (0.0096, True, 0.004 / 0.0096), (0.02, True, 0.0)],
 )
-def test_a_height_is_looked_for_where_one_of_a_metre_shows(by_metre, is_shown):
+def test_a_height_is_looked_for_where_one_of_a_metre_shows_and_known_by_what_a_model_lacks(by_metre, is_shown, std):
     """Held at nothing at 9.6 mm/s a metre, one of 2.8 m turned the rest of the arm and was an unknown cause."""
     arm = EFFECTS["lever_arm"]
     columns = np.zeros((100, 2, 3))
@@ -1215,6 +1217,27 @@ def test_a_height_is_looked_for_where_one_of_a_metre_shows(by_metre, is_shown):
     problem = Mock(spec=Problem, measured=(True, True, False), recordings=[], columns=lambda *_: columns)
     shown = observable_parts({arm.name: arm}, problem)[arm.name]
     assert [each.name for each in shown.parameters] == ["x_m", "y_m", "z_m"][: 2 + is_shown]
+    hypothesis = no_effect().with_effects([arm], 1, {})
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=hypothesis.values)
+    fit.columns = np.concatenate([np.zeros((100, 2, 6)), columns], axis=2)
+    added = np.diag(with_observable(problem, fit, np.zeros((9, 9))))
+    assert np.sqrt(added) == pytest.approx([0.0] * 8 + [std])
+    assert not with_observable(Mock(spec=Problem, measured=(True, True, True)), fit, np.zeros((9, 9))).any()
+    for times, stands in ((1.9, not std), (-2.1, True)):
+        fit.values = {arm.name: ({"x_m": 0.0, "y_m": 0.0, "z_m": times * std},)}
+        fit.effects = (arm,)
+        left = without_insignificant(problem, fit)
+        assert left is None if stands else [each.name for each in left.parameters] == ["x_m", "y_m"]
+
+
+def test_what_turns_show_best_of_an_arm_is_said_however_little_they_show():
+    """Of a vehicle that hardly turns nothing of the arm would be left, and an effect without a parameter."""
+    arm = EFFECTS["lever_arm"]
+    hypothesis = no_effect().with_effects([arm], 1, {arm.name: ({"x_m": 0.1, "y_m": 0.1, "z_m": 0.1},)})
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=hypothesis.values, effects=(arm,))
+    fit.columns = np.concatenate([np.zeros((100, 2, 6)), np.full((100, 2, 3), [0.005, 0.005, 0.0005])], axis=2)
+    left = without_insignificant(Mock(spec=Problem, measured=(True, True, False)), fit)
+    assert left is not None and [each.name for each in left.parameters] == ["x_m", "y_m"]
 
 
 def test_a_height_that_is_not_said_is_held_where_it_is(monkeypatch):
