@@ -44,7 +44,7 @@ from .search.arm_clock_ambiguity import (
 from .search.effect_selection import EffectSelection, TooFewBinsError, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
-from .search.observable_parameters import somewhere
+from .search.observable_parameters import somewhere, with_observable
 from .search.unexplained import Unexplained, matters, moved_by
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
@@ -125,6 +125,7 @@ def diagnose_recordings(
     if verdict is DiagnosisVerdict.UNKNOWN and rest.found:  # the unknown cause may contribute
         moved = moved_by(selection.fitter.problem, selection.fit, rest)
         covariance = covariance + np.outer(moved, moved)
+    covariance = with_observable(selection.fitter.problem, selection.fit, covariance)
     unmoved, covariance = covariance, with_open(selection.fit, covariance, selection.opened)
     covariance = with_moved(selection.fit, covariance, selection.moved)
     found = tuple(
@@ -234,7 +235,7 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
     if matters(selection.fitter.problem, selection.fit, rest):
         return DiagnosisVerdict.UNKNOWN
     # effects that leave more than the noise on held-out data explain it no better than their equivalents
-    if gap.not_expected > gap.noise_floor:
+    if gap.fails_elsewhere:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected and gap.closure < MATERIAL:
         return DiagnosisVerdict.UNKNOWN

@@ -31,11 +31,11 @@ class Gap:
 
     noise_floor: from the residual, white and slow. closure: share of the noise-free error's energy that a correction
     with the estimated effects closes, nan without a gap; interval: its 95 per cent, given the parameters' covariance.
-    not_explained: part of `after` above the noise. reported: noise reported by the messages, None if missing.
-    by_recording: before and after per recording, if several. left_open: predicted part of `not_explained`, in stretches
-    that alone determine parts of the effects. falls_from: lower 95 per cent bound of the held-out fall, as a share of
-    the gap; shown_from: the same without left_open. drift: of straight dead reckoning with errors before and after,
-    None for a vehicle at rest.
+    not_explained: noise-free error that is not closed; without effects, the part of `after` above the noise. reported:
+    noise reported by the messages, None if missing. by_recording: before and after per recording, if several.
+    left_open: predicted part of `after` above the noise, in stretches that alone determine parts of the effects.
+    falls_from: lower 95 per cent bound of the held-out fall, as a share of the gap; shown_from: the same without
+    left_open. drift: of straight dead reckoning with errors before and after, None for a vehicle at rest.
     """
 
     before: float
@@ -53,8 +53,13 @@ class Gap:
 
     @property
     def not_expected(self) -> float:
-        """Return the unexplained error beyond the part left open, m/s."""
-        return float(np.sqrt(max(0.0, self.not_explained**2 - self.left_open**2)))
+        """Return the part of `after` above the noise and beyond the part left open, m/s."""
+        return float(np.sqrt(max(0.0, self.after**2 - self.noise_floor**2 - self.left_open**2)))
+
+    @property
+    def fails_elsewhere(self) -> bool:
+        """Return whether the effects leave more than the noise in stretches that they were not fitted to."""
+        return self.not_expected > self.noise_floor
 
     @property
     def beyond_noise(self) -> float:
@@ -219,7 +224,7 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     residuals_of = [fit.residual, *(fitter.evaluated(each)[1] for each in others)]
     truths = [beside_calibration(selection.base.residual - each)[:, 0] for each in residuals_of]
     corrected = truths[0]
-    of_cause = rows * remainder(selection, residuals)
+    of_cause = rows * max(remainder(selection, residuals), gap.not_expected**2 if gap.fails_elsewhere else 0.0)
     gram = columns.T @ columns
     shares = []
     for true, step in zip(truths, np.array_split(moved, len(truths)), strict=True):
@@ -229,7 +234,9 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
         share = 1.0 - (of_left + of_cause) / np.maximum(of_whole + of_cause, 1e-300)
         shares.append(np.clip(share, -1.0, 1.0))
     low, high = np.percentile(np.concatenate(shares), [2.5, 97.5]).tolist()
-    return replace(gap, closure=float(np.median(shares[0])), interval=(low, high))
+    closure = float(np.median(shares[0]))
+    not_explained = gap.beyond_noise * float(np.sqrt(1.0 - closure))
+    return replace(gap, closure=closure, interval=(low, high), not_explained=not_explained)
 
 
 def remainder(selection: EffectSelection, residuals: HeldOutResiduals) -> float:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...calibration.numerics.frames import Array
+from ...calibration.numerics.samples import Index
 from ...effects.base import Effect
-from ..fit.gauss_newton import Fit, Fitter, around
+from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, around
 from ..model.hypothesis import Hypothesis, Values
 from ..model.settings import SETTINGS
 from .initial_guess import FirstGuess
@@ -22,6 +23,8 @@ TWO_CLOCKS = DVL_CLOCK, REFERENCE_CLOCK
 # Alternatives for a delayed reference, and the delay from which each is tried for the other, s
 LAG_OR_DELAY, LAG_FROM_S = (LAG, REFERENCE_CLOCK), 0.2
 ARM_PARAMETERS = "x_m", "y_m", "z_m"
+# At one speed, arm and clock are inseparable if a joint fit inflates the arm's σ by this factor
+AS_ONE = 3.5
 # Ambiguity of the arm, m, from which registration limits the precision of arm and clock
 OPEN_M = 0.1
 
@@ -117,6 +120,44 @@ def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: M
     return found if found.deviance < fit.deviance + SETTINGS.indistinguishable else fit
 
 
+def with_clocks(
+    fitter: Fitter,
+    fit: Fit,
+    guesses: Sequence[FirstGuess],
+    effects: Mapping[str, Effect],
+    block: Index,
+    opened: OpenArm | None,
+) -> Fit | None:
+    """Return a fit with both clocks in addition, if part of the lever arm is equally likely theirs; else the fit.
+
+    Return None where arm and clock are inseparable. block: (M,) of each bin, for σ. opened: from `opened_arm`; if
+    given, a part that changes significantly with free clocks is ambiguous as well.
+
+    At 0.87 m/s, a DVL 0.3 m astern and a compass delay of 0.35 s differ only while the boat slows down. A model without
+    clocks attributes instrument errors in turns to the arm.
+    """
+    present = [effect.name for effect in fit.effects]
+    clocks = [effects[name] for name in TWO_CLOCKS if name in effects and name not in present]
+    if ARM not in present or not clocks or not is_open(guesses):
+        return fit
+    joint = fitter.fit_kept(fit.hypothesis.with_effects([*fit.effects, *clocks], len(fit.seen), {}), fit.noise)
+    if opened is not None and joint.deviance > fit.deviance + SETTINGS.indistinguishable:
+        return None
+    (own, own_std), (free, free_std) = (_arm_of(each, block) for each in (fit, joint))
+    was_shown, is_shown = np.abs(own) > OF_INTERVAL * own_std, np.abs(free) > OF_INTERVAL * free_std
+    by_chance = np.sqrt(np.maximum(free_std**2 - own_std**2, 0.0))  # change if no clock is delayed
+    is_another = ~is_shown | ((opened is not None) & (np.abs(free - own) > OF_INTERVAL * by_chance))
+    if bool((was_shown & is_another & (free_std > 2.0 * own_std)).any()):
+        return joint
+    return None if opened is not None and bool((was_shown & (free_std > AS_ONE * own_std)).any()) else fit
+
+
+def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
+    """Return the lever arm's parameters (p,) and standard deviations (p,) from blocks."""
+    at = [*_places(fit, ARM).values()]
+    return fit.hypothesis.vector()[at], np.sqrt(np.diag(fit.covariance(block))[at])
+
+
 def opened_arm(guesses: Sequence[FirstGuess]) -> OpenArm | None:
     """Return the ambiguity of the least ambiguous recording. Return None if it is negligible."""
     found = [each.registration for each in guesses if each.registration is not None]
@@ -139,10 +180,19 @@ def moved_arm(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:
     return max(moved, key=lambda each: sum(by**2 for by in each.values()), default={})
 
 
+def moved_lag(fit: Fit, joint: Fit) -> dict[str, float]:
+    """Return the change (s) of a lag from a joint fit with more clocks, if both are equally likely."""
+    if not {LAG} <= fit.values.keys() & joint.values.keys():
+        return {}
+    if fit.deviance > joint.deviance + SETTINGS.indistinguishable:
+        return {}
+    return {name: value - joint.values[LAG][0][name] for name, value in fit.values[LAG][0].items()}
+
+
 def with_moved(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
-    """Return a covariance (6 + p, 6 + p) that includes changes from `moved_arm`."""
+    """Return a covariance (6 + p, 6 + p) that includes changes from `moved_arm` and `moved_lag`."""
     step = np.zeros(len(covariance))
-    for name, i in _places(fit, ARM).items():
+    for name, i in (_places(fit, ARM) | _places(fit, LAG)).items():
         step[i] = moved.get(name, 0.0)
     return np.asarray(covariance + np.outer(step, step))
 

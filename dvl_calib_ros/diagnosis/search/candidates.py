@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,8 @@ SHORTLIST, FITTED = 12, 7
 ADDING_MOST = 4
 # Start times kept per intermittent effect
 KEPT_VARIANTS = 2
+# Share of the coloured noise's misfit that an intermittent effect may leave
+MOST_OF_NOISE = 0.5
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,12 @@ class Variant:
     def p(self) -> int:
         """Return the number of columns."""
         return self.columns.shape[2]
+
+    @property
+    def comes_and_goes(self) -> bool:
+        """Return whether the effect acts during a part of the run only."""
+        times = [spec.name for spec in self.effect.parameters if is_time_of_run(spec)]
+        return any(each[name] != self.effect.defaults[name] for each in self.values for name in times)
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,26 @@ def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hy
         *by_other_clocks(fitter, fit, effects),
         *_told_by_a_lag(fit, effects),
     ]
+
+
+def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """Return the best hypotheses with intermittent effects under white noise.
+
+    Coloured noise absorbs the residual of a wrong time, so no time on a grid improves the fit. Only effects that
+    explain most of the noise are proposed: an intermittent effect explains a part of any coloured noise.
+    """
+    if not fit.noise.is_coloured:
+        return []
+    fit = replace(fit, noise=fit.noise.white)
+    table, worth = _worth(fitter, fit, effects)
+    own = len(fit.effects)
+    most = MOST_OF_NOISE * table.drop(range(own))
+    come = [
+        chosen
+        for chosen in worth
+        if any(i >= own and table.variants[i].comes_and_goes for i in chosen) and table.drop(chosen) < most
+    ]
+    return [combined(fitter, fit, table, chosen) for chosen in come[:KEPT_VARIANTS]]
 
 
 def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[StraightLines, list[tuple[int, ...]]]:

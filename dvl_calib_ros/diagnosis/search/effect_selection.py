@@ -42,11 +42,11 @@ from .backward_elimination import (
     only_predictive,
     repeated_effects,
 )
-from .candidates import proposed, variants_about
+from .candidates import intermittent_effects, proposed, variants_about
 from .clock_jumps import in_gaps, leaping
 from .identifiability import Selected, identify_effects
 from .initial_guess import FirstGuess, first_guess
-from .observable_parameters import observable_parts, unobservable_parts
+from .observable_parameters import observable_parts, unobservable_parts, without_insignificant
 
 # The most common causes of a gap; the first fit includes all of them.
 START = (ARM, "dvl_time_offset", "reference_time_offset")
@@ -146,6 +146,9 @@ def select(
         fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
         fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
+        for hypothesis in intermittent_effects(fitter, fit, effects):
+            as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
+            fits.append(fitter.fit(as_white.hypothesis, fit.noise))
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
         best = in_gaps(fitter, fitter.refined(best_of(fits, effects), finer[3:]))
         best = eliminate(fitter, best, len(effects))
@@ -157,6 +160,7 @@ def select(
     wider = eliminate(fitter, fit, len(effects))
     fit = only_predictive(fitter, wider, len(effects))
     fitter, fit = _about(fitter, fit, every)
+    fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
     told = identify_effects(fitter, fit, guesses, effects, alike)
     base = fitter.fit_kept(told.fit.hypothesis.with_effects([], len(recordings), {}), told.fit.noise)
@@ -196,14 +200,15 @@ def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fit
         np.concatenate([each / size - columns, (residual - raw)[:, :, None]], axis=2)
         for each, residual in _shaken(fitter, fit, effects)
     ]
+    frames = _frames(problem)
     for _ in range(2):
         explained, std = _explained(noise, columns, raw - fitter.outliers, own)
         left = raw - explained
         noise, robust = min(
-            (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in _frames(problem)),
+            (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in frames),
             key=lambda each: each[0].deviance(each[1]),
         )
-        fitter = Fitter(problem, left - robust)
+        frames, fitter = [noise.rotation], Fitter(problem, left - robust)
     return fitter, fitter.fit(fit.hypothesis, noise)
 
 
@@ -236,6 +241,22 @@ def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Arra
     system = WhitenedLeastSquares.of(white, noise.whiten(residual), ridge, np.zeros_like(ridge))
     of_noise = sum((joined.T @ joined for joined in map(noise.whiten, own)), np.zeros_like(system.gram))
     return np.asarray(columns @ system.solution_without(of_noise)), ridge
+
+
+def _with_what_is_shown_of_the_arm(
+    fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
+) -> tuple[Fitter, Fit, Mapping[str, Effect]]:
+    """Return a fit and effects with only the observable parts of the lever arm.
+
+    every: effects with all parameters; effects: with those observable by their columns alone.
+    """
+    arm = without_insignificant(fitter.problem, fit)
+    if arm is not None:
+        effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
+        values = tuple(dict(each) for each in fit.values[ARM])  # unobservable parts are held at their values
+        hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
+        fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
+    return fitter, fit, effects
 
 
 __all__ = ["EffectSelection", "Selected", "select"]

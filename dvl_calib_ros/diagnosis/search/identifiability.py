@@ -12,6 +12,7 @@ from ...effects.base import Effect
 from ..fit.cross_validation import predictive_gain_of
 from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, n_amplitudes
 from ..fit.selection_criteria import (
+    blocks_of,
     fit_without,
     log_p_in_place,
     log_p_value,
@@ -30,9 +31,11 @@ from .arm_clock_ambiguity import (
     OpenArm,
     is_open,
     moved_arm,
+    moved_lag,
     opened_arm,
     told_apart,
     with_arm,
+    with_clocks,
 )
 from .candidates import combined, straight_lines
 from .initial_guess import FirstGuess
@@ -72,6 +75,12 @@ def identify_effects(
         selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened, told_apart(guesses))
     selected = [_or_else(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
     rivals = [one for each in selected if opened is not None and each.effect.name in CLOCKS for one in each.rivals]
+    freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), opened)
+    clocks = tuple(effect.name for effect in (freed or fit).effects if effect not in fit.effects)
+    if freed is None:
+        clocks = tuple(name for name in TWO_CLOCKS if name not in fit.values)
+    if clocks:
+        selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
     if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
         opened = replace(opened, late=IN_TIME_STD_S)  # only their combination is observable
     if opened is not None:  # a lag differs from a delay by less than interpolation errors
@@ -79,9 +88,10 @@ def identify_effects(
             _or_else(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
         ]
+    fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
         selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
-    return Identifiability(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved_arm(fit, rivals))
+    return Identifiability(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
 
 
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:

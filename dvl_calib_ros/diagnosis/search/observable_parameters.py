@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ...calibration.numerics.frames import Array
 from ...effects.base import Effect
+from ..fit.gauss_newton import OF_INTERVAL, Fit
 from ..model.forward_model import Problem
 from ..model.hypothesis import Values, amplitudes, is_time_of_run, no_effect
 from ..model.seen import Seen
@@ -47,6 +49,37 @@ def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effec
         by_metre = zip(specs, np.sqrt(of_each).tolist(), strict=True)
         out &= {spec.name for spec, size in by_metre if ARM_FROM_M * size < SHOWN_FROM * USUAL_MPS}
     return effect.without(out)
+
+
+def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
+    """Return the lever arm without parts below 2 σ of the model error. Return None if all are significant."""
+    known = _known_to(problem, fit)
+    faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < OF_INTERVAL * std}
+    (arm,) = (effect for effect in fit.effects if effect.name == ARM) if faint else (None,)
+    return arm and arm.without(faint)
+
+
+def with_observable(problem: Problem, fit: Fit, covariance: Array) -> Array:
+    """Add the model error of the lever arm to a fit's covariance (6 + p, 6 + p)."""
+    found, known = covariance.copy(), _known_to(problem, fit)
+    for number, each in enumerate(fit.hypothesis.parameters(), start=6):
+        if each.effect.name == ARM:
+            found[number, number] += known.get(each.spec.name, 0.0) ** 2
+    return found
+
+
+def _known_to(problem: Problem, fit: Fit) -> dict[str, float]:
+    """Return the model error, m, of lever arm parameters whose typical size is unobservable."""
+    if problem.measured[2] or ARM not in fit.values:
+        return {}
+    sizes = np.sqrt((fit.columns[:, :, 6:] ** 2).sum(axis=1).mean(axis=0)).tolist()
+    own = [
+        (each.spec, size)
+        for each, size in zip(fit.hypothesis.parameters(), sizes, strict=True)
+        if each.effect.name == ARM
+    ]
+    least = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
+    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < least}
 
 
 def somewhere(effect: Effect, problem: Problem) -> list[Values]:

@@ -68,6 +68,7 @@ def test_nine_of_ten_true_closures_are_inside_the_interval(memory_s, times):
         residuals = held_out(selection, nothing)
         gap = with_closure(measure_gap(selection, residuals), selection, fit.covariance(blocks_of(problem)), residuals)
         low, high = gap.interval
+        assert gap.not_explained == pytest.approx(gap.beyond_noise * math.sqrt(1.0 - gap.closure))
         true = _true_closure(clean, no_effect().with_effects([effect], 1, fit.values))
         inside += low - 0.005 <= true <= high + 0.005
         widths.append(high - low)

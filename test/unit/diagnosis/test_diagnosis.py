@@ -39,7 +39,7 @@ from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
     repeated_effects,
 )
-from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks
+from dvl_calib_ros.diagnosis.search.candidates import by_other_clocks, intermittent_effects
 from dvl_calib_ros.diagnosis.search.clock_jumps import (
     DELAYS,
     PARTS,
@@ -56,6 +56,8 @@ from dvl_calib_ros.diagnosis.search.effect_selection import (
 from dvl_calib_ros.diagnosis.search.identifiability import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.search.observable_parameters import (
     observable_parts,
+    with_observable,
+    without_insignificant,
 )
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained, _plainest
 from dvl_calib_ros.effects.base import ActsOn
@@ -155,6 +157,19 @@ def test_what_comes_and_goes_does_so_at_another_time_by_another_clock():
     assert [its for *_, its in found[:2]] == [{"attitude_time_offset"}, {"dvl_time_offset"}]
     assert [its["from_s"] for its, *_ in found] == pytest.approx([110.9, 110.8, 110.9, 110.0])
     assert all(its["to_s"] == np.inf and leap["at_s"] == 0.0 for its, leap, _ in found)
+
+
+def test_a_current_that_was_taken_for_noise_is_proposed_when_it_came_and_went():
+    """With a memory of 15 s, it was for as long as it takes in least: all after it began. 0.4 m/s were unknown."""
+    given = scenario(effects=["water_lock:east_mps=0.2,north_mps=-0.34,from_s=120,to_s=241"], gnss_std=0.02)
+    fitter, fit, _ = fitted(given, {})
+    assert not intermittent_effects(fitter, fit, EFFECTS)
+    fitter, fit = _about(fitter, fit, {})
+    assert max(arma.ratio for arma in fit.noise.axes) > 2.0
+    effects = {name: EFFECTS[name].once for name in ("water_lock", "heading_error", "velocity_bias", "scale_drift")}
+    (best, *_) = intermittent_effects(fitter, fit, effects)
+    assert best.values["water_lock"][0]["to_s"] == pytest.approx(240.0, abs=1.0)
+    assert best.values["water_lock"][0]["east_mps"] == pytest.approx(0.2, abs=0.05)
 
 
 @pytest.mark.parametrize(("seconds", "between_samples"), [(387.0, 1.0), (400.0, 0.4), (370.0, 0.2)])
@@ -1100,7 +1115,8 @@ def test_what_exceeds_the_noise_by_as_much_is_unknown_and_no_sound_bag():
     selection: Any = SimpleNamespace(selected=[], fit=None, fitter=Mock())
     nothing_left = Unexplained(0.0, 0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
     for not_explained, verdict in ((0.99, DiagnosisVerdict.NO_GAP), (1.01, DiagnosisVerdict.UNKNOWN)):
-        gap = Gap(1.4, 1.4, 1.0, np.nan, (np.nan, np.nan), not_explained)
+        after = float(np.hypot(1.0, not_explained))
+        gap = Gap(after, after, 1.0, np.nan, (np.nan, np.nan), not_explained)
         assert _verdict(selection, nothing_left, gap, 1.0) is verdict
 
 
@@ -1109,7 +1125,7 @@ def test_what_the_very_stretch_that_is_held_out_tells_is_no_unknown_cause():
     current = "water_lock:east_mps=0.4,north_mps=0.1,from_s=101,to_s=119"
     diagnosis = diagnosed(effects=[LEVER, "dvl_time_offset:seconds=1.2", current], seconds=300.0, gnss_std=0.02)
     assert set(found(diagnosis)) == {"lever_arm", "dvl_time_offset", "water_lock"}
-    assert diagnosis.gap.not_explained > 2.0 * diagnosis.gap.noise_floor
+    assert diagnosis.gap.after > 2.0 * diagnosis.gap.noise_floor
     assert diagnosis.gap.not_expected < 0.3 * diagnosis.gap.noise_floor
     assert diagnosis.verdict is DiagnosisVerdict.KNOWN
 
@@ -1189,10 +1205,10 @@ def test_a_height_that_is_known_and_not_fitted_is_no_part_of_the_derivatives_of_
 
 
 @pytest.mark.parametrize(
-    ("by_metre", "is_shown"),
-    [(0.005, False), (0.0096, True), (0.02, True)],
+    ("by_metre", "is_shown", "std"),
+    [(0.005, False, 0.004 / 0.005), (0.0096, True, 0.004 / 0.0096), (0.02, True, 0.0)],
 )
-def test_a_height_is_looked_for_where_one_of_a_metre_shows(by_metre, is_shown):
+def test_a_height_is_looked_for_where_one_of_a_metre_shows_and_known_by_what_a_model_lacks(by_metre, is_shown, std):
     """Held at nothing at 9.6 mm/s a metre, one of 2.8 m turned the rest of the arm and was an unknown cause."""
     arm = EFFECTS["lever_arm"]
     columns = np.zeros((100, 2, 3))
@@ -1201,6 +1217,27 @@ def test_a_height_is_looked_for_where_one_of_a_metre_shows(by_metre, is_shown):
     problem = Mock(spec=Problem, measured=(True, True, False), recordings=[], columns=lambda *_: columns)
     shown = observable_parts({arm.name: arm}, problem)[arm.name]
     assert [each.name for each in shown.parameters] == ["x_m", "y_m", "z_m"][: 2 + is_shown]
+    hypothesis = no_effect().with_effects([arm], 1, {})
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=hypothesis.values)
+    fit.columns = np.concatenate([np.zeros((100, 2, 6)), columns], axis=2)
+    added = np.diag(with_observable(problem, fit, np.zeros((9, 9))))
+    assert np.sqrt(added) == pytest.approx([0.0] * 8 + [std])
+    assert not with_observable(Mock(spec=Problem, measured=(True, True, True)), fit, np.zeros((9, 9))).any()
+    for times, stands in ((1.9, not std), (-2.1, True)):
+        fit.values = {arm.name: ({"x_m": 0.0, "y_m": 0.0, "z_m": times * std},)}
+        fit.effects = (arm,)
+        left = without_insignificant(problem, fit)
+        assert left is None if stands else [each.name for each in left.parameters] == ["x_m", "y_m"]
+
+
+def test_what_turns_show_best_of_an_arm_is_said_however_little_they_show():
+    """Of a vehicle that hardly turns nothing of the arm would be left, and an effect without a parameter."""
+    arm = EFFECTS["lever_arm"]
+    hypothesis = no_effect().with_effects([arm], 1, {arm.name: ({"x_m": 0.1, "y_m": 0.1, "z_m": 0.1},)})
+    fit = Mock(spec=Fit, hypothesis=hypothesis, values=hypothesis.values, effects=(arm,))
+    fit.columns = np.concatenate([np.zeros((100, 2, 6)), np.full((100, 2, 3), [0.005, 0.005, 0.0005])], axis=2)
+    left = without_insignificant(Mock(spec=Problem, measured=(True, True, False)), fit)
+    assert left is not None and [each.name for each in left.parameters] == ["x_m", "y_m"]
 
 
 def test_a_height_that_is_not_said_is_held_where_it_is(monkeypatch):
