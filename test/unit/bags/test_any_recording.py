@@ -20,12 +20,12 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from dvl_calib_ros.bags import channels, sources
-from dvl_calib_ros.bags.channels import is_empty
+from dvl_calib_ros.bags.channels import Channel, DecodingError, Definition, is_empty
 from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Storage
 from dvl_calib_ros.calibration.numerics.samples import DvlSample
 from dvl_calib_ros.cli.main import main
-from dvl_calib_ros.messages.drivers import TWIST_TYPE
+from dvl_calib_ros.messages.drivers import KNOWN_DEFINITIONS, TWIST_TYPE
 from dvl_calib_ros.recordings.recording import open_bags, open_recording
 
 # ---------------------------------------------------------------------- names
@@ -397,6 +397,21 @@ def test_what_does_not_fit_of_a_library_is_no_damage(bags, tmp_path, monkeypatch
     monkeypatch.setattr(module, name, unfit)
     with pytest.raises(error, match="no such thing"), BagReader([bag]) as reader:
         list(reader.messages(reader.topics))
+
+
+def test_what_a_damaged_definition_makes_of_messages_is_told_of_each():
+    bad = [
+        "float64 a\nfloat64 a\n", "geometry_msgs/Nowhere a\n", "float64[99999999] a\n", "float128 a\n", "x y z\n",
+        "a/B self\n", "float64 class\n", "float64[] a\nstring<=3 b\n",
+    ]  # fmt: skip
+    for text in bad:
+        decoder = channels.Decoder(KNOWN_DEFINITIONS)
+        channel = Channel("a", "a/msg/B", Definition(channels.FORMATS["ros2msg"], text))
+        for data in (b"", b"\0\1\0\0", b"\0\1\0\0" + bytes(range(64)), b"\0\0\0\0" + b"\xff" * 64):
+            try:
+                decoder(channel, data)
+            except DecodingError as error:
+                assert str(error)
 
 
 @pytest.mark.parametrize("options", [{}, {"use_chunking": False}])

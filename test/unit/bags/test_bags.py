@@ -6,10 +6,8 @@ import shutil
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from io_fixtures import (
-    JAZZY,
     TOPICS,
     estimates,
     mcap_bytes,
@@ -22,8 +20,6 @@ from io_fixtures import (
     write_bag,
 )
 from mcap.writer import CompressionType, IndexType
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from yaml_text import parsed, written
 
 from dvl_calib_ros.bags import batches, sources
@@ -31,7 +27,6 @@ from dvl_calib_ros.bags.reader import BagReader
 from dvl_calib_ros.bags.writer import BagWriter, Compression, Storage
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, VelocityFrame
 from dvl_calib_ros.errors import InputError
-from dvl_calib_ros.messages.drivers import TWIST_TYPE
 from dvl_calib_ros.messages.encode import SampleWriter
 
 if sys.version_info >= (3, 14):
@@ -165,33 +160,6 @@ def test_a_file_is_known_by_its_content_whatever_its_name(tmp_path, plain):
 
 def test_topics_are_found_with_and_without_a_leading_slash(tmp_path, expected):
     assert estimates(write_bag(tmp_path / "bag", run(), prefix="/")) == expected
-
-
-@pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
-def test_the_definition_embedded_in_the_bag_is_used(tmp_path, storage):
-    """The vendor's TwistWithCovarianceStamped has a field more, first, and Vector3 in another order."""
-    definition, _ = JAZZY.generate_msgdef(TWIST_TYPE, ros_version=2)
-    parts = definition.split("=" * 80)
-    parts[0] = "float64 temperature\n" + parts[0]
-    parts = [part.replace("float64 x\nfloat64 y\nfloat64 z", "float64 z\nfloat64 y\nfloat64 x") for part in parts]
-    vendor = get_typestore(Stores.EMPTY)
-    vendor.register(get_types_from_msg(("=" * 80).join(parts), TWIST_TYPE))
-    types = vendor.types
-    with Writer(tmp_path / "bag", version=9, storage_plugin=storage) as writer:
-        connection = writer.add_connection("dvl/twist", TWIST_TYPE, typestore=vendor)
-        for i in range(50):
-            stamp = types["builtin_interfaces/msg/Time"](sec=100 + i, nanosec=0)
-            vector = types["geometry_msgs/msg/Vector3"]
-            twist = types["geometry_msgs/msg/Twist"](vector(x=1.5, y=0.1, z=0.05), vector(x=0.0, y=0.0, z=0.0))
-            inner = types["geometry_msgs/msg/TwistWithCovariance"](twist, np.zeros(36))
-            message = types[TWIST_TYPE](20.0, types["std_msgs/msg/Header"](stamp, "dvl_link"), inner)
-            writer.write(connection, (100 + i) * 10**9, vendor.serialize_cdr(message, TWIST_TYPE))
-    with BagReader([tmp_path / "bag"]) as bag:
-        linear = next(iter(bag.messages(["dvl/twist"])))[2].twist.twist.linear
-    assert (linear.x, linear.y, linear.z) == (1.5, 0.1, 0.05)
-    samples = [DvlSample((100 + i) * 10**9, (1.5, 0.1, 0.05)) for i in range(50)]
-    standard = write_bag(tmp_path / "standard", samples)
-    assert estimates(tmp_path / "bag") == estimates(standard)
 
 
 def test_zero_stamps_fall_back_to_the_log_time_and_are_reported(tmp_path, expected):

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from runs import ONE_HERTZ, START_NS, MatchedRun, calibrate, make_samples
+from runs import START_NS, MatchedRun, calibrate, make_samples
 
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.checks.data_warnings import one_heading_warnings
@@ -56,14 +56,6 @@ def test_the_full_model_finds_noise_that_lasts_by_itself():
     lasting, white = (calibrated(wander).estimate("full") for wander in (0.1, 0.0))
     assert lasting.std[2] > 2.0 * white.std[2]
     np.testing.assert_array_equal(lasting.recording_covariance, lasting.filter_covariance)
-
-
-def test_how_samples_are_gathered_changes_nothing():
-    names = ("M3", "full", "F1", "A1")
-    one, other = (calibrate(run(0.1, **ONE_HERTZ), CLAIMED, block_size=size, models=names) for size in (64, 1))
-    for name in names:
-        found = one.estimate(name).covariance, other.estimate(name).covariance
-        np.testing.assert_allclose(*found, rtol=1e-7, atol=1e-12)
 
 
 def test_a_covariance_is_symmetric_to_the_last_bit_however_much_each_sigma_is_raised():

@@ -329,11 +329,12 @@ BAD = [
 ]
 
 
-def test_invalid_dvl_samples_are_dropped_counted_and_without_effect():
+def test_invalid_samples_are_dropped_counted_and_without_effect():
     samples = make_samples(NOISY)
-    spoiled = calibrate(BAD + samples)
-    assert_same(spoiled, calibrate(samples))
+    spoiled = calibrate([*BAD, ImuSample(samples[0].stamp_ns, (np.nan,) * 4, (np.nan,) * 3), *samples], block_size=1)
+    assert_same(spoiled, calibrate(samples, block_size=1))
     assert spoiled.counts["dvl"]["invalid"] == len(BAD)
+    assert spoiled.counts["imu"]["invalid"] == 1
 
 
 @pytest.mark.parametrize("variance", [0.0, 1e-310, 5e-324])
