@@ -231,16 +231,9 @@ def judged_replay(
     errors = [each for each in findings if _has_error([each])]
     if not errors or errors[0].code.startswith(NO_IMU):  # that there is no IMU is said before the verdict
         return replayed
-    verifications = {
-        **result.verifications,
-        result.selected: judged.with_objections([errors[0].weighed(Severity.REJECT)]),
-    }
-    return replace(
-        replayed,
-        result=replace(result, verifications=verifications),
-        findings=(*replayed.findings, errors[0]),
-        notes=(*replayed.notes, str(errors[0])),
-    )
+    judged = judged.with_objections([errors[0].weighed(Severity.REJECT)])
+    result = replace(result, verifications={**result.verifications, result.selected: judged})
+    return replace(replayed, result=result, findings=(*replayed.findings, errors[0]))
 
 
 def _streams(recording: Recording, discovery: Discovery) -> dict[str, Recorded]:
