@@ -379,14 +379,8 @@ def _mounting_contradicted(given: Array, found: Array, imu: ImuFrame | None) -> 
     if np.abs(shares).min() > math.cos(TURNED_FROM):  # a half turn
         negated = " and ".join(axis for axis, share in zip("xyz", shares, strict=True) if share < 0.0)
         also = f", or, if that mounting is right, negate {negated} in the DVL's driver"
-    return finding(
-        "MOUNTING_CONTRADICTED",
-        given=in_degrees(rpy),
-        found=in_degrees(fitting),
-        option=as_option(fitting),
-        first=first,
-        also=also,
-    )
+    said = {"given": in_degrees(rpy), "found": in_degrees(fitting), "option": as_option(fitting)}
+    return finding("MOUNTING_CONTRADICTED", **said, first=first, also=also)
 
 
 def _arm_odds(fit: Registered) -> float:

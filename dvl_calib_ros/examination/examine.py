@@ -228,19 +228,12 @@ def judged_replay(
     streams = _streams(recording, discovery)
     look = recording.survey.looks.get(streams["dvl"].topic)
     findings = _findings(streams, discovery, _body_velocity(streams["dvl"], look, discovery.parameters))
-    errors = [each for each in findings if _has_error([each]) and not each.code.startswith((NO_IMU, "DOCTOR_FRAMES"))]
-    if not errors:
+    errors = [each for each in findings if _has_error([each])]
+    if not errors or errors[0].code.startswith(NO_IMU):  # that there is no IMU is said before the verdict
         return replayed
-    verifications = {
-        **result.verifications,
-        result.selected: judged.with_objections([errors[0].weighed(Severity.REJECT)]),
-    }
-    return replace(
-        replayed,
-        result=replace(result, verifications=verifications),
-        findings=(*replayed.findings, errors[0]),
-        notes=(*replayed.notes, str(errors[0])),
-    )
+    judged = judged.with_objections([errors[0].weighed(Severity.REJECT)])
+    result = replace(result, verifications={**result.verifications, result.selected: judged})
+    return replace(replayed, result=result, findings=(*replayed.findings, errors[0]))
 
 
 def _streams(recording: Recording, discovery: Discovery) -> dict[str, Recorded]:
