@@ -23,7 +23,7 @@ from ..models.own import DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENC
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import TimeBlocks
 from ..numerics.frames import Array
-from ..numerics.kalman import GaussianState
+from ..numerics.kalman import GaussianState, covariance_of
 from ..numerics.samples import Index
 from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
@@ -532,8 +532,7 @@ class JointFit:
                 vector[:, :, at] += each.gram[:, :N_STATE, N_STATE]
                 square += each.gram[:, N_STATE, N_STATE]
                 log_det += each.log_determinant
-        covariance = np.linalg.inv(information)
-        covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
+        covariance = covariance_of(information, known.information)
         x = (covariance @ vector[..., None])[..., 0]
         left = square - (x * vector).sum(axis=-1)
         odds = known.log_odds[:, None] + self._log_prior[points]

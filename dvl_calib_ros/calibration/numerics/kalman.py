@@ -45,6 +45,25 @@ class GaussianState(NamedTuple):
         return GaussianState(self.x, self.p * (factor[:, None] * factor))
 
 
+def covariance_of(information: Array, prior: Array) -> Array:
+    """Return the covariances (..., n, n) of information (..., n, n) that holds a prior's, as positive as the prior's.
+
+    Information of very different size, as of rates beyond any vehicle's, cancels in the inverse. Its eigenvalues, in
+    units of the prior's diagonal, are then raised to the prior's smallest.
+    """
+    try:
+        found: Array = np.linalg.inv(information)
+    except np.linalg.LinAlgError:
+        found = np.zeros_like(information)
+    if not (np.diagonal(found, axis1=-2, axis2=-1) > 0.0).all():
+        unit = np.sqrt(np.diagonal(prior, axis1=-2, axis2=-1))
+        both = unit[..., None] * unit[..., None, :]
+        least = np.maximum(np.linalg.eigvalsh(prior / both)[..., :1], np.finfo(float).eps)
+        values, vectors = np.linalg.eigh(information / both)
+        found = (vectors / np.maximum(values, least)[..., None, :]) @ vectors.swapaxes(-1, -2) / both
+    return np.asarray(0.5 * (found + found.swapaxes(-1, -2)))
+
+
 @dataclass(frozen=True)
 class Measurements:
     """N measurements of m rows for each of K models with n states.

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dvl_calib_ros.calibration.numerics import kalman
-from dvl_calib_ros.calibration.numerics.kalman import Measurements
+from dvl_calib_ros.calibration.numerics.kalman import Measurements, covariance_of
 
 
 def least_squares(x, p, data, k):
@@ -138,3 +138,12 @@ def test_a_sample_that_must_not_be_used_changes_nothing_at_all(rng):
     np.testing.assert_array_equal(after.x, x)
     np.testing.assert_array_equal(after.p, p)
     assert not after.used.any()
+
+
+def test_information_of_very_different_size_leaves_positive_variances():
+    """A rate of 1e9 rad/s made the variance of the lever arm negative, and the next step a square root of it."""
+    row, prior = np.array([1e9, 2e9, -3e9]), np.diag([0.25, 0.25, 0.25])
+    information = prior + np.outer(row, row)
+    found = covariance_of(information, prior)
+    assert (np.diag(found) > 0.0).all() and (np.diag(found) < 4.0).all()
+    np.testing.assert_allclose(covariance_of(prior, prior), 4.0 * np.eye(3))
