@@ -401,7 +401,7 @@ FINDINGS = (
     warning(
         "ONE_HEADING",
         "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
-        "{degrees:.1f}° or {percent:.1f} %; σ includes the reference's error",
+        "{degrees:.1f}° or {percent:.1f} %; σ includes the reference's constant error",
         remedy=(
             "drive the opposite heading as well, at two speeds; or set reference_offset_std to the reference's "
             "accuracy (σ includes four times that)"
