@@ -158,7 +158,7 @@ class ReferenceLag(EffectWithMemory):
         return _in_body(motion, _decaying_part(motion.time, _in_reference_frame(motion, velocity), constant))
 
     def follows(self, motion: EffectInput, velocity: Array, values: Mapping[str, float]) -> Array:
-        """Compute the same with a single rotation to and fro."""
+        """Return `EffectWithMemory.follows`, with one rotation to the reference's frame and back for speed."""
         reference, constant = _in_reference_frame(motion, velocity), values["time_constant_s"]
         if constant <= 0.0:
             return velocity

@@ -65,7 +65,7 @@ def may_be_mapped(msgtype: str) -> bool:
 
 
 def forget_mapped(text: str) -> None:
-    """Remove the types registered by another map than this, '' for none."""
+    """Remove types registered by another map. text: `dvl_fields` of the map to keep, '' to remove all."""
     for name in [name for name, known in _MAPPED.items() if known != text]:
         forget(name)
         del _MAPPED[name]

@@ -167,12 +167,12 @@ def add_waves(motion: Motion, waves: Waves, rng: np.random.Generator) -> Motion:
     orbital = np.zeros_like(velocity_enu)
     slope = np.zeros((len(east), 2))
     for amplitude, omega, direction, phase in _components(waves, rng):
-        number = omega**2 / GRAVITY
+        wavenumber = omega**2 / GRAVITY
         toward = np.array([np.cos(direction), np.sin(direction)])
-        theta = number * (east * toward[0] + north * toward[1]) - omega * motion.time + phase
+        theta = wavenumber * (east * toward[0] + north * toward[1]) - omega * motion.time + phase
         orbital[:, :2] += amplitude * omega * np.cos(theta)[:, None] * toward
         orbital[:, 2] += amplitude * omega * np.sin(theta)
-        slope -= amplitude * number * np.sin(theta)[:, None] * toward
+        slope -= amplitude * wavenumber * np.sin(theta)[:, None] * toward
     return _tilted(motion, orbital, slope)
 
 

@@ -156,7 +156,7 @@ def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
     def of(log: Log) -> Array:
         return np.concatenate([_blocks(_usual(f.steps), lambda b: np.std(b, axis=1)) for f in log.facts])
 
-    return _times("jitter", of(vehicle), of(simulator), JITTER_S)
+    return _compare_times("jitter", of(vehicle), of(simulator), JITTER_S)
 
 
 def _usual(steps: Array) -> Array:
@@ -169,7 +169,7 @@ def _latency(vehicle: Log, simulator: Log) -> Candidate | None:
     def of(log: Log) -> Array:
         return np.concatenate([_blocks(f.latency, lambda b: np.median(b, axis=1)) for f in log.facts])
 
-    return _times("latency", of(vehicle), of(simulator), LATENCY_S)
+    return _compare_times("latency", of(vehicle), of(simulator), LATENCY_S)
 
 
 def _blocks(values: Array, of: Callable[[Array], Array]) -> Array:
@@ -177,12 +177,19 @@ def _blocks(values: Array, of: Callable[[Array], Array]) -> Array:
     return of(blocks) if len(blocks) else np.zeros(0)
 
 
-def _times(name: str, vehicle: Array, simulator: Array, worth: float) -> Candidate | None:
+def _compare_times(name: str, vehicle: Array, simulator: Array, threshold_s: float) -> Candidate | None:
+    """Compare the means of block values (B,) s of both sides; differences below a threshold do not matter."""
     if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
         return None
     shown: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
-    is_present = tuple(abs(float(each.mean())) > worth for each in (vehicle, simulator))
+    is_present = tuple(abs(float(each.mean())) > threshold_s for each in (vehicle, simulator))
     gap = abs(float(vehicle.mean() - simulator.mean()))
     return Candidate(
-        name, "s", shown[0], shown[1], welch(vehicle, simulator), (is_present[0], is_present[1]), matters=gap > worth
+        name,
+        "s",
+        shown[0],
+        shown[1],
+        welch(vehicle, simulator),
+        (is_present[0], is_present[1]),
+        matters=gap > threshold_s,
     )

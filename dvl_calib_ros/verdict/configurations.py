@@ -37,7 +37,9 @@ CONFIGURATIONS = on_page(
     reject(
         "DVL_LEFT_HANDED",
         "the DVL's axes look left-handed: {axis} points the other way{alike}",
-        remedy=("negate {axis} in the DVL's driver; of z, check the sign of the reference's vertical velocity as well"),
+        remedy=(
+            "negate {axis} in the DVL's driver; for z, check the sign of the reference's vertical velocity as well"
+        ),
     ),
     reject(
         "DVL_SIDE_INVERTED",

@@ -75,7 +75,7 @@ FINDINGS = (
     ),
     warning(
         "STAMPS_FAR",
-        "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, absurdly far from the others",
+        "{topic}: {count} of {total} messages are set aside: {how} {when} UTC, too far from the others",
         means="A computer without a clock battery.",
         remedy=(
             "set clocks before recording (a clock battery, NTP, PTP or GNSS); to use those messages, cut the recording"
@@ -84,7 +84,7 @@ FINDINGS = (
     warning(
         "STAMP_STRAY",
         "{count} {stream} samples have stamps more than max_time_jump from their neighbours'; they are not used",
-        means="Single stamps are wrong. A jump that the next sample confirms is followed.",
+        means="Single stamps are wrong. A jump is accepted if the next sample confirms it.",
         remedy="check the clock of the driver",
     ),
     warning(
@@ -330,7 +330,7 @@ FINDINGS = (
     warning(
         "ONE_SPEED",
         "at about one speed a constant error of the DVL looks like yaw, pitch or scale: {off:g} m/s would be "
-        "{degrees:.1f}° or {percent:.1f} %; σ includes what dvl_bias_std says of it",
+        "{degrees:.1f}° or {percent:.1f} %; σ includes an error of dvl_bias_std",
         remedy="drive at two speeds, one twice the other; set dvl_bias_std, if you know the DVL's",
     ),
     warning(
@@ -401,7 +401,7 @@ FINDINGS = (
     warning(
         "ONE_HEADING",
         "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
-        "{degrees:.1f}° or {percent:.1f} %; σ includes that of the reference",
+        "{degrees:.1f}° or {percent:.1f} %; σ includes the reference's constant error",
         remedy=(
             "drive the opposite heading as well, at two speeds; or set reference_offset_std to the reference's "
             "accuracy (σ includes four times that)"
@@ -426,7 +426,7 @@ FINDINGS = (
     warning(
         "RESULT_WORSE",
         "{path} is kept, which is better ({before}); the newer result ({now}) is {beside}",
-        remedy="to use the newer all the same, rename it, or call ~/save_anyway",
+        remedy="to use the newer result anyway, rename its file, or call ~/save_anyway",
     ),
     warning(
         "RESULT_NOT_SAVED",

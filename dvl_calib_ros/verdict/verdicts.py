@@ -52,7 +52,7 @@ VERDICTS = on_page(
     ),
     accept(
         "MOUNTING_FAR",
-        "inspect the mounting: it is {degrees:.1f}° from mounting_rpy, which is much (from {limit:.1f}° on)",
+        "inspect the mounting: it is {degrees:.1f}° from mounting_rpy, more than {limit:.1f}°",
         means="The calibration may be good and the bracket bent (`accept_misalignment`).",
     ),
     marginal(
@@ -145,7 +145,7 @@ MANOEUVRES = on_page(
     accept("NEXT_DIVE", "dive and rise by 10° of pitch", means="Pitching shows the vertical axis."),
     accept("NEXT_WAIT", "keep on: nothing is learnt yet"),
     accept("NEXT_REJECTED", "nothing: the findings say why this calibration is not to be used"),
-    accept("NEXT_STANDS", "keep on: the goal is reached, if it stays so"),
+    accept("NEXT_STANDS", "keep on until the drift has stayed on target"),
     accept("NEXT_IS_GOOD", "good enough: save"),
     accept("NEXT_IS_GOOD_BUT_SCALE", "as good as it gets without a reference: save; the scale stays unknown"),
     accept(
@@ -360,7 +360,7 @@ UNPAIRED = on_page(
     ),
     marginal(
         "SIMULATOR_NOTHING_COMPARED",
-        "nothing can be compared: of the {side}, {why}",
+        "nothing can be compared ({side}: {why})",
         means="That side's recordings cannot be diagnosed.",
     ),
 )

@@ -518,7 +518,8 @@ def _unpack_chunk(file: BinaryIO, at: int, start: int, head: ChunkHead, packed_s
         damage = f"the checksum of the chunk at byte {at} does not match"
     elif len(records) != head.unpacked_size:
         damage = f"the chunk at byte {at} is damaged"
-    return Chunk(records, damage, is_cut or not head.checksum or not damage, end)
+    is_believed = is_cut or not head.checksum or not damage
+    return Chunk(records, damage, is_believed, end)
 
 
 def _unpack_zstd(packed: bytes, size: int) -> bytes:

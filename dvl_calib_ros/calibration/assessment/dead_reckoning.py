@@ -287,9 +287,10 @@ def drift_over(astray: Array, along: Array, ends: Index) -> Drift:
 
 
 def _noise(errors: Array, step_s: Array, along: Array, ends: Index, slow: SlowNoise | None) -> float:
-    """Return the drift that white noise of these errors (K, 2) and slow noise cause, m per km, rms over stretches.
+    """Return the drift by white and slow noise, m per km, rms over stretches.
 
-    Differences of neighbours give the white noise.
+    errors: (K, 2) m/s; differences of neighbours give the white noise. step_s: (K,) s. along: (K,) m driven.
+    ends: (S + 1,) indices of the ends of stretches.
     """
     if len(errors) < 3:
         return 0.0

@@ -63,17 +63,20 @@ def is_good_enough(model: Model) -> Reason:
 
 
 def noise_of_a_second(estimate: Estimate, parameters: Parameters, seconds: float, mean_square_speed: float) -> float:
-    """Return `RecentMotion.noise` from the filter's information after a time (s) at a mean square speed.
+    """Return `RecentMotion.noise` from the filter's information on yaw, or `gnss_aided_std` squared without any.
 
-    The information on yaw is the sum of squared speeds over the noise.
+    The information on yaw is the sum of squared speeds over the noise. seconds: duration of the data.
+    mean_square_speed: (m/s)².
     """
     model = MODELS[estimate.model]
     t = parameters.rotation_dvl_from_body
     about_z = np.concatenate([t[:, 2], np.zeros(model.n_state - 3)])
     information = about_z @ np.linalg.pinv(estimate.filter_covariance) @ about_z
-    shown = information - parameters.initial_std_misalignment**-2
-    usual: float = parameters.gnss_aided_std**2
-    return seconds * mean_square_speed / shown if model.aided and shown > 0.0 and seconds > 0.0 else usual
+    from_data = information - parameters.initial_std_misalignment**-2
+    if model.aided and from_data > 0.0 and seconds > 0.0:
+        return seconds * mean_square_speed / from_data
+    configured: float = parameters.gnss_aided_std**2
+    return configured
 
 
 def outlook(estimate: Estimate, parameters: Parameters, motion: RecentMotion, before: Reason | None = None) -> Outlook:

@@ -122,7 +122,10 @@ class FoldInformation:
         return GaussianState(p @ vector, p)
 
     def end_day(self, start: GaussianState, of_day: NDArray[np.intp]) -> None:
-        """Restart for a new recording; states that differ per recording (u,) from `start`, x (K, n), P (K, n, n)."""
+        """Keep the information on the vehicle for the next recording, and reset what differs per recording.
+
+        start: x (K, n), P (K, n, n), prior of the reset states. of_day: (u,) indices of these states.
+        """
         known = []
         for fold in range(FOLDS):
             states = zip(*(self.state(fold, index) for index in range(len(start.x))), strict=True)

@@ -73,7 +73,7 @@ def observability(
 ) -> tuple[Observability, ...]:
     """Return one entry per DVL error of a model, lever arm and delay, from its covariance (n, n).
 
-    tilt_needs: requirement of roll and pitch other than motion.
+    tilt_needs: Entry of `missing` for roll and pitch, if they need something other than motion; '' otherwise.
 
     The missing motion is found in the body frame: with a DVL at 45 degrees, φx and φy both stay uncertain after a
     straight leg, because roll is not observable.

@@ -254,11 +254,11 @@ class MotionFit:
         kept = [*range(N)[TURN], *range(N)[ARM], APART]
         h = np.concatenate([own, rows.jacobian[:, :, kept]], axis=2).reshape(-1, 3 + len(kept))
         w = np.repeat(weight, axes) / fitted.level**2
-        away = fitted.x.copy()
-        away[TURN], away[APART] = turn_between(nominal, rotation), 0.0
+        from_prior = fitted.x.copy()
+        from_prior[TURN], from_prior[APART] = turn_between(nominal, rotation), 0.0
         prior = np.concatenate([np.full(3, WIDEST_FACTOR**-2.0), LIKELY[kept] ** -2.0])
         information = (h * w[:, None]).T @ h + np.diag(prior)
-        vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), away[kept]])
+        vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), from_prior[kept]])
         found = np.linalg.solve(information, vector)
         left = rows.residual.ravel() + h @ found
         # residuals that the factors explain are no noise
@@ -310,7 +310,7 @@ class MotionFit:
         return shared
 
     def _best_rotation(self, reference: float, apart: float) -> Array | None:
-        """Return the best rotation C (3, 3) without lever arm, by singular values."""
+        """Return the least-squares rotation C (3, 3) at delays ρ and δ (s), without lever arm."""
         streams = self._streams(reference, apart)
         if streams is None:
             return None
@@ -344,7 +344,11 @@ class MotionFit:
     def _solved(
         self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]
     ) -> tuple[Array, Array, float, Array]:
-        """Return step (9,), information (9, 9), noise level (m/s) and robust weight of each row (J,)."""
+        """Solve one Gauss-Newton step with priors, robust weights and the constraints of synchronised clocks.
+
+        Returns step (9,), information (9, 9), noise level (m/s) and robust weight of each row (J,). in_time: rows of
+        synchronised clocks, see `__call__`.
+        """
         axes = rows.residual.shape[1]
         squares = squared(rows.residual)
         level2 = max(float(median(squares)) / _MEDIAN_CHI2[axes - 1], 1e-8)
@@ -354,13 +358,13 @@ class MotionFit:
         prior = LIKELY**-2.0
         weighted = (h * w[:, None]).T
         information = weighted @ h + np.diag(prior)
-        # limit: the subtracted noise must not exceed the marginal information on δ
-        told = 1.0 / float(np.linalg.inv(information)[APART, APART])
-        information[APART, APART] -= min(float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * told)
-        away = x.copy()
-        away[TURN] = turn_between(nominal, rotation)
-        away[[APART, LATE]] = 0.0
-        vector = -weighted @ rows.residual.ravel() - prior * away
+        # DVL noise in the slope counts as information on δ: subtract it, but less than the marginal information on δ
+        marginal = 1.0 / float(np.linalg.inv(information)[APART, APART])
+        information[APART, APART] -= min(float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * marginal)
+        from_prior = x.copy()
+        from_prior[TURN] = turn_between(nominal, rotation)
+        from_prior[[APART, LATE]] = 0.0
+        vector = -weighted @ rows.residual.ravel() - prior * from_prior
         for row in in_time:
             information += HELD_STD_S**-2.0 * np.outer(row, row)
             vector -= HELD_STD_S**-2.0 * row * float(row @ x)

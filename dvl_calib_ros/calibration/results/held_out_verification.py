@@ -56,7 +56,7 @@ def verify(
     finds_lever_arm: bool = False,
     typical_error: float | None = None,
     own_error: float = 0.0,
-    drift_open: float = 0.0,
+    remaining_drift: float = 0.0,
 ) -> Verification:
     """Judge an estimate of all data by its size, its used samples, and its held-out error.
 
@@ -74,7 +74,7 @@ def verify(
     finds_lever_arm: True if the σ of the angles include the lever arm.
     typical_error: Velocity error without outliers, m/s rms, if the held-out one is large.
     own_error: Velocity error predicted by σ of time blocks, m/s rms (`calibration_error`).
-    drift_open: Drift that the calibration leaves open, m per km (`drift_left_open`).
+    remaining_drift: Drift predicted from σ of the estimate, m per km (`drift_left_open`).
     """
     reasons = by_severity(
         [
@@ -83,7 +83,7 @@ def verify(
             *use_findings(used_and_gated),
             *_lever_arm_findings(lever_arm_turns, finds_lever_arm, parameters),
             *_size_findings(model, state, parameters),
-            *_drift_findings(convergence, drift_open, parameters),
+            *_drift_findings(convergence, remaining_drift, parameters),
             _error_finding(held_out, parameters, reference_claims, typical_error, own_error),
         ]
     )
@@ -189,11 +189,12 @@ def _error_finding(
     return finding("HELD_OUT", **said)
 
 
-def _drift_findings(convergence: Convergence, drift_open: float, parameters: Parameters) -> list[Reason]:
+def _drift_findings(convergence: Convergence, remaining_drift: float, parameters: Parameters) -> list[Reason]:
+    """Return a finding if no angle is observable, or σ still allows a drift well above the target."""
     if convergence is Convergence.COLLECTING:
         return [finding("NO_ANGLE_SHOWN")]
     limit = ACCEPTED_DRIFT * parameters.target_drift
-    return [] if drift_open <= limit else [finding("DRIFT_OPEN", open=drift_open, limit=limit)]
+    return [] if remaining_drift <= limit else [finding("DRIFT_OPEN", open=remaining_drift, limit=limit)]
 
 
 def verification_document(verification: Verification) -> dict[str, Any]:

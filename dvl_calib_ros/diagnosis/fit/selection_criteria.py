@@ -119,8 +119,8 @@ def robust_p(fit: Fit, effect: Effect, covariance: Array, blocks: int) -> float:
 def robust_covariance(problem: Problem, fit: Fit) -> tuple[Array, int]:
     """Return the covariance (6 + p, 6 + p) from blocks, inflated to the scatter by slow noise, and their number.
 
-    The fit's own noise is bounded in memory, so that no effect is taken for it, and blocks are shorter than multipath.
-    The memory is uncertain as well: it is drawn from its posterior.
+    The fit's own noise has a bounded correlation time, so that it absorbs no effect. Blocks are shorter than multipath.
+    The uncertain correlation time is sampled from its posterior.
     """
     block = blocks_of(problem)
     covariance, known, rng = fit.covariance(block), NuisanceFit.of_fit(problem, fit), np.random.default_rng(0)

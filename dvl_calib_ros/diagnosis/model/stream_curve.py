@@ -32,7 +32,7 @@ FAST_ENOUGH_S, SMOOTH_SAMPLES = 0.45, 5
 # neighbours' differences has a relative σ of 1.6 / √n
 SURELY_HEAVY = 3.0 * 1.6
 # Largest product of the intervals to both neighbours, in usual intervals; at the middle of two samples it is 0.25
-TOLD = 0.4
+MAX_NEIGHBOUR_PRODUCT = 0.4
 
 
 class Remembered:
@@ -197,14 +197,14 @@ class Curve:
         inside = (at >= self.time[0]) & (at <= self.time[-1])
         return inside & (apart <= SETTINGS.max_gap_intervals * self.interval)
 
-    def tells(self, at: Array) -> NDArray[np.bool_]:
+    def is_complete_at(self, at: Array) -> NDArray[np.bool_]:
         """Return (M,) whether the stream `covers` a time and, if slow, lost no sample there."""
         known = self.covers(at)
         if self.interval <= FAST_ENOUGH_S:
             return known
         after = np.clip(np.searchsorted(self.time, at), 1, len(self.time) - 1)
         apart = (at - self.time[after - 1]) * (self.time[after] - at)
-        return known & (apart <= TOLD * self.interval**2)
+        return known & (apart <= MAX_NEIGHBOUR_PRODUCT * self.interval**2)
 
     def averaged(self, rate_hz: float) -> Curve:
         """Average groups of samples to at most a given rate."""

@@ -104,10 +104,10 @@ def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
     per_bin = max(2, round(width / base.interval))
     streams = (recording.dvl, offsets.dvl), (recording.reference, offsets.reference)
     others = [(curve, own_late) for curve, own_late in streams if curve is not base]
-    told = np.ones(len(base.time), dtype=bool)
+    complete = np.ones(len(base.time), dtype=bool)
     for curve, own_late in (*others, *((each, 0.0) for each in (recording.attitude, recording.rates) if each)):
-        told &= curve.tells(base.time - base_late + own_late)
-    stamps = base.time[told]
+        complete &= curve.is_complete_at(base.time - base_late + own_late)
+    stamps = base.time[complete]
     true = stamps - base_late
     known = np.ones(len(true), dtype=bool)
     for curve, own_late in others:

@@ -57,14 +57,14 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class StraightLines:
+class LinearisedModel:
     """Linearised model of all variants in one Gram matrix. blocks: columns of each variant."""
 
     variants: list[Variant]
     blocks: list[NDArray[np.intp]]
     system: WhitenedLeastSquares
 
-    def drop(self, chosen: Sequence[int]) -> float:
+    def misfit(self, chosen: Sequence[int]) -> float:
         """Return the misfit of a combination."""
         part = self.system.part(np.concatenate([np.arange(6), *(self.blocks[index] for index in chosen)]))
         return part.misfit(part.solution())
@@ -72,12 +72,12 @@ class StraightLines:
 
 def proposed(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     """Return hypotheses to fit, by the linearised model about a fit; the fit's own is among them."""
-    table, worth = _worth(fitter, fit, effects)
+    table, to_fit = _combinations(fitter, fit, effects)
     own = tuple(range(len(fit.effects)))
     return [
-        *(combined(fitter, fit, table, chosen) for chosen in (worth if own in worth else [*worth, own])),
+        *(combined(fitter, fit, table, chosen) for chosen in (to_fit if own in to_fit else [*to_fit, own])),
         *by_other_clocks(fitter, fit, effects),
-        *_told_by_a_lag(fit, effects),
+        *_with_lag_or_delay(fit, effects),
     ]
 
 
@@ -90,20 +90,22 @@ def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]
     if not fit.noise.is_coloured:
         return []
     fit = replace(fit, noise=fit.noise.white)
-    table, worth = _worth(fitter, fit, effects)
+    table, to_fit = _combinations(fitter, fit, effects)
     own = len(fit.effects)
-    most = MOST_OF_NOISE * table.drop(range(own))
+    most = MOST_OF_NOISE * table.misfit(range(own))
     come = [
         chosen
-        for chosen in worth
-        if any(i >= own and table.variants[i].comes_and_goes for i in chosen) and table.drop(chosen) < most
+        for chosen in to_fit
+        if any(i >= own and table.variants[i].comes_and_goes for i in chosen) and table.misfit(chosen) < most
     ]
     return [combined(fitter, fit, table, chosen) for chosen in come[:KEPT_VARIANTS]]
 
 
-def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[StraightLines, list[tuple[int, ...]]]:
-    """Return the linearised model about a fit, and the combinations to fit, best first."""
-    table = straight_lines(fitter, fit, effects)
+def _combinations(
+    fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]
+) -> tuple[LinearisedModel, list[tuple[int, ...]]]:
+    """Return the linearised model about a fit, and its combinations of effects to fit, best first."""
+    table = linearised(fitter, fit, effects)
     n = len(fitter.problem.recordings)
     cost = [price(v.effect, len(effects), n, v.tried) for v in table.variants]
     own = list(range(len(fit.effects)))
@@ -113,23 +115,23 @@ def _worth(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Str
         for chosen in itertools.combinations(usable, size):
             names = {table.variants[index].effect.name for index in chosen}
             if len(names) == size:
-                scored.append((table.drop(chosen) + sum(cost[index] for index in chosen), chosen))
+                scored.append((table.misfit(chosen) + sum(cost[index] for index in chosen), chosen))
     scored.sort()
-    for _, chosen in scored[:3]:  # one more on top of the best
+    for _, chosen in scored[:3]:  # add one more effect to the best combinations
         names = {table.variants[index].effect.name for index in chosen}
         scored += [
-            (table.drop((*chosen, index)) + sum(cost[i] for i in (*chosen, index)), (*chosen, index))
+            (table.misfit((*chosen, index)) + sum(cost[i] for i in (*chosen, index)), (*chosen, index))
             for index in usable
             if table.variants[index].effect.name not in names and len(chosen) < SETTINGS.max_effects
         ]
     scored.sort()
-    scored = [each for each in scored if _is_told_by_two_clocks(table, each[1])]
-    worth = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + SETTINGS.conclusive))[
+    scored = [each for each in scored if _has_no_redundant_clock(table, each[1])]
+    to_fit = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + SETTINGS.conclusive))[
         :FITTED
     ]
-    if not any(_is_possible(table, chosen) for chosen in worth):  # outside the linear range
-        worth += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
-    return table, worth
+    if not any(_is_possible(table, chosen) for chosen in to_fit):  # outside the linear range
+        to_fit += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
+    return table, to_fit
 
 
 def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Variant]:
@@ -150,7 +152,7 @@ def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> l
     return found
 
 
-def straight_lines(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> StraightLines:
+def linearised(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> LinearisedModel:
     """Linearise the effects of a fit, in its order, and then every other effect at every window."""
     problem, noise, hypothesis = fitter.problem, fit.noise, fit.hypothesis
     own: list[Variant] = []
@@ -172,7 +174,7 @@ def straight_lines(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> S
     n = len(problem.recordings)
     std = np.concatenate([prior_std(no_effect()), *(_std(variant.effect, variant.p, n) for variant in variants)])
     system = WhitenedLeastSquares(_gram(problem, noise, columns, target), std, np.zeros_like(std))
-    return StraightLines(variants, blocks, system)
+    return LinearisedModel(variants, blocks, system)
 
 
 def _gram(problem: Problem, noise: Noise, columns: Array, target: Array) -> Array:
@@ -195,19 +197,19 @@ def _std(effect: Effect, p: int, n_recordings: int) -> Array:
     return np.array(sizes * (p // len(sizes)))
 
 
-def _shortlisted(table: StraightLines, own: Sequence[int], cost: Sequence[float]) -> list[int]:
+def _shortlisted(table: LinearisedModel, own: Sequence[int], cost: Sequence[float]) -> list[int]:
     """Return all variants of the fit and the most promising others, alone or in addition."""
-    alone, none = table.drop(own), table.drop([])
+    alone, none = table.misfit(own), table.misfit([])
     gains: dict[int, float] = {}
     adds: dict[int, float] = {}
     for index in range(len(table.variants)):
         if index in own:
             continue
-        by_itself = none - table.drop([index]) - cost[index]
-        adds[index] = alone - table.drop([*own, index]) - cost[index]
+        by_itself = none - table.misfit([index]) - cost[index]
+        adds[index] = alone - table.misfit([*own, index]) - cost[index]
         instead = max(
-            (table.drop([i for i in own if i != out]) - table.drop([*(i for i in own if i != out), index]) - cost[index]
-             for out in own),
+            (table.misfit(rest) - table.misfit([*rest, index]) - cost[index]
+             for rest in ([i for i in own if i != out] for out in own)),
             default=-np.inf,
         )  # fmt: skip
         # strong effects resemble whatever explains much by itself: the gain in addition counts more
@@ -224,7 +226,7 @@ def _shortlisted(table: StraightLines, own: Sequence[int], cost: Sequence[float]
     return [*own, *kept]
 
 
-def combined(fitter: Fitter, fit: Fit, table: StraightLines, chosen: Sequence[int]) -> Hypothesis:
+def combined(fitter: Fitter, fit: Fit, table: LinearisedModel, chosen: Sequence[int]) -> Hypothesis:
     """Return the hypothesis of a combination. The fit's effects start at its values, others at the linear solution."""
     part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
     solution = part.solution()[6:]
@@ -245,7 +247,7 @@ def combined(fitter: Fitter, fit: Fit, table: StraightLines, chosen: Sequence[in
     return fit.hypothesis.with_effects(effects, n, start)
 
 
-def _is_possible(table: StraightLines, chosen: Sequence[int]) -> bool:
+def _is_possible(table: LinearisedModel, chosen: Sequence[int]) -> bool:
     """Return whether the linear solution of a combination is within the bounds of each parameter."""
     part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
     variants = [table.variants[index] for index in chosen]
@@ -257,7 +259,7 @@ def _is_possible(table: StraightLines, chosen: Sequence[int]) -> bool:
     return all(spec.low < x < spec.high for spec, x in zip(specs, part.solution()[6:].tolist(), strict=True))
 
 
-def _is_told_by_two_clocks(table: StraightLines, chosen: Sequence[int]) -> bool:
+def _has_no_redundant_clock(table: LinearisedModel, chosen: Sequence[int]) -> bool:
     """Return whether a combination has no redundant pair of clocks: DVL and reference represent any pair."""
     names = {table.variants[index].effect.name for index in chosen}
     return ATTITUDE_CLOCK not in names or len(names & set(CLOCKS)) == 1
@@ -306,7 +308,7 @@ def _at_other_times(fit: Fit, effects: Sequence[Effect], later: Array) -> dict[s
     return found
 
 
-def _told_by_a_lag(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+def _with_lag_or_delay(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     """Return the fit with a lag of the reference for its delay, or a delay for its lag."""
     rest = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
     return [

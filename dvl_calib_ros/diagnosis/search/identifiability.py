@@ -37,7 +37,7 @@ from .arm_clock_ambiguity import (
     with_arm,
     with_clocks,
 )
-from .candidates import combined, straight_lines
+from .candidates import combined, linearised
 from .initial_guess import FirstGuess
 
 
@@ -103,12 +103,12 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     rest = fit_without(fitter, fit, effect)
     log_p = log_p_in_place(fitter, fit, rest, effect)
     drop = rest.deviance - fit.deviance
-    table = straight_lines(fitter, rest, effects)
+    table = linearised(fitter, rest, effects)
     n = len(fit.seen)
     own = list(range(len(rest.effects)))
     found: list[tuple[float, str, Hypothesis]] = []
     best_by_name: dict[str, int] = {}
-    drops = {i: table.drop(own) - table.drop([*own, i]) for i in range(len(own), len(table.variants))}
+    drops = {i: table.misfit(own) - table.misfit([*own, i]) for i in range(len(own), len(table.variants))}
     for index in sorted(drops, key=lambda i: -drops[i]):
         best_by_name.setdefault(table.variants[index].effect.name, index)
     straight = drops.get(best_by_name.get(effect.name, -1), drop)

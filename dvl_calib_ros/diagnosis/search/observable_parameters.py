@@ -24,11 +24,11 @@ ARM_FROM_M = 0.6
 
 
 def observable_parts(effects: Mapping[str, Effect], problem: Problem) -> dict[str, Effect]:
-    """Return effects without parameters unobservable by a reference that does not measure the vertical."""
+    """Return effects reduced to their observable parameters: all, unless the reference is horizontal only."""
     if problem.measured[2]:
         return dict(effects)
     seen = problem.all_seen(no_effect())
-    return {name: _shown_part(each, problem, seen) for name, each in effects.items()}
+    return {name: _observable_part(each, problem, seen) for name, each in effects.items()}
 
 
 def unobservable_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect]) -> tuple[Effect, ...]:
@@ -37,7 +37,7 @@ def unobservable_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect
     return tuple(effect for effect in left_out if effect.parameters)
 
 
-def _shown_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:
+def _observable_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:
     specs = amplitudes(effect)
     columns = problem.columns(no_effect(), seen, effect, somewhere(effect, problem))
     squares = (columns**2).sum(axis=1).mean(axis=0)

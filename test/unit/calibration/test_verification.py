@@ -132,7 +132,7 @@ def judged(
 ):
     state = GaussianState(np.array([0.0, np.tan(np.deg2rad(degrees)), 0.0, scale]), std**2 * np.eye(4))
     p = Parameters(**parameters)
-    return verify(MODELS["M3"], state, convergence, held_out, p, own_error=own_error, drift_open=open)
+    return verify(MODELS["M3"], state, convergence, held_out, p, own_error=own_error, remaining_drift=open)
 
 
 def test_an_angle_or_a_scale_that_is_not_known_is_no_misalignment_and_no_scale_that_is_off():

@@ -229,15 +229,15 @@ def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best(seed):
 def test_where_all_that_is_proposed_is_beyond_its_bounds_what_is_within_them_is_tried_as_well(monkeypatch):
     """A shear of 17° and more was in every proposal, no fit of them went anywhere, and a current was not found."""
     fitter, fit, _ = fitted(scenario(effects=["velocity_bias:x_mps=0.1"]), {})
-    _, worth = candidates._worth(fitter, fit, EFFECTS)
+    _, worth = candidates._combinations(fitter, fit, EFFECTS)
     assert worth and () not in worth
     monkeypatch.setattr(candidates, "_is_possible", lambda table, chosen: chosen in ((), worth[-1]))
-    assert candidates._worth(fitter, fit, EFFECTS)[1] == worth
+    assert candidates._combinations(fitter, fit, EFFECTS)[1] == worth
     monkeypatch.setattr(candidates, "_is_possible", lambda table, chosen: chosen == ())
-    assert candidates._worth(fitter, fit, EFFECTS)[1] == [*worth, ()]
+    assert candidates._combinations(fitter, fit, EFFECTS)[1] == [*worth, ()]
 
 
-def test_straight_lines_are_possible_within_the_bounds_of_all_that_they_hold():
+def test_linear_solutions_are_possible_within_the_bounds_of_all_their_parameters():
     shear, clock = EFFECTS["axis_nonorthogonality"], EFFECTS["clock_drift"]
     (high, *_), (drift,) = ([spec.high for spec in each.parameters] for each in (shear, clock))
     variants = [
@@ -251,7 +251,7 @@ def test_straight_lines_are_possible_within_the_bounds_of_all_that_they_hold():
         ([0.0, 0.0, 0.0, 1.1 * drift], False),
     ):
         part = Mock(solution=lambda values=values: np.array([9.0] * 6 + values))
-        table = candidates.StraightLines(variants, blocks, Mock(part=lambda index, part=part: part))
+        table = candidates.LinearisedModel(variants, blocks, Mock(part=lambda index, part=part: part))
         assert candidates._is_possible(table, (0, 1)) is is_possible
 
 

@@ -358,7 +358,7 @@ def test_what_lies_about_a_lost_sample_of_a_slow_stream_is_not_compared():
     assert all(np.abs(less - at).min() > 0.5 for at in time[lost])
     # of a fast stream its neighbours tell it
     fast = streams(seconds=120.0, dvl_rate=5.0, gnss_rate=5.0)
-    assert Curve(*fast["dvl"]).part(np.arange(len(fast["dvl"][0])) != 100).tells(fast["dvl"][0][5:-5]).all()
+    assert Curve(*fast["dvl"]).part(np.arange(len(fast["dvl"][0])) != 100).is_complete_at(fast["dvl"][0][5:-5]).all()
 
 
 def test_of_a_fit_that_is_far_off_nothing_is_taken_for_an_outlier(rng):
