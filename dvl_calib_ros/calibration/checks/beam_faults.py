@@ -21,8 +21,9 @@ from ..numerics.frames import Array
 
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
-# Significance, in σ, of eight tests of one recording, for false alarms of 0.3 %
-SAID = 3.4
+# Limits in σ from which an error of the DVL (a beam, a bias) is reported, and from which it rejects. They are beyond
+# those of eight tests of normal noise, because references at sea have errors that no model holds.
+NAMED_FROM, SURELY_WRONG = 3.7, 4.2
 # Error of the velocity ahead (share of the speed) from which a beam is reported, even if it is better by WITHIN σ: 10 m
 # per km, the limit of acceptance.
 SAID_FROM, WITHIN = 0.01, 2.0
@@ -86,11 +87,13 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     information, vector: (n, n), (n,) prior of the states.
     mean: (3,) m/s, mean velocity in the DVL.
     """
-    n = len(vector)
+    n, p = len(vector), np.linalg.inv(information)
+    start = p @ vector
+    p[BIAS, BIAS] += BIAS_STD**2 * np.eye(3)
     # without a vertical reference nothing else holds the scale of z
     prior = np.diag([*np.zeros(n), Z_SCALE_STD**-2.0, 0.0])
-    prior[:n, :n] = information
-    prior[BIAS, BIAS] = np.eye(3) * BIAS_STD**-2.0
+    prior[:n, :n] = np.linalg.inv(p)
+    vector = prior[:n, :n] @ start
     all_blocks, found = blocks.of(0), []
     for number in range(1, N_EFFECTS):
         at = np.append(np.arange(n + 1), n + number)
@@ -108,8 +111,9 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
 
 
 def beam_warning(found: BeamFault | None) -> list[Reason]:
-    """Return the reason against a calibration by a faulty beam, whose roll and yaw are wrong by several σ."""
-    if found is None or found.share < SAID * found.std or found.least < SAID_FROM:
+    """Return the reason against a calibration by a faulty beam; its roll and yaw are wrong by several σ."""
+    if found is None or found.share < NAMED_FROM * found.std or found.least < SAID_FROM:
         return []
+    word = Severity.REJECT if found.share > SURELY_WRONG * found.std else Severity.MARGINAL
     percent, std = 100.0 * found.share, 100.0 * found.std
-    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.REJECT)]
+    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(word)]

@@ -28,7 +28,7 @@ from ..numerics.frames import Array, cross, skew
 from ..numerics.robust import median, robust_std
 from ..numerics.samples import Index
 from ..results.results import ARM, OFFSETS, Estimate
-from .beam_faults import BeamFault, beam_warning
+from .beam_faults import NAMED_FROM, SURELY_WRONG, BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
 
 # Time constants, s, between which a change of tilt is the vehicle's; slower ones may be the IMU's error.
@@ -40,8 +40,8 @@ STRETCH_S, ENOUGH = 15.0, 12
 # Numbers of stretches combined for σ: slow errors of references and attitudes last a minute or two.
 QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # Limits in σ. Those of smoothing and bias are lower, because their σ includes the small number of turns, and all other
-# likely errors. A bias is reported from NAMED_FROM, and rejects from SURELY_BIASED.
-SURELY, SURELY_SMOOTHED, SURELY_BIASED, NAMED_FROM = 6.0, 5.0, 4.2, 3.7
+# likely errors.
+SURELY, SURELY_SMOOTHED = 6.0, 5.0
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
 # about the earth's vertical (rad), which differs from yaw when the vehicle tilts. BY_HEADING: heading errors with one
 # and two cycles of the heading, and with a drift over the recording (rad), similar to a bias but not to fast signals.
@@ -353,7 +353,7 @@ def residual_warnings(
             if shown[i]
         )
         turned = float(size[shown].max()) / found.speed
-        is_sure = size > SURELY_BIASED * found.bias_std
+        is_sure = size > SURELY_WRONG * found.bias_std
         is_wrong = size - found.bias_std > np.maximum(WRONG_FROM, WITHIN * np.asarray(along)) * found.speed
         word = Severity.REJECT if (shown & is_wrong).any() and (shown & is_sure).any() else Severity.MARGINAL
         said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))

@@ -41,8 +41,8 @@ def test_what_doctor_says_to_type_next_calibrates(tmp_path, capsys):
     bag = write(tmp_path / "bag", TWIST, HOUR_S)
     assert main(["doctor", str(bag)]) == 1
     said = capsys.readouterr().out
-    assert said.startswith("no: ") and f"next  dvl-calib replay {bag} --restamp dvl/twist --save" in said
-    assert main(["replay", str(bag), "--restamp", "dvl/twist"]) == 0
+    assert said.startswith("no: ") and f"next  dvl-calib replay {bag} --restamp log --save" in said
+    assert main(["replay", str(bag), "--restamp", "log"]) == 0
     assert not capsys.readouterr().out.startswith("reject")
 
 
