@@ -336,14 +336,14 @@ def residual_warnings(
             said.append(found_tilt.weighed(word))
         elif std > TILT_SHOWN and abs(float(found.lean[axis])) > WRONG_FROM:
             said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
-    if all(each.severity is Severity.WARNING for each in said):  # a wrong tilt looks like a beam
-        said += beam_warning(beam)
     # the heading at either end, relative to its mean
     off = 0.5 * abs(found.turned)
     if off > SAID_FROM and off > 0.5 * SURELY * found.turned_std:
         word = Severity.MARGINAL if off > max(WRONG_FROM, WITHIN * along[1]) else Severity.WARNING
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
         said.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(word))
+    if all(each.severity is Severity.WARNING for each in said):  # a wrong tilt or heading looks like a beam
+        said += beam_warning(beam)
     size = np.abs(found.bias)
     shown = (size > NAMED_FROM * found.bias_std) & (size > SAID_FROM * found.speed)
     if shown.any():
