@@ -83,7 +83,7 @@ def diagnose(
 
     recording, discovery = discovered_in(as_paths(bags), topics, params, parameters)
     diagnosis = run(recording, discovery.diagnosed.replace(min_speed=slow["min_speed"]), discovery.topics)
-    return diagnosis.led_by(lambda: rejection(recording, discovery))
+    return diagnosis.led_by(rejection(recording, discovery))
 
 
 def simulate(

@@ -76,6 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     recording = common.opened(arguments.bags, parameters)
     discovery = common.discovered(arguments, recording, parameters)
     parameters = discovery.diagnosed
+    rejected = rejection(recording, discovery)  # before the messages are forgotten
     with common.progress("diagnosing") as on_progress:
         diagnosis = diagnose(
             recording,
@@ -85,8 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
             with_series=arguments.report is not None,
             forget=True,
         )
-    # opened again, as its messages are forgotten
-    diagnosis = diagnosis.led_by(lambda: rejection(common.opened(arguments.bags, parameters), discovery))
+    diagnosis = diagnosis.led_by(rejected)
 
     written: list[str] = []
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
@@ -85,16 +85,15 @@ class Diagnosis(Answering):
     dvl: DvlSeen | None = None
     selection: EffectSelection | None = field(default=None, repr=False, compare=False)
 
-    def led_by(self, rejection: Callable[[], Reason | None]) -> Diagnosis:
+    def led_by(self, rejection: Reason | None) -> Diagnosis:
         """Return the diagnosis with the calibration's reason against the recording first.
 
         A named effect comes before it, unless that reason is in frames, clocks or mounting, which look like effects.
         """
-        first = rejection()
         is_named = self.verdict not in (DiagnosisVerdict.NO_GAP, DiagnosisVerdict.UNKNOWN)
-        if first is None or (is_named and not any(map(is_cause, first.causes))):
+        if rejection is None or (is_named and not any(map(is_cause, rejection.causes))):
             return self
-        return replace(self, reasons=(first, *self.reasons))
+        return replace(self, reasons=(rejection, *self.reasons))
 
     @property
     def sentence(self) -> str:
