@@ -21,8 +21,8 @@ from ..numerics.frames import Array
 
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
-# Limits in σ from which an error of the DVL (a beam, a bias) is reported, and from which it rejects. They are beyond
-# those of eight tests of normal noise, because references at sea have errors that no model holds.
+# Limits in σ from which an error of the DVL (a beam, a bias) is reported, and from which it rejects. Normal noise would
+# allow smaller ones, but references at sea have errors that no model holds.
 NAMED_FROM, SURELY_WRONG = 3.7, 4.2
 # Error of the velocity ahead (share of the speed) from which a beam is reported, even if it is better by WITHIN σ: 10 m
 # per km, the limit of acceptance.
@@ -61,8 +61,8 @@ def effect_velocities(v: Array) -> Array:
 class BeamFault(NamedTuple):
     """Most significant beam.
 
-    share, std: amount by which it reads low. azimuth_deg: in the DVL. off: error of the mean velocity by it, as a share
-    of the speed.
+    share, std: missing share of its velocity. azimuth_deg: in the DVL. off: resulting error of the mean velocity, as a
+    share of the speed.
     """
 
     share: float

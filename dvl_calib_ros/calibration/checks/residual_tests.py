@@ -39,8 +39,7 @@ BEND_S = 1.0
 STRETCH_S, ENOUGH = 15.0, 12
 # Numbers of stretches combined for σ: slow errors of references and attitudes last a minute or two.
 QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
-# Limits in σ. Those of smoothing and bias are lower, because their σ includes the small number of turns, and all other
-# likely errors.
+# Limits in σ. Smoothing has the lower one, because its σ includes the small number of turns and all likely errors.
 SURELY, SURELY_SMOOTHED = 6.0, 5.0
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
 # about the earth's vertical (rad), which differs from yaw when the vehicle tilts. BY_HEADING: heading errors with one

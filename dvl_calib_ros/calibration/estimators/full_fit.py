@@ -486,10 +486,12 @@ class JointFit:
         n = len(of_state[0]) + k
         blocks, velocity, effects = TimeBlocks(), [], np.arange(n - k, n)
         for number, day in enumerate(self._days):
+            if not np.isfinite(day.white).all():
+                continue
             x = self._x[self._of_day(number)]
             at = np.append(self._of_day(number), effects)
             for part in (part for block in day.blocks for part in self._parts(block, x)):
-                if part.rows is None or not np.isfinite(day.white).all():
+                if part.rows is None:
                     continue
                 gram = effects_gram(part, effect_velocities, x, day.single, day.white, self._slow.part(points))
                 information, vector = np.zeros((1, n, n)), np.zeros((1, n))
