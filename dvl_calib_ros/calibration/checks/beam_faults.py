@@ -34,12 +34,9 @@ Z_SCALE_STD, BIAS_STD = 1.0, 0.1
 def _beams() -> Array:
     """Return E (8, 3, 3) of each beam."""
     flat, down = math.sin(BEAM_ANGLE), math.cos(BEAM_ANGLE)
-    effects = []
-    for degrees in AZIMUTHS_DEG:
-        along = math.radians(degrees)
-        beam = np.array([flat * math.cos(along), flat * math.sin(along), -down])
-        effects.append(np.outer(beam / [2.0 * flat**2, 2.0 * flat**2, 4.0 * down**2], beam))
-    return np.array(effects)
+    along = np.radians(AZIMUTHS_DEG)
+    beams = np.column_stack([flat * np.cos(along), flat * np.sin(along), np.full(len(along), -down)])
+    return np.asarray((beams / [2.0 * flat**2, 2.0 * flat**2, 4.0 * down**2])[:, :, None] * beams[:, None])
 
 
 BEAMS: Array = _beams()
