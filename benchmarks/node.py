@@ -79,12 +79,12 @@ def measure_cpu() -> list[Measurement]:
 def measure_latency() -> list[Measurement]:
     """From a DVL message's publishing to the return of the estimate with its stamp, at 50 Hz with GNSS at 10 Hz.
 
-    The node runs F1, which has an estimate for every DVL message; those with GNSS wait for the next GNSS sample. In
+    The node runs M7, which has an estimate for every DVL message; those with GNSS wait for the next GNSS sample. In
     turns with the peer, and the best of each: a machine that does something else at times must not decide.
     """
     ours, peer = [], []
     for _ in range(ROUNDS):
-        ours.append(_latencies_s([*_NODE, "--ros-args", "-p", "model:=F1"], "dvl_calibration/estimate"))
+        ours.append(_latencies_s([*_NODE, "--ros-args", "-p", "model:=M7"], "dvl_calibration/estimate"))
         peer.append(_latencies_s([sys.executable, "-c", _REPUBLISHER], "republished"))
     return [
         Measurement(

@@ -98,7 +98,12 @@ def assert_counts_add_up(counts: dict[str, dict[str, int]], models: dict[str, di
     decided = dvl["accepted"] - dvl["awaiting_imu"] - pairing["awaiting_reference"]
     assert decided == pairing["paired"] + pairing["unpaired"]
     assert dvl["usable"] == sum(pairing[key] for key in ("oriented", "not_oriented", "awaiting_attitude"))
-    given = {Needs.NOTHING: dvl["usable"], Needs.ATTITUDE: pairing["oriented"], Needs.REFERENCE: pairing["paired"]}
+    given = {
+        Needs.NOTHING: dvl["usable"],
+        Needs.ATTITUDE: pairing["oriented"],
+        Needs.ATTITUDE_IF_KNOWN: pairing["oriented"] + pairing["not_oriented"],
+        Needs.REFERENCE: pairing["paired"],
+    }
     for name, model in ((name, MODELS[name]) for name in BY_VELOCITY):
         taken = models[name]["used"] + models[name]["gated"]
         if MODELS[name].estimator:  # takes references, also those of the last block that wait for their pair

@@ -1,4 +1,4 @@
-"""Bags of runs with positions whose noise lasts (validation/positions.py), for D1."""
+"""Bags of runs with positions whose noise lasts (validation/positions.py), for `positions`."""
 
 from __future__ import annotations
 

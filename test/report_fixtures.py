@@ -40,7 +40,7 @@ from dvl_calib_ros.present.page import write_replay_report
 from dvl_calib_ros.verdict.reasons import finding
 
 # One of each kind: most of a report's time goes into pictures of the models' estimates
-FEW = ("M3", "F1")
+FEW = ("M3", "unaided")
 # Of a plug-in: the installed library does not know it
 OWN_EFFECT = "own_<b>$effect$</b>"
 
@@ -137,7 +137,7 @@ def evaluation(**changes: Any) -> Evaluation:
         for name in models
     )  # fmt: skip
     methods = [(name, std) for std in (0.2, 0.02) for name in ("M3", "Kinsey-Whitcomb", "Troni-Whitcomb")]
-    methods += [(name, None) for name in ("A1", "F1", "M7")]
+    methods += [(name, None) for name in ("unaided", "M7")]
     curves = tuple(ConvergenceCurve(*method, np.full((len(TIMES_S), 3), 0.1)) for method in methods)
     values: dict[str, Any] = {
         "source": "folder <b>$x$</b>",

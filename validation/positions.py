@@ -144,7 +144,7 @@ def fitted(run: Driven, parameters: Parameters | None = None) -> DisplacementFit
     reckoning = DeadReckoning(parameters.rotation_dvl_from_body)
     reckoning.add_fixes(run.fixes)
     reckoning.add_rows(run.stamps_ns, run.velocity, run.quaternion)
-    return solve(reckoning.legs(), parameters, prior(MODELS["D1"], parameters))
+    return solve(reckoning.legs(), parameters, prior(MODELS["positions"], parameters))
 
 
 def errors_of(fit: DisplacementFit | None, truth: Truth) -> tuple[Array, Array]:

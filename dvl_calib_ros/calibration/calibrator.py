@@ -25,9 +25,8 @@ from .assessor import Assessor, Estimates, NonlinearEstimators
 from .estimators.estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
 from .filters.build_observations import Observer, RowsSeen, own_copy
 from .filters.filter_bank import Group, groups_of
-from .filters.heading_diversity import EVERY_NS, Headings
 from .filters.state_history import Counts, Numbers, StateTrace
-from .models import BROKEN, LINEAR_MODELS, MODELS, WITH_POSITIONS, Model, Needs
+from .models import BROKEN, LINEAR_MODELS, MODELS, POSITIONS, Model, Needs
 from .models.parameters import IAC, ParameterError, Parameters
 from .numerics.frames import Array, Vector
 from .numerics.kalman import GaussianState
@@ -61,6 +60,7 @@ SAMPLES_OF_A_BLOCK = 128
 _HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
     Needs.NOTHING: lambda block: block.usable,
     Needs.ATTITUDE: lambda block: block.oriented,
+    Needs.ATTITUDE_IF_KNOWN: lambda block: block.usable,
     Needs.REFERENCE: lambda block: block.paired,
 }
 # Imported here because no live message may wait for an import.
@@ -104,7 +104,7 @@ class Calibrator:
         self.parameters = parameters
         self._models = tuple(name for name in MODELS if name in models)
         # without positions the position model is not reported
-        unknown = () if are_positions(parameters) else (WITH_POSITIONS,)
+        unknown = () if are_positions(parameters) else (POSITIONS.name,)
         self._told = tuple(name for name in self._models if name not in unknown)
         check_model(parameters)
         self._initial = initial
@@ -154,8 +154,6 @@ class Calibrator:
         self._further = NonlinearEstimators([self._estimators[name] for name in self._models if MODELS[name].estimator])
         self._estimates = Estimates(self._estimators, self._further, self._models, self.parameters)
         self._judge = Assessor(self._estimates)
-        self._headings = Headings(self.parameters)
-        self._n_headings = 0  # rows given to `_headings`
         self._seen: dict[Needs, RowsSeen] = {}
         self._doubted: tuple[tuple[object, ...], Sequence[Reason]] | None = None
         if self._trace is not None:
@@ -235,7 +233,6 @@ class Calibrator:
             if aligner.partners.n_judged - each.n_taken >= COPIED_AT_ONCE:
                 each.take_rows()
             each.advance()
-        self._look_at_headings()
         if aligner.partners.n_paired > self._n_selected:
             self._select()
         due = [group for group in self._groups if self._is_due(group)]
@@ -262,28 +259,6 @@ class Calibrator:
             paired = rows.pairing[first : first + len(stamps_ns)] == Pairing.PAIRED
             self._selection.update(stamps_ns, paired, self.parameters)
             self._n_selected += len(stamps_ns)
-
-    def _look_at_headings(self) -> None:
-        """Tell the selection once the headings make the current observable, a fixed delay after the last row."""
-        aligner, rows = self._aligner, self._aligner.rows
-        first, decided = self._n_headings, aligner.partners.n_oriented
-        if self._headings.shown or decided == first:
-            return
-        is_judged = self._headings.waits_for(int(rows.stamps_ns[decided - 1 - rows.base]))
-        if not is_judged and decided - first < self._rows_held:
-            return
-        self._n_headings = decided
-        for start, end, is_new_day in parts_by_day(self._aligner.day_rows, first, decided):
-            if is_new_day:
-                self._headings.end_day()
-            seen = self._observed(Needs.ATTITUDE, start, end)
-            oriented = np.zeros(end - start, dtype=bool)
-            oriented[seen.numbers - start] = True
-            stamps_ns = rows.stamps_ns[start - rows.base : end - rows.base]
-            shown_ns = self._headings.add(stamps_ns, oriented, seen.observations)
-            if shown_ns is not None:
-                wait_ns = aligner.lag_ns + round(self.parameters.imu_timeout * 1e9) + EVERY_NS
-                self._selection.headings_show_the_current(shown_ns + wait_ns, self._headings.trimmed)
 
     def _on_evidence(self, model: Model, from_ns: int) -> None:
         """Pass an estimator's new evidence to the selection and its state to the trace."""
@@ -330,8 +305,8 @@ class Calibrator:
         """Return the number of the first row that is not decided for models with these needs."""
         partners = self._aligner.partners
         return {
-            Needs.NOTHING: partners.n_judged, Needs.ATTITUDE: partners.n_oriented, Needs.REFERENCE: partners.n_paired,
-        }[needs]  # fmt: skip
+            Needs.NOTHING: partners.n_judged, Needs.REFERENCE: partners.n_paired,
+        }.get(needs, partners.n_oriented)  # fmt: skip
 
     def _observed(self, needs: Needs, first: int, decided: int) -> RowsSeen:
         """Return observations of rows first .. decided - 1 for models with these needs, cached for other groups."""
@@ -352,7 +327,6 @@ class Calibrator:
         """Forget the rows that all models have had."""
         rows = self._aligner.rows
         done = min(self._n_selected, self._further.n_taken, *(group.next_row for group in self._groups))
-        done = done if self._headings.shown else min(done, self._n_headings)
         if done - rows.base > rows.begin:
             if self._on_rows is not None:
                 self._on_rows(own_copy(rows.block(rows.begin + rows.base, done)))

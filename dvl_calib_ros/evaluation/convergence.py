@@ -21,7 +21,7 @@ TIMES_S = (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 50.0, 75.0, 100.0, 150.0, 200.0)
 REFERENCE_STD = (protocol.GNSS_STD, 0.02)
 # result reported for a published network that aligns a DVL: error in degrees after a time in s
 PUBLISHED_DEG, PUBLISHED_S = 0.8, 25.0
-_AIDED, _FREE = ("M3",), ("A1", "F1", "M7")
+_AIDED, _FREE = ("M3",), ("unaided", "M7")
 
 
 def curve_keys(models: Sequence[str]) -> list[tuple[str, float | None]]:

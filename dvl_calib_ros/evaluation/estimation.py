@@ -61,7 +61,10 @@ class AlignedVariants:
     def observations(self, needs: Needs, parameters: Parameters) -> Observations:
         """Return the observations of models with these needs for all rows; any finite values for unusable rows."""
         n_samples = self.has[needs].shape[1]
-        return Observer(parameters).observe(self.rows, needs, np.repeat(self.sway_heave, n_samples, axis=0))
+        rows = self.rows
+        if needs is Needs.REFERENCE:
+            rows = replace(rows, attitude=np.nan_to_num(rows.attitude))
+        return Observer(parameters).observe(rows, needs, np.repeat(self.sway_heave, n_samples, axis=0))
 
 
 def streams_of(data: SensorData, variant: int) -> Streams:
@@ -103,12 +106,13 @@ def aligned(data: SensorData, parameters: Parameters) -> AlignedVariants:
     has = {
         needs: present & mask.reshape(at.shape)
         for needs, mask in (
-            (Needs.NOTHING, rows.usable), (Needs.ATTITUDE, rows.oriented), (Needs.REFERENCE, rows.paired)
+            (Needs.NOTHING, rows.usable), (Needs.ATTITUDE, rows.oriented), (Needs.ATTITUDE_IF_KNOWN, rows.usable),
+            (Needs.REFERENCE, rows.paired),
         )
     }  # fmt: skip
     # missing velocities are 0; covariances are unchanged
     reference = np.concatenate([np.nan_to_num(rows.reference[:, :3]), rows.reference[:, 3:]], axis=1)
-    rows = replace(rows, attitude=np.nan_to_num(rows.attitude), reference=reference)
+    rows = replace(rows, reference=reference)
     return AlignedVariants(rows, has, np.array([sway_heave for _, sway_heave in found]))
 
 

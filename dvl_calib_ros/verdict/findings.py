@@ -243,7 +243,7 @@ FINDINGS = (
     warning(
         "GNSS_OUTAGE",
         "no GNSS for {seconds:.0f} s: {model} still corrects with its last estimate, but learns nothing more",
-        remedy="surface, check the receiver and the topic {topic}, or select a model without GNSS (gnss_free_model)",
+        remedy="in a dive, nothing; else check the receiver and the topic {topic}",
     ),
     warning(
         "GNSS_OUTAGE_WITHOUT",

@@ -180,13 +180,11 @@ SELECTIONS = on_page(
     accept("GNSS_NOT_AVAILABLE", "GNSS is not available", means="No reference for `gnss_timeout`."),
     accept("GNSS_GOING", "GNSS has stopped; the model changes if it stays away for gnss_hysteresis"),
     accept("GNSS_COMING", "GNSS is back; the model changes if it stays for gnss_hysteresis"),
-    accept("HEADINGS_TELL_CURRENT", "headings distinguish a current from the mounting"),
     accept(
-        "HEADINGS_TOO_FEW",
-        "no attitude over headings that would distinguish a current from the mounting",
-        means="On one heading, or without an IMU, a current looks like a mounting.",
+        "REFERENCE_HAS_TOLD",
+        "the calibration by the reference so far stays in use",
+        means="The mounting is known from the time with a reference.",
     ),
-    accept("TRIM_KNOWN", "the trim is known", means="The IMU gives roll and pitch."),
     accept(
         "ARM_LOOKS_LIKE_ANGLE",
         "on this track a {metres:g} m error of the lever arm looks like {degrees:.1f}° of {angle}",

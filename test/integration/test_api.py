@@ -112,7 +112,7 @@ def test_a_printed_mounting_has_no_powers_of_ten(bag):
 def test_the_mounting_is_printed_with_arm_and_delay_and_findings_are_of_the_selected_model(calibration):
     said = str(calibration.mounting)
     assert "lever arm x " in said and "stamps late " in said
-    assert not any(each.says.startswith(("M1: ", "M7: ", "F1: ")) for each in calibration.findings)
+    assert not any(each.says.startswith(("M1: ", "M7: ", "unaided: ")) for each in calibration.findings)
 
 
 def test_values_that_no_data_support_are_marked_where_the_mounting_is_printed(bag):
@@ -155,7 +155,7 @@ def test_the_other_functions_give_dataclasses(tmp_path, bag):
     checked = dc.evaluate([bag, made], models=["M3"], dvl_topic="dvl/twist", gnss_topic="gnss/twist")
     assert checked.models == ("M3",)
     assert repr(checked).startswith(f"{checked.verdict}: On bags that were not calibrated on M3 leaves ")
-    assert dc.replay([made], gnss_topic="none").model == "F1"
+    assert dc.replay([made], gnss_topic="none").model == "unaided"
     with pytest.raises(dc.InputError, match="none of"):
         dc.evaluate(models=["M9"])
     with pytest.raises(dc.InputError, match="no topic 'nowhere'"):

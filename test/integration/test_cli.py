@@ -150,7 +150,7 @@ def completed(tmp_path, typed: str) -> list[str]:
         ("dvl-calib re", ["replay"]),
         ("dvl-calib replay --dvl-t", ["--dvl-topic"]),
         ("dvl-calib replay bag -p min_s", ["min_speed:="]),
-        ("dvl-calib replay bag -p gnss_free_model:=F", ["gnss_free_model:=F1"]),
+        ("dvl-calib replay bag -p gnss_free_model:=M5", ["gnss_free_model:=M5"]),
         ("dvl-calib simulate bag --storage m", ["mcap"]),
     ],
 )
@@ -195,12 +195,12 @@ def test_replay_json_has_the_documented_structure(document, bag):
     assert document["models"]["M3"]["state_names"][3:] == ["delta_k"]
     assert document["models"]["M4"]["state_names"][3:] == ["delta_k_x"]
     assert document["version"] == __version__
-    assert document["parameters"]["gnss_model"] == "full"
+    assert document["parameters"]["gnss_model"] == "M3"
 
 
 def test_the_selected_segments_follow_each_other_from_the_first_sample_to_the_last(document):
     segments = document["selected"]
-    assert [segment["model"] for segment in segments] == ["F1", "full"]
+    assert [segment["model"] for segment in segments] == ["unaided", "full"]
     assert segments[0]["from_s"] == 0.0
     assert segments[0]["to_s"] == segments[1]["from_s"] == pytest.approx(3.0, abs=0.5)
     assert segments[-1]["to_s"] == pytest.approx(40.0, abs=0.5)

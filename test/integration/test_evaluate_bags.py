@@ -59,7 +59,7 @@ def test_topics_are_found_as_by_replay_and_the_answer_is_said_first_with_warning
     # M3 knows nothing of the arm and the clock that these days differ by
     assert said.startswith("not_better: On bags that were not calibrated on M3 leaves a velocity error of ")
     assert "DVL /a50/velocity" in said and "reference /rtk/velocity" in said
-    assert not any(f"{name}: " in warned for name in ("full", "M7", "F1"))
+    assert not any(f"{name}: " in warned for name in ("full", "M7", "unaided"))
 
 
 def test_the_table_for_spreadsheets_is_for_trajectories_only(bags, tmp_path, capsys):

@@ -17,7 +17,7 @@ from position_fixtures import USBL, write_positions
 import dvl_calib_ros as dc
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
-from dvl_calib_ros.calibration.models import WITH_POSITIONS
+from dvl_calib_ros.calibration.models import POSITIONS
 from dvl_calib_ros.calibration.models.parameters import ParameterError, Parameters
 from dvl_calib_ros.discovery.discover import discover
 from dvl_calib_ros.examination.examine import examine
@@ -44,16 +44,16 @@ def usbl(tmp_path_factory):
 def test_auto_takes_legs_of_noisy_positions_and_verifies_them_on_legs_not_seen(usbl):
     replayed = replay([usbl], Parameters(), TOPICS)
     result = replayed.result
-    assert result.selected == WITH_POSITIONS and "compared over legs" in str(result.selected_because)
+    assert result.selected == POSITIONS.name and "compared over legs" in str(result.selected_because)
     x, std = result.estimate.state, result.estimate.recording_std
     assert abs(x[2] - TRUTH.phi[2]) < 3.0 * std[2] < math.radians(1.0)
     assert abs(x[3] - TRUTH.scale) < 3.0 * std[3] < 0.02
     observed = {each.axis: each.observed for each in result.estimate.observability}
     assert observed["yaw"] and not observed["roll"] and not observed["pitch"]
-    held_out = result.verifications[WITH_POSITIONS].held_out
+    held_out = result.verifications[POSITIONS.name].held_out
     assert held_out is not None and held_out.corrected < 0.9 * held_out.uncorrected
     assert held_out.corrected < 1.2 * held_out.predicted
-    assert result.verifications[WITH_POSITIONS].verdict.value == "accept"
+    assert result.verifications[POSITIONS.name].verdict.value == "accept"
     navigation = replayed.navigation
     assert navigation is not None and navigation.after.per_km < navigation.before.per_km
     assert navigation.after.end < 0.5 * navigation.before.end  # of one fix, noise is less the longer the way
@@ -73,7 +73,7 @@ def test_a_wrong_calibration_of_positions_is_not_verified(usbl, monkeypatch):
         return fit
 
     monkeypatch.setattr(of_positions, "solve", solved)
-    verification = replay([usbl], Parameters(), TOPICS).result.verifications[WITH_POSITIONS]
+    verification = replay([usbl], Parameters(), TOPICS).result.verifications[POSITIONS.name]
     assert verification.verdict.value == "reject"
 
 
@@ -82,7 +82,7 @@ def test_where_velocities_of_positions_are_good_auto_does_not(tmp_path):
     bag = write_positions(tmp_path / "bag", run(Noise(0.02), seconds=200.0))
     result = replay([bag], Parameters(), TOPICS).result
     assert result.selected == "full"
-    assert {segment.model for segment in result.segments}.isdisjoint({WITH_POSITIONS})
+    assert {segment.model for segment in result.segments}.isdisjoint({POSITIONS.name})
 
 
 @pytest.mark.slow
@@ -98,7 +98,7 @@ def test_live_and_replay_agree_in_state_and_in_when_it_was_chosen(tmp_path):
                 take[topic](message, log_ns)
         live = feed.calibrator.result()
     offline = replay(recording, Parameters(), TOPICS).result
-    assert live.selected == offline.selected == WITH_POSITIONS
+    assert live.selected == offline.selected == POSITIONS.name
     assert live.segments == offline.segments
     np.testing.assert_allclose(live.estimate.state, offline.estimate.state, rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(live.estimate.covariance, offline.estimate.covariance, rtol=0.0, atol=1e-12)
@@ -115,12 +115,12 @@ def test_a_usbl_that_gives_a_position_each_10_s_is_discovered_and_calibrated_wit
     bag = write_positions(tmp_path / "bag", run(seconds=900.0, fix_s=10.0))
     found = dc.replay(bag, history=False)
     result = found.replayed.result
-    assert found.discovery.topics.gnss == USBL and result.selected == WITH_POSITIONS
+    assert found.discovery.topics.gnss == USBL and result.selected == POSITIONS.name
     assert "too infrequent" in str(result.selected_because)
     assert abs(result.estimate.state[2] - TRUTH.phi[2]) < 3.0 * result.estimate.recording_std[2]
     examined = dc.doctor(bag)
     assert not {"DOCTOR_TOO_FEW", "DOCTOR_SLOW_REFERENCE"} & {each.code for each in examined.findings}
-    assert "dvl-calib replay calibrates with them (model D1)" in fail(capsys, "diagnose", bag)
+    assert "dvl-calib replay calibrates with them (model positions)" in fail(capsys, "diagnose", bag)
 
 
 def test_half_a_minute_of_a_slow_usbl_which_a_live_node_looks_through_is_enough_to_find_it(tmp_path):
@@ -129,12 +129,12 @@ def test_half_a_minute_of_a_slow_usbl_which_a_live_node_looks_through_is_enough_
 
 
 def test_a_diagnosis_of_noisy_positions_says_what_to_do(usbl):
-    assert any("replay calibrates with them (model D1)" in each for each in dc.diagnose(usbl).notes)
+    assert any("replay calibrates with them (model positions)" in each for each in dc.diagnose(usbl).notes)
 
 
 def test_the_model_of_positions_is_refused_where_there_are_velocities():
     with pytest.raises(ParameterError, match=r"goes by positions, and .*Twist.* holds velocities; name another"):
-        Calibrator(Parameters(model=WITH_POSITIONS))
+        Calibrator(Parameters(model=POSITIONS.name))
 
 
 def test_latitude_and_longitude_are_imported_beside_speed_and_course(tmp_path):
@@ -161,7 +161,7 @@ def test_a_boats_positions_alone_tell_what_its_velocities_tell(tmp_path):
     parts = [folder / f"{name}_{role}.csv" for role in ("dvl", "gnss", "attitude")]
     import_recording(*parts, tmp_path / "bag", ImportOptions(frame="flu"))
     by_velocity = replay([tmp_path / "bag"], Parameters()).result.estimate
-    by_position = replay([tmp_path / "bag"], Parameters(model=WITH_POSITIONS), Topics(gnss="gnss/fix")).result.estimate
+    by_position = replay([tmp_path / "bag"], Parameters(model=POSITIONS.name), Topics(gnss="gnss/fix")).result.estimate
     yaw = by_position.state[2] - by_velocity.state[2]
     assert abs(yaw) < 2.0 * math.hypot(by_position.recording_std[2], by_velocity.recording_std[2])
     assert math.degrees(by_position.std[2]) <= 0.5

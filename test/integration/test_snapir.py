@@ -102,17 +102,17 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
         dvl, attitude = (snapir / f"{name}_{kind}.csv" for kind in ("dvl", "attitude"))
         import_recording(dvl, None, attitude, tmp_path / name, ImportOptions())
         result = replay([tmp_path / name], Parameters()).result
-        estimate = result.estimates["A1"]
+        estimate = result.estimates["unaided"]
         _, _, yaw = rpy_from_rotation(estimate.rotation_body_from_dvl(np.eye(3)))  # of the DVL, as YAW_DEG: not φ
         errors.append(np.degrees(yaw) - YAW_DEG)
         sigmas.append(np.degrees(estimate.std[2]))
         selected.append(result.selected)
     error, scaled = np.array(errors), np.array(errors) / sigmas
-    print("A1, deg:", np.round(error, 2), np.median(np.abs(error)), *(np.sqrt(np.mean(x**2)) for x in (error, scaled)))
+    print("unaided, deg:", np.round(error, 2), np.median(np.abs(error)), *(np.sqrt(np.mean(x**2)) for x in (error, scaled)))
     assert np.median(np.abs(error)) < 0.32
     assert np.sqrt(np.mean(error**2)) < 0.38
     assert 0.6 < np.sqrt(np.mean(scaled**2)) < 1.0
-    assert selected.count("A1") >= 9
+    assert selected.count("unaided") >= 9
 
 
 @pytest.mark.parametrize("name", ["T05", "T13"])

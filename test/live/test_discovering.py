@@ -93,5 +93,5 @@ def test_a_usbl_with_a_fix_each_five_seconds_is_waited_for_found_and_calibrated_
                 lambda stream=stream, topic=topic: f"{stream}: {sent[topic]}, not {latest(said)[f'{stream} received']}",
             )
         assert latest(said)["calibration restarts"] == "0"
-        until(lambda: latest(said)["model"] == "D1", lambda: f"legs of positions, not {latest(said)['model']}")
+        until(lambda: latest(said)["model"] == "positions", lambda: f"legs of positions, not {latest(said)['model']}")
     assert "reference /usbl/pose (PoseWithCovarianceStamped" in node.output

@@ -151,7 +151,7 @@ def test_a_view_that_is_killed_takes_its_node_with_it_and_the_node_saves(world, 
         [sys.executable, "-m", "dvl_calib_ros.cli.main", "run", "--watch", "-p", f"result_file:={saved}"],
         env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
-    assert view.stdout.readline().startswith("F1 collecting")
+    assert view.stdout.readline().startswith("unaided collecting")
     # asked of the system: a participant that hears late of a node that has gone keeps its name for ever
     (node,) = Path(f"/proc/{view.pid}/task/{view.pid}/children").read_text().split()
     ended = os.pidfd_open(int(node))

@@ -59,7 +59,7 @@ ERRORS = DvlErrors((0.02, -0.03, 0.05), (0.005,) * 3, beam_std=0.005)
 RUN = Scenario(
     trajectory="figure8", seconds=40, dvl_rate=5, gnss_rate=5, imu_rate=5, gnss_std=0.02, errors=ERRORS
 )  # fmt: skip
-GIVEN = {"max_latency": 60.0, "gnss_model": "M3"}
+GIVEN = {"max_latency": 60.0, "model": "iac"}
 PARAMETERS = Parameters(**GIVEN)
 
 
@@ -395,7 +395,7 @@ def test_a_storm_of_parameters_good_and_bad_costs_no_sample_and_ends_where_it_sh
         asked.append(names[number // 6 % len(names)])
         answer = node.world.set_parameter("model", asked[-1])
         refused += [] if answer.successful else [answer.reason]
-    assert node.world.set_parameter("model", "auto").successful  # before anything fails: other tests share this node
+    assert node.world.set_parameter("model", "iac").successful  # before anything fails: other tests share this node
     assert asked.count("M9") > 5 and len(refused) == asked.count("M9") and all("'M9'" in reason for reason in refused)
     replay = Offline(PARAMETERS).feed(messages)
     saved, expected = node.when_like(replay), replay.calibrator.result()
@@ -512,7 +512,7 @@ def test_a_result_file_whose_folder_goes_comes_back_or_becomes_something_else_co
     folder.mkdir()
     file, messages = folder / "result.yaml", as_messages(between(0, 20))
     world = World()
-    with world.calibration_node("max_latency:=60.0", "gnss_model:=M3", f"result_file:={file}") as process:
+    with world.calibration_node("max_latency:=60.0", "model:=iac", f"result_file:={file}") as process:
         node = Live(world, process, file)
         node.publish(messages)
         node.when_like(Offline(PARAMETERS).feed(messages))

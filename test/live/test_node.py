@@ -104,7 +104,7 @@ def test_the_node_and_the_replay_of_one_bag_agree_in_every_model(scenario, world
 
 
 def test_the_papers_own_selection_is_published_whatever_is_selected(world, bag):
-    with world.calibration_node("model:=F1", *as_arguments(PATIENT)):
+    with world.calibration_node("model:=unaided", *as_arguments(PATIENT)):
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         got = world.received(TwistWithCovarianceStamped, f"{NODE}/iac/estimate", LATCHED)
         sent = play(world, bag)
@@ -132,7 +132,7 @@ def test_the_result_is_saved_whichever_way_the_node_is_stopped(stop, world, tmp_
         until(lambda: diagnostics, "the node to run")
     assert process.returncode == 0, process.output
     assert "Traceback" not in process.output
-    assert load_yaml(saved, "result file")["model"] == "F1"
+    assert load_yaml(saved, "result file")["model"] == "unaided"
 
 
 def test_a_result_that_cannot_be_saved_at_the_end_is_printed_so_that_it_is_not_lost(world, tmp_path):
@@ -293,7 +293,7 @@ def test_models_are_switched_by_parameter_at_once_and_a_late_subscriber_gets_the
     "name, value, reason",
     [
         ("model", "M9", "is not one of auto"),
-        ("gnss_model", "M7", "is not one of M1"),
+        ("gnss_model", "M7", "is not one of M3"),
         ("gnss_timeout", 5.0, "read-only"),
         ("gnss_hysteresis", -1.0, ""),
         ("gnss_hysteresis", "long", "type"),
@@ -375,7 +375,7 @@ def account_at_200_hz(world: World, folder: Path, n: int) -> dict[str, int]:
 
 def test_services_reset_and_save_answer_in_words(world, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with node_here(world) as node:
+    with node_here(world, model="M7") as node:  # which waits for no IMU
         dvl = Publisher(world)
         dvl.send(*(twist(1000 + 0.2 * i) for i in range(10)))
         until(lambda: received(node) == 10, "all samples")
@@ -449,7 +449,7 @@ def test_wrong_frames_and_a_silent_dvl_are_named_in_the_diagnostics(world):
         assert "gnss_frame" in status.message and "'gps_antenna'" in status.message
         assert "frame_id 'base_link'" in status.message and "dvl_frame" in status.message
         assert diagnosed(diagnostics, "dvl wrong_frame") == diagnosed(diagnostics, "dvl invalid") == "1"
-        assert diagnosed(diagnostics, "model") == "F1"
+        assert diagnosed(diagnostics, "model") == "unaided"
         until(lambda: diagnostics[-1].status[0].level == DiagnosticStatus.ERROR, "the DVL to be reported silent")
         assert "no usable DVL message for" in diagnostics[-1].status[0].message
 
@@ -474,7 +474,7 @@ def test_calibrated_twist_is_the_corrected_velocity_in_the_body_with_both_uncert
 
 
 def test_the_node_runs_on_simulated_time_that_stands_still(world):
-    with node_here(world, use_sim_time=True) as node:
+    with node_here(world, use_sim_time=True, model="M7") as node:
         diagnostics = world.received(DiagnosticArray, "/diagnostics")
         Publisher(world).send(*(twist(1000 + 0.2 * i) for i in range(5)))
         until(lambda: diagnosed(diagnostics, "samples used") == "5", "diagnostics on a standing clock")

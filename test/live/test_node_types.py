@@ -24,7 +24,7 @@ from test_node import as_arguments, assert_agree, diagnosed, node_here, play, re
 from dvl_calib_ros.bag_replay.replay import replay
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.estimators.estimator import AtOnce
-from dvl_calib_ros.calibration.models import WITH_POSITIONS
+from dvl_calib_ros.calibration.models import POSITIONS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample
 from dvl_calib_ros.disk.text_files import load_yaml
@@ -79,13 +79,13 @@ def test_the_node_takes_noisy_positions_over_legs_as_the_replay_does(world, tmp_
         sent = play(world, bag)
         for topic, stream in (("dvl/twist", "dvl"), ("gnss/twist", "reference"), ("imu/data", "imu")):
             until(lambda s=stream, t=topic: diagnosed(diagnostics, f"{s} received") == str(sent[t]), f"all of {topic}")
-        until(lambda: diagnosed(diagnostics, "model") == WITH_POSITIONS, "the node to say so")
+        until(lambda: diagnosed(diagnostics, "model") == POSITIONS.name, "the node to say so")
     live, offline = load_yaml(saved, "result file"), replay([bag], Parameters(**patient)).result
     assert_agree(live, offline)
-    estimate = offline.estimates[WITH_POSITIONS]
-    assert live["model"] == offline.selected == WITH_POSITIONS
-    np.testing.assert_allclose(live["models"][WITH_POSITIONS]["state"], estimate.state, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(live["models"][WITH_POSITIONS]["covariance"], estimate.covariance, rtol=0.0, atol=1e-12)
+    estimate = offline.estimates[POSITIONS.name]
+    assert live["model"] == offline.selected == POSITIONS.name
+    np.testing.assert_allclose(live["models"][POSITIONS.name]["state"], estimate.state, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(live["models"][POSITIONS.name]["covariance"], estimate.covariance, rtol=0.0, atol=1e-12)
     assert live["verification"]["held_out"] is not None
 
 
@@ -176,7 +176,8 @@ def test_what_is_usable_follows_the_verdict(turned):
 @pytest.mark.parametrize(
     ("model", "rate", "goes_on"),
     [
-        ("auto", 1.0, "F1 continues, but learns nothing that needs GNSS, such as the scale"),
+        ("auto", 1.0, "full still corrects with its last estimate, but learns nothing more"),
+        ("unaided", 1.0, "unaided continues, but learns nothing that needs GNSS, such as the scale"),
         ("M3", 1.0, "M3 still corrects with its last estimate, but learns nothing more"),
         ("auto", 4.0, ""),
     ],
@@ -243,6 +244,6 @@ def test_topics_are_looked_for_unless_the_dvls_was_named_or_nobody_wants_it(worl
 
 def test_the_model_of_positions_is_refused_while_the_reference_is_velocities(world):
     with node_here(world) as node:
-        (answer,) = node.set_parameters([Parameter("model", value=WITH_POSITIONS)])
+        (answer,) = node.set_parameters([Parameter("model", value=POSITIONS.name)])
         assert not answer.successful and "goes by positions" in answer.reason
-        assert node._calibrator.selected != WITH_POSITIONS
+        assert node._calibrator.selected != POSITIONS.name

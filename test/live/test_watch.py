@@ -74,8 +74,8 @@ def test_the_view_shows_the_mounting_what_it_is_worth_and_what_to_drive():
 
 def test_good_enough_is_said_and_of_a_wrong_configuration_nothing_that_could_be_used():
     assert "next: good enough: save\n" in drawn(status(**GOOD), 100.0)
-    back = drawn(status(**{"taken back": "no longer good enough: the model is A1 now"}), 100.0)
-    assert "no longer good enough: the model is A1 now\n" in back and "next: drive straight" in back
+    back = drawn(status(**{"taken back": "no longer good enough: the model is unaided now"}), 100.0)
+    assert "no longer good enough: the model is unaided now\n" in back and "next: drive straight" in back
     assert "not to be used" not in drawn(status(2, "no DVL message for 7 s"), 100.0)
     wrong = drawn(status(2, "the data contradict the configuration", usable="no", **GOOD), 100.0)
     assert "not to be used" in wrong and "good enough: save" not in wrong and "contradict the configuration" in wrong
@@ -318,7 +318,7 @@ def test_without_a_terminal_it_is_said_that_no_node_answers(monkeypatch):
     assert out.getvalue() == "waiting for the node's /diagnostics ... (same ROS_DOMAIN_ID?)\n"
 
 
-@pytest.mark.parametrize("name", ["M3", "F1"])
+@pytest.mark.parametrize("name", ["M3", "unaided"])
 def test_progress_goes_from_the_prior_to_fine_by_the_logarithm(name):
     parameters = Parameters()
     calibrator = calibrate(make_samples(MatchedRun(dvl_std=0.01, gnss_std=0.01)), parameters)
@@ -433,7 +433,7 @@ def test_q_does_not_replace_a_good_result_by_a_few_samples_without_asking(world,
     calibrated = result_document(calibrate(make_samples(MatchedRun(dvl_std=0.01, gnss_std=0.01))).result())
     save_result(saved, calibrated | {"verification": {"verdict": "accept", "reasons": ["so"]}})
     good = saved.read_bytes()
-    with terminal(world, "run", "--watch", "-p", f"result_file:={saved}") as screen:
+    with terminal(world, "run", "--watch", "-p", f"result_file:={saved}", "-p", "model:=M7") as screen:
         publisher = world.node.create_publisher(TwistWithCovarianceStamped, "dvl/twist", 100)
         until(lambda: publisher.get_subscription_count() == 1, "the node's subscription")
         message = TwistWithCovarianceStamped()
@@ -464,7 +464,7 @@ def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_ru
         first = watching.stdout.readline()
         watching.send_signal(signal.SIGINT)
         _, errors = watching.communicate(timeout=30)
-        assert first.startswith("F1 collecting: roll 0.000°, as set")
+        assert first.startswith("unaided collecting: roll 0.000°, as set")
         assert (watching.returncode, errors) == (0, "")
         assert node.poll() is None
 
@@ -472,7 +472,7 @@ def test_watching_a_node_elsewhere_writes_lines_to_a_pipe_and_leaves_the_node_ru
 @pytest.mark.slow
 def test_of_two_nodes_the_one_is_shown_that_was_named(world):
     """The other, in a namespace, is heard on the same /diagnostics and has another model."""
-    with world.calibration_node("model:=A1"):
+    with world.calibration_node("model:=unaided"):
         port = subprocess.Popen(
             command("run", "--watch", "-p", "model:=M5", "--ros-args", "-r", "__ns:=/port"), env=environment(world),
             cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -487,7 +487,7 @@ def test_of_two_nodes_the_one_is_shown_that_was_named(world):
         for each in (*elsewhere, port):
             each.send_signal(signal.SIGINT)
             each.communicate(timeout=PATIENCE_S)
-    assert shown == ["M5", "A1", "M5"]
+    assert shown == ["M5", "unaided", "M5"]
 
 
 def test_a_node_that_cannot_start_says_why_and_watching_ends(world):

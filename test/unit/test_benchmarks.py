@@ -109,7 +109,7 @@ def test_batch_and_filterpy_come_to_the_same_states(monkeypatch):
 def test_the_published_procedure_and_its_loop_with_filterpy_come_to_the_same_scores():
     """Also of models whose noise has fewer rows than three, and of those that want a height."""
     pytest.importorskip("filterpy", reason="a peer of the benchmarks: pip install '.[test]'")
-    procedure = Procedure(own_trajectories(), ("F1", "A1"), protocol.SETS[:1], Parameters(**DEFAULTS), studies=False)
+    procedure = Procedure(own_trajectories(), ("unaided",), protocol.SETS[:1], Parameters(**DEFAULTS), studies=False)
     ours = np.array([each.by_time for each in run_seed(procedure, 0).by_set])
     peers = evaluate._with_filterpy(procedure, 0)
     np.testing.assert_array_equal(np.isnan(ours), np.isnan(peers))

@@ -179,6 +179,7 @@ def _information(
         interval=np.full(len(speed), STEP_S),
         assumptions=Assumptions(*(getattr(parameters, name) for name in Assumptions._fields)),
         earth_in_body=rotation.transpose(0, 2, 1)[:, :, :2] if motion.in_earth else None,
+        oriented=np.full(len(speed), motion.heading is not None),
     )
     own = model.linearise(seen)[1]
     h = np.zeros((len(speed), own.shape[1], model.n_state))

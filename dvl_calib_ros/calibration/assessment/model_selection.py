@@ -10,14 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..models import WITH_HEADINGS, WITH_POSITIONS
+from ..models import FULL, POSITIONS, UNAIDED
 from ..models.parameters import AUTO, IAC, Parameters
 from ..numerics.samples import Mask, Stamps
 from ..results.results import Segment
-
-# Models of the published selection; the paper recommends the first and the last
-IAC_G = ("M3", "M4")
-IAC_GF = ("M5", "M6", "M7")
 
 
 class GnssAvailability:
@@ -70,12 +66,14 @@ class GnssAvailability:
 class Evidence(NamedTuple):
     """Evidence of an estimator for the selection: code and numbers of a reason, '' for none.
 
-    pairs_elsewhere: the estimator finds references that pairing at the uncorrected stamps misses.
+    pairs_elsewhere: the estimator finds references that pairing at the uncorrected stamps misses. is_known: its
+    calibration holds without further references.
     """
 
     code: str = ""
     numbers: Mapping[str, Any] = {}
     pairs_elsewhere: bool = False
+    is_known: bool = False
 
 
 NO_EVIDENCE = Evidence()
@@ -90,20 +88,14 @@ class Selection:
         self.gnss = GnssAvailability()
         self.segments: list[Segment] = []
         self._referenced_until_ns = 0
-        self._headings = self._trimmed = False
+        self._is_known = False
         self._by_positions: Evidence | None = None
-        # events that take effect when DVL samples reach their stamp: evidence, or None for sufficient headings
-        self._coming: deque[tuple[int, Evidence | None]] = deque()
+        self._coming: deque[tuple[int, Evidence]] = deque()  # takes effect when DVL samples reach its stamp
 
     def take(self, from_ns: int, evidence: Evidence) -> None:
         """Use an estimator's evidence from this stamp on."""
-        if evidence.code or evidence.pairs_elsewhere:
+        if evidence != NO_EVIDENCE:
             insort(self._coming, (from_ns, evidence), key=lambda each: each[0])
-
-    def headings_show_the_current(self, from_ns: int, trimmed: bool = False) -> None:
-        """Allow models with attitude and without GNSS from this stamp on. trimmed: because of the trim."""
-        self._trimmed = trimmed
-        insort(self._coming, (from_ns, None), key=lambda each: each[0])
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
         """Take DVL samples (N,) in order of stamps, and whether they were paired."""
@@ -113,12 +105,12 @@ class Selection:
             if at:
                 self._update(stamps_ns[:at], paired[:at], parameters)
             stamps_ns, paired = stamps_ns[at:], paired[at:]
-            if evidence is None:
-                self._headings = True
-            elif evidence.pairs_elsewhere:
-                self._referenced_until_ns = from_ns + REFERENCED_NS
-            else:
+            if evidence.code:
                 self._by_positions = evidence
+            else:
+                self._is_known = evidence.is_known
+                if evidence.pairs_elsewhere:
+                    self._referenced_until_ns = from_ns + REFERENCED_NS
             self.record(int(stamps_ns[0]), parameters)
         if len(stamps_ns):
             self._update(stamps_ns, paired, parameters)
@@ -145,21 +137,16 @@ class Selection:
     def model(self, parameters: Parameters) -> str:
         """Return the name of the selected model."""
         if parameters.model == IAC:
-            aided, unaided = published_models(parameters)
-        elif parameters.model == AUTO:
-            aided, unaided = parameters.gnss_model, parameters.gnss_free_model
-        else:
+            return self.iac_model(parameters)
+        if parameters.model != AUTO:
             return parameters.model
-        if parameters.model == AUTO and self._by_positions is not None:
-            return WITH_POSITIONS
-        if not self.gnss.available:
-            return WITH_HEADINGS.get(unaided, unaided) if parameters.model == AUTO and self._headings else unaided
-        return aided
+        if self._by_positions is not None:
+            return POSITIONS.name
+        return FULL.name if self.gnss.available or self._is_known else UNAIDED.name
 
     def iac_model(self, parameters: Parameters) -> str:
         """Return the model that the paper's selection runs now."""
-        aided, unaided = published_models(parameters)
-        return aided if self.gnss.available else unaided
+        return parameters.gnss_model if self.gnss.available else parameters.gnss_free_model
 
     def reason(self, parameters: Parameters) -> Reason:
         """Return the reason for the selected model."""
@@ -169,16 +156,6 @@ class Selection:
         if parameters.model == AUTO and self._by_positions is not None:
             why = finding(self._by_positions.code, **self._by_positions.numbers)
             return finding("MODEL_CHOSEN_AS", **chosen, why=why)
-        if parameters.model == AUTO and not self.gnss.available and parameters.gnss_free_model in WITH_HEADINGS:
-            headings = "TRIM_KNOWN" if self._trimmed else "HEADINGS_TELL_CURRENT"
-            return finding("MODEL_CHOSEN_AS", **chosen, why=finding(headings if self._headings else "HEADINGS_TOO_FEW"))
+        if parameters.model == AUTO and not self.gnss.available and self._is_known:
+            return finding("MODEL_CHOSEN_AS", **chosen, why=finding("REFERENCE_HAS_TOLD"))
         return finding("MODEL_CHOSEN", **chosen)
-
-
-def published_models(parameters: Parameters) -> tuple[str, str]:
-    """Return the models of `iac` with and without GNSS (Yampolsky and Klein): IAC-G and IAC-GF.
-
-    If gnss_model or gnss_free_model name no such model, as by default, these are the paper's final ones.
-    """
-    aided = parameters.gnss_model if parameters.gnss_model in IAC_G else IAC_G[0]
-    return aided, parameters.gnss_free_model if parameters.gnss_free_model in IAC_GF else IAC_GF[-1]

@@ -18,11 +18,12 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..assessment.dead_reckoning import SlowNoise
-from ..assessment.model_selection import Evidence
+from ..assessment.model_selection import NO_EVIDENCE, Evidence
 from ..checks.beam_faults import BeamFault
 from ..filters.cross_validation import FOLDS, HeldOutError, Moments
 from ..filters.filter_bank import ModelCounts
 from ..filters.filter_setup import prior
+from ..filters.observability import OBSERVED_SHARE, body_angle_std
 from ..filters.state_history import Counts, Numbers, StateTrace
 from ..models.own import BIAS, DELAY, LEVER_ARM, N_STATE, PHI, REFERENCE_ERROR
 from ..numerics.frames import Array
@@ -230,8 +231,14 @@ class FullEstimator(Estimator):
 
     @property
     def evidence(self) -> Evidence:
-        """See `Estimator`."""
-        return Evidence(pairs_elsewhere=self.claims and abs(float(self.state().x[DELAY])) > PAIRED_WITHIN_S)
+        """See `Estimator`. The calibration is known once the data have halved the prior σ of yaw."""
+        if not self.claims:
+            return NO_EVIDENCE
+        x, p = self.state()
+        yaw_std, prior_std = body_angle_std(p, self._parameters)[2], self._parameters.initial_std_misalignment
+        return Evidence(
+            pairs_elsewhere=abs(float(x[DELAY])) > PAIRED_WITHIN_S, is_known=bool(yaw_std <= OBSERVED_SHARE * prior_std)
+        )
 
     @property
     def doubt(self) -> Reason | None:

@@ -15,6 +15,8 @@ from .state_history import Numbers
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 _BITS = np.array([1, 2, 4], dtype=np.uint8)
+# attitude (4) and angular velocity (3) of rows without
+_UNKNOWN = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
 class Observer:
@@ -36,17 +38,18 @@ class Observer:
         common = (rotation_dvl_from_body, sway_heave)
         interval = 1e-9 * block.interval_ns
         if needs is not Needs.REFERENCE:
-            oriented = needs is Needs.ATTITUDE
+            attitude = None if needs is Needs.NOTHING else np.where(block.oriented[:, None], block.attitude, _UNKNOWN)
             return Observations(
                 block.velocity_dvl,
                 None,
                 lever,
                 *common,
                 self._unaided_noise,
-                rotation_from_quaternion(block.attitude[:, :4]) if oriented else None,
-                block.attitude[:, 4:] if oriented else None,
+                None if attitude is None else rotation_from_quaternion(attitude[:, :4]),
+                None if attitude is None else attitude[:, 4:],
                 interval,
                 assumptions=self._assumptions,
+                oriented=None if attitude is None else block.oriented,
             )
         rotation, earth = _reference_in_body(block)
         reference = block.reference[:, :3]

@@ -32,6 +32,7 @@ class Needs(Enum):
     NOTHING = "nothing"
     REFERENCE = "reference velocity"
     ATTITUDE = "attitude and angular velocity"
+    ATTITUDE_IF_KNOWN = "attitude and angular velocity, if known"
 
 
 class Nuisance(NamedTuple):
@@ -62,8 +63,7 @@ class Model:
     `Observations.motion_weight`. vertical_from_reference: uses the vertical velocity of the reference as a measurement.
     estimator: "module:class" of its `Estimator`, '' for the linear filter. sideslip_std: σ (rad) about the body's yaw
     axis that P includes because no data of this model reduce it; 0: none. uses_height: uses `Observations.height`.
-    instead_of: the model that `auto` replaces with this one once the headings make the current observable
-    (heading_diversity.py). from_positions: uses positions instead of velocities derived from them; `auto` selects it
+    from_positions: uses positions instead of velocities derived from them; `auto` selects it
     where the derived velocities are too noisy.
     """
 
@@ -81,7 +81,6 @@ class Model:
     motion_is_noise: bool = False
     vertical_from_reference: bool = False
     estimator: str = ""
-    instead_of: str | None = None
     sideslip_std: float = 0.0
     uses_height: bool = False
     from_positions: bool = False
@@ -151,7 +150,7 @@ _UNIT_NOISE: Array = np.eye(3)[None]
 
 
 class Assumptions(NamedTuple):
-    """Assumed vehicle motion of F1 and A1; each field is a parameter.
+    """Assumed vehicle motion of `unaided`; each field is a parameter.
 
     motion_std, heave_offset_std, current_std: m/s. motion_correlation_time: s.
     """
@@ -190,7 +189,8 @@ class Observations:
     body frame; None without a reference. lever_velocity: (N, 3) m/s, ω×l of the DVL, body frame, zero where unknown;
     None without a lever arm. rotation_dvl_from_body: T (3, 3). sway_heave: (2,) m/s prior sway and heave, body frame.
     noise: R (N or 1, 3, 3) (m/s)² of the measurement, DVL frame. rotation_enu_from_body: (N, 3, 3), and
-    angular_velocity: (N, 3) rad/s, body frame; None without attitude. interval: (N,) s since the previous DVL sample.
+    angular_velocity: (N, 3) rad/s, body frame; None without attitude, identity and zero where not oriented (N,).
+    interval: (N,) s since the previous DVL sample.
     unmeasured: axes of the reference that hold the DVL's own velocity (nominal mounting) because they are not measured;
     None if all are measured. earth_in_body: (N, 3, 2) east and north as columns in the body frame, the axes of a
     constant error of an earth-frame reference; zeros for samples with a body-frame reference, None if all have one.
@@ -210,6 +210,7 @@ class Observations:
     unmeasured: Unmeasured | None = None
     earth_in_body: Array | None = None
     height: Array | None = None
+    oriented: Mask | None = None
 
     @cached_property
     def reference(self) -> Reference:

@@ -1,4 +1,4 @@
-"""Models F1 and A1 (linear) and the entries of `full` and D1 (own estimators)."""
+"""Our models by the data of a run: `full` (reference velocities), `positions`, and `unaided` (linear, neither)."""
 
 from __future__ import annotations
 
@@ -9,28 +9,6 @@ from .base import SHOWN_WITH_GNSS, SHOWN_WITHOUT, Linearised, Model, Needs, Nuis
 
 # Sway (m/s, 1 σ) of a vehicle whose turns are not measured
 UNSEEN_TURN_SWAY_STD = 0.1
-
-
-def _f1(seen: Observations) -> Linearised:
-    """Linearise F1: z = (Tᵀv)_yz, H = [-(Tᵀ[v×])_yz, 1] on φ, s, h (docs/models.md, "F1").
-
-    Sway s and heave h are unknown constants. Their priors decide the share of sway assigned to misalignment: (σ_φ ‖v‖)²
-    against σ_c². Only the forward part of [v×] is used: in turns, sway and heave vary together and would look like
-    roll.
-    """
-    ahead = np.zeros_like(seen.velocity_in_body)
-    ahead[:, 0] = seen.velocity_in_body[:, 0]
-    h = np.zeros((len(ahead), 2, 5))
-    h[:, :, :3] = -(skew(ahead) @ seen.rotation_dvl_from_body.T)[:, 1:]
-    h[:, 0, 3] = h[:, 1, 4] = 1.0
-    return seen.velocity_in_body[:, 1:], h
-
-
-def _f1_noise(seen: Observations) -> Array:
-    heave = seen.assumptions.motion_std**2
-    return np.diag([heave + UNSEEN_TURN_SWAY_STD**2, heave, 1.0])[None]
-
-
 # Sway and heave noise in turns beyond the proportional skid, s: m/s per (rad/s of turn · m/s of speed). On Snapir the
 # skid is 1.8 s, and a third of it remains unexplained.
 TURN_SWAY_STD_S, TURN_HEAVE_STD_S = 1.0, 0.5
@@ -43,76 +21,81 @@ SHEAR_STD = 0.005
 UPRIGHT = 0.5
 
 
-def _a1(seen: Observations) -> Linearised:
-    """Linearise A1: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h, s (docs/models.md, "A1").
+def _unaided(seen: Observations) -> Linearised:
+    """Linearise `unaided`: z = (Tᵀv)_yz - (0, e), state φ, c (east, north), b, d, h, s, a (docs/models.md).
 
     (Tᵀ(v + [v×]φ))_y = (Rᵀ(c + s z))_y + b ω_z u: current c with shear s over height z, skid b in turns. On one heading
-    c and yaw are not separable, so their priors decide, as in F1. (Tᵀ(v + [v×]φ))_z = (1 + d) e + h: e is the heave of
+    c and yaw are not separable, so their priors decide. (Tᵀ(v + [v×]φ))_z = (1 + d) e + h: e is the heave of
     a level path at this attitude, n·v_b = 0 with n the third row of R; d = -1 is a vehicle that moves where it points.
     R = rotation_enu_from_body, u the measured speed ahead.
+
+    Samples without attitude have a constant sway a instead, and of [v×] the forward part only: in turns, sway and heave
+    vary together and would look like roll.
     """
-    rotation, rates, v = seen.rotation_enu_from_body, seen.angular_velocity, seen.velocity_in_body
-    assert rotation is not None and rates is not None
+    rotation, rates, v, oriented = (
+        seen.rotation_enu_from_body,
+        seen.angular_velocity,
+        seen.velocity_in_body,
+        seen.oriented,
+    )
+    assert rotation is not None and rates is not None and oriented is not None
     up = rotation[:, 2]
-    upright = np.abs(up[:, 2]) > UPRIGHT
+    upright = oriented & (np.abs(up[:, 2]) > UPRIGHT)
     level_heave = np.where(upright, -(up[:, 0] * v[:, 0] + up[:, 1] * v[:, 1]) / np.where(upright, up[:, 2], 1.0), 0.0)
-    h = np.zeros((len(v), 2, 10))
-    h[:, :, :3] = -seen.body_from_measured[:, 1:]
-    h[:, 0, 3:5] = rotation[:, :2, 1]
+    h = np.zeros((len(v), 2, 11))
+    turned = v if oriented.all() else np.where(oriented[:, None], v, v * _AHEAD)
+    h[:, :, :3] = -(skew(turned) @ seen.rotation_dvl_from_body.T)[:, 1:]
+    across = rotation[:, :2, 1] * oriented[:, None]
+    h[:, 0, 3:5] = across
     h[:, 0, 5] = rates[:, 2] * v[:, 0]
     h[:, 1, 6] = level_heave
     h[:, 1, 7] = 1.0
     if seen.height is not None:
-        h[:, 0, 8:] = rotation[:, :2, 1] * seen.height[:, None]
+        h[:, 0, 8:10] = across * seen.height[:, None]
+    h[:, 0, 10] = ~oriented
     z = v[:, 1:].copy()
     z[:, 1] -= level_heave
     return z, h
 
 
-def _a1_noise(seen: Observations) -> Array:
-    assert seen.angular_velocity is not None
+_AHEAD = np.array([1.0, 0.0, 0.0])
+
+
+def _unaided_noise(seen: Observations) -> Array:
+    assert seen.angular_velocity is not None and seen.oriented is not None
     turn = seen.angular_velocity[:, 2] * seen.velocity_in_body[:, 0]
     noise = np.zeros((len(turn), 3, 3))
-    noise[:, 0, 0] = (TURN_SWAY_STD_S * turn) ** 2
+    noise[:, 0, 0] = np.where(seen.oriented, TURN_SWAY_STD_S * turn, UNSEEN_TURN_SWAY_STD) ** 2
     noise[:, 1, 1] = (TURN_HEAVE_STD_S * turn) ** 2
     noise += seen.assumptions.motion_std**2 * np.eye(3)
     return noise
 
 
 SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
-_SECOND_HEADING = "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)"
-WITHOUT_REFERENCE = (
-    Model(
-        "F1", Needs.NOTHING, 2, _f1, SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
-        assumes="no GNSS; sway and heave near unknown constants, as large as current_std and heave_offset_std say",
-        wrong_when="a current stronger than current_std; a run that is mostly turning",
-        nuisance=(
-            Nuisance("sway", "m/s", "current_std", of_the_day=True),
-            Nuisance("heave", "m/s", "heave_offset_std"),
-        ),
-        noise=_f1_noise,
-        motion_is_noise=True,
+UNAIDED = Model(
+    "unaided", Needs.ATTITUDE_IF_KNOWN, 2, _unaided,
+    SHOWN_WITHOUT | {
+        "yaw": "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)",
+        "pitch": "motion ahead, holding depth",
+    },
+    assumes="no GNSS; a current that changes only with depth, skid in proportion to the turn rate, depth held or pitch "
+    "flown; without attitude, sway and heave near unknown constants, as large as current_std and heave_offset_std say",
+    wrong_when="a current that changes along the run or, on one heading, exceeds current_std; without attitude, a run "
+    "that is mostly turning",
+    nuisance=(
+        Nuisance("current_east", "m/s", "current_std", of_the_day=True),
+        Nuisance("current_north", "m/s", "current_std", of_the_day=True),
+        Nuisance("skid", "s", 3.0),
+        Nuisance("dive", "", 0.5),
+        Nuisance("heave", "m/s", "heave_offset_std"),
+        Nuisance("shear_east", "1/s", SHEAR_STD, of_the_day=True),
+        Nuisance("shear_north", "1/s", SHEAR_STD, of_the_day=True),
+        Nuisance("sway", "m/s", "current_std", of_the_day=True),
     ),
-    Model(
-        "A1", Needs.ATTITUDE, 2, _a1, SHOWN_WITHOUT | {"yaw": _SECOND_HEADING, "pitch": "motion ahead, holding depth"},
-        assumes="attitude, no GNSS; a current that changes only with depth, skid in proportion to the turn rate, "
-        "depth held or pitch flown",
-        wrong_when="on one heading (then it is F1: yaw and current are the same); a current that changes along the run",
-        nuisance=(
-            Nuisance("current_east", "m/s", "current_std", of_the_day=True),
-            Nuisance("current_north", "m/s", "current_std", of_the_day=True),
-            Nuisance("skid", "s", 3.0),
-            Nuisance("dive", "", 0.5),
-            Nuisance("heave", "m/s", "heave_offset_std"),
-            Nuisance("shear_east", "1/s", SHEAR_STD, of_the_day=True),
-            Nuisance("shear_north", "1/s", SHEAR_STD, of_the_day=True),
-        ),
-        instead_of="F1",
-        sideslip_std=SIDESLIP_STD,
-        uses_height=True,
-        noise=_a1_noise,
-        motion_is_noise=True,
-    ),
+    sideslip_std=SIDESLIP_STD,
+    uses_height=True,
+    noise=_unaided_noise,
+    motion_is_noise=True,
 )  # fmt: skip
 
 
@@ -187,7 +170,7 @@ FULL = Model(
 
 
 def _per_second(seen: Observations) -> Linearised:
-    """Linearise D1's displacement rate: z = -Tᵀv, H = [Tᵀ[v×], -Tᵀv] on φ and δk.
+    """Linearise the displacement rate of `positions`: z = -Tᵀv, H = [Tᵀ[v×], -Tᵀv] on φ and δk.
 
     `legs` integrates both over time.
     """
@@ -198,8 +181,8 @@ def _per_second(seen: Observations) -> Linearised:
     return -seen.velocity_in_body, h
 
 
-D1 = Model(
-    "D1", Needs.ATTITUDE, 3, _per_second,
+POSITIONS = Model(
+    "positions", Needs.ATTITUDE, 3, _per_second,
     SHOWN_WITH_GNSS | {
         "roll": "positions with their height, while rolling or moving across the bow",
         "pitch": "positions with their height (USBL), and legs of minutes",

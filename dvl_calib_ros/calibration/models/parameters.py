@@ -99,10 +99,6 @@ IMU_ENU, IMU_NED = "enu", "ned"
 XYZ, XY = "xyz", "xy"
 
 
-_AIDED = tuple(name for name, model in MODELS.items() if model.aided)
-_UNAIDED = tuple(name for name, model in MODELS.items() if not model.aided)
-
-
 @dataclass(frozen=True)
 class Parameters:
     """Validated parameters of a calibration. The constructor raises ParameterError."""
@@ -114,16 +110,15 @@ class Parameters:
         read_only=False,
     )
     gnss_model: str = _parameter(
-        "full",
-        "Model of auto with GNSS. iac: M3, or M4 if set here.",
-        choices=_AIDED,
+        "M3",
+        "Model of iac with GNSS (IAC-G).",
+        choices=("M3", "M4"),
         read_only=False,
     )
     gnss_free_model: str = _parameter(
-        "F1",
-        "Model of auto without GNSS; F1 gives way to A1 with attitude over several headings. iac: M7, or M5 or M6 if "
-        "set here.",
-        choices=_UNAIDED,
+        "M7",
+        "Model of iac without GNSS (IAC-GF).",
+        choices=("M5", "M6", "M7"),
         read_only=False,
     )
     gnss_timeout: float = _parameter(
@@ -294,19 +289,19 @@ class Parameters:
     )
     motion_std: float = _parameter(
         ASSUMPTIONS.motion_std,
-        "σ of sway and heave about the model, straight ahead (A1, F1).",
+        "σ of sway and heave about the model, straight ahead (unaided).",
         unit="m/s",
         within=(1e-4, 10.0),
     )
     motion_correlation_time: float = _parameter(
         ASSUMPTIONS.motion_correlation_time,
-        "Correlation time of sway and heave (A1, F1). 0: none.",
+        "Correlation time of sway and heave (unaided). 0: none.",
         unit="s",
         within=(0.0, 600.0),
     )
     heave_offset_std: float = _parameter(
         ASSUMPTIONS.heave_offset_std,
-        "Prior σ of a constant heave, such as trim (A1, F1).",
+        "Prior σ of a constant heave, such as trim (unaided).",
         unit="m/s",
         within=(1e-6, 10.0),
     )
@@ -341,7 +336,7 @@ class Parameters:
     )
     current_std: float = _parameter(
         ASSUMPTIONS.current_std,
-        "Prior σ of the current per axis (A1, F1). On one heading it sets the share of sway that counts as "
+        "Prior σ of the current per axis (unaided). On one heading it sets the share of sway that counts as "
         "misalignment.",
         unit="m/s",
         within=(1e-6, 10.0),

@@ -381,6 +381,8 @@ def whereabouts(
         unusable, unpaired, waiting = pairing["paired"] - given, pairing["unpaired"], pairing["awaiting_reference"]
     elif needs is Needs.ATTITUDE:
         unpaired, waiting = pairing["not_oriented"], pairing["awaiting_attitude"]
+    elif needs is Needs.ATTITUDE_IF_KNOWN:
+        waiting = pairing["awaiting_attitude"]
     return {
         "refused": dvl["received"] - dvl["accepted"] - dvl["held"],
         "unusable": unusable,

@@ -102,6 +102,7 @@ class Pairer:
         add_count(self._tally["pairing"], "oriented", oriented)
         add_count(self._tally["pairing"], "not_oriented", n_usable - oriented)
         self.given[Needs.ATTITUDE] += oriented
+        self.given[Needs.ATTITUDE_IF_KNOWN] += n_usable
 
     def in_earth_frame(self, end: int, newest_ns: Stamps) -> Mask:
         """Return a mask (N,) of the next rows before `end` with an earth-frame reference. newest_ns: as for `pair`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..models import WITH_POSITIONS
+from ..models import POSITIONS
 from ..models.parameters import ParameterError, Parameters
 from ..numerics.frames import Array, cross
 from .interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
@@ -24,9 +24,9 @@ def are_positions(parameters: Parameters) -> bool:
 
 def check_model(parameters: Parameters) -> None:
     """Raise ParameterError if the model needs positions and the reference has velocities."""
-    if parameters.model == WITH_POSITIONS and not are_positions(parameters):
+    if parameters.model == POSITIONS.name and not are_positions(parameters):
         raise ParameterError(
-            f"model: {WITH_POSITIONS} goes by positions, and {parameters.gnss_type} holds velocities; name another "
+            f"model: {POSITIONS.name} goes by positions, and {parameters.gnss_type} holds velocities; name another "
             "model, or a topic of positions (--gnss-topic, gnss_type: NavSatFix or PoseWithCovarianceStamped)"
         )
 

@@ -357,7 +357,7 @@ def _unfit_positions(path: Path, msgtype: str, topic: str, velocities: Array) ->
         return []
     return [
         f"{path}: the positions on {topic} are too noisy, or too seldom, for the velocities that a diagnosis compares "
-        "with the DVL's; dvl-calib replay calibrates with them (model D1)"
+        "with the DVL's; dvl-calib replay calibrates with them (model positions)"
     ]
 
 

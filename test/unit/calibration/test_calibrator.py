@@ -44,7 +44,7 @@ def assert_same(a: Calibrator, b: Calibrator, atol=0.0, names=BY_VELOCITY):
 # ---------------------------------------------------------------- what comes out
 
 
-@pytest.mark.parametrize("names", [("M1",), ("F1", "A1"), ("full",), ("M3", "M7")], ids=" ".join)
+@pytest.mark.parametrize("names", [("M1",), ("unaided",), ("full",), ("M3", "M7")], ids=" ".join)
 def test_a_model_without_the_others_is_what_it_is_among_them(names, one_by_one):
     samples = make_samples(variant(NOISY, seconds=30))
     alone = calibrate(samples, models=names, verified=True)
@@ -239,18 +239,26 @@ def test_switching_models_at_any_time_equals_having_run_that_model_from_the_star
             np.testing.assert_array_equal(switched.estimate().covariance, from_start.estimate().covariance)
 
 
-def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and_hysteresis():
+def test_auto_keeps_the_calibration_by_the_reference_when_the_reference_ends():
+    """A vehicle that dives lost its scale, and roll, to the model without a reference."""
     run = variant(NOISY, seconds=100, gnss_phase=0)
-    outage = [
-        s
-        for s in make_samples(run)
-        if not (isinstance(s, ReferenceSample) and 40 <= (s.stamp_ns - START_NS) / SECOND < 60)
+    dive = [
+        s for s in make_samples(run) if not (isinstance(s, ReferenceSample) and s.stamp_ns > START_NS + 60 * SECOND)
     ]
-    segments = calibrate(outage).selection.segments
-    assert [segment.model for segment in segments] == ["F1", "full", "F1", "full"]
-    at = [(segment.from_ns - START_NS) / SECOND for segment in segments]
-    # lost 2 s after 39.8 s (the first sample beyond is at 42.0), then 3 s of hysteresis; back 3 s after 60 s
-    np.testing.assert_allclose(at, [0.0, 3.0, 45.0, 63.0], atol=1e-6)
+    calibrator = calibrate(dive)
+    assert [segment.model for segment in calibrator.selection.segments] == ["unaided", "full"]
+    assert calibrator.result().selected_because.numbers["why"].code == "REFERENCE_HAS_TOLD"
+    for block_size in (1, 30):
+        assert calibrate(dive, block_size=block_size).selection.segments == calibrator.selection.segments
+
+
+def test_auto_does_not_keep_what_few_references_tell():
+    """Five seconds of a noisy receiver are no calibration, so the model without a reference is back in the dive."""
+    run = variant(NOISY, seconds=100, gnss_phase=0, gnss_std=1.0)
+    dive = [
+        s for s in make_samples(run) if not (isinstance(s, ReferenceSample) and s.stamp_ns > START_NS + 5 * SECOND)
+    ]
+    assert [segment.model for segment in calibrate(dive).selection.segments] == ["unaided", "full", "unaided"]
 
 
 @pytest.mark.parametrize(
@@ -260,7 +268,7 @@ def test_auto_goes_to_the_gnss_free_model_in_an_outage_and_back_with_timeout_and
         ({"gnss_model": "M4", "gnss_free_model": "M5"}, ("M5", "M4")),
     ],
 )
-def test_iac_is_the_published_selection_and_switches_when_auto_does(given, expected):
+def test_iac_is_the_published_selection_with_timeout_and_hysteresis(given, expected):
     run = variant(NOISY, seconds=100, gnss_phase=0)
     outage = [
         s
@@ -269,7 +277,9 @@ def test_iac_is_the_published_selection_and_switches_when_auto_does(given, expec
     ]
     auto, iac = (calibrate(outage, Parameters(model=model, **given)) for model in ("auto", "iac"))
     assert [segment.model for segment in iac.selection.segments] == [*expected, *expected]
-    assert [s.from_ns for s in iac.selection.segments] == [s.from_ns for s in auto.selection.segments]
+    at = [(segment.from_ns - START_NS) / SECOND for segment in iac.selection.segments]
+    # lost 2 s after 39.8 s (the first sample beyond is at 42.0), then 3 s of hysteresis; back 3 s after 60 s
+    np.testing.assert_allclose(at, [0.0, 3.0, 45.0, 63.0], atol=1e-6)
     assert iac.result().selected_because.sentence == "iac: GNSS is available"
     for name in BY_VELOCITY:  # what is selected changes no estimate
         np.testing.assert_array_equal(iac.state(name).x, auto.state(name).x)
@@ -282,7 +292,7 @@ def test_a_flapping_receiver_does_not_flap_the_output():
         if not (isinstance(s, ReferenceSample) and ((s.stamp_ns - START_NS) // SECOND) % 8 < 5)
     ]  # fmt: skip
     segments = calibrate(flapping, Parameters(gnss_hysteresis=6.0)).selection.segments
-    assert [segment.model for segment in segments] == ["F1", "A1"]
+    assert [segment.model for segment in segments] == ["unaided", "full"]
 
 
 # ---------------------------------------------------------------- pairing
@@ -304,7 +314,7 @@ def test_an_earth_frame_reference_without_attitude_is_not_used_and_counted():
     assert counts["pairing"]["paired"] == 0
     assert counts["pairing"]["without_attitude"] > 280
     assert calibrator.estimate("M3").used == 0
-    assert calibrator.selected == "F1"
+    assert calibrator.selected == "unaided"
 
 
 def test_a_fast_dvl_does_not_make_more_of_a_slow_reference_than_there_is():
@@ -411,7 +421,7 @@ def test_at_any_time_each_dvl_sample_that_came_is_in_one_place(seed, block_size)
         calibrator.feed_dvl(DvlSample(at + step * SECOND, (1.5 + 0.01 * step, 0.0, 0.0)))
         calibrator.feed_reference(ReferenceSample(at + step * SECOND, (1.5, 0.0, 0.0)))
         calibrator.feed_imu(ImuSample(at + step * SECOND, (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1)))
-    for name in ("M1", "M3", "M7", "A1", "F1"):
+    for name in ("M1", "M3", "M7", "unaided"):
         found = where(name)
         assert found["gathered"] == 0 and found["waiting"] <= 1, (name, found)
 

@@ -1,4 +1,4 @@
-"""D1 against a simulation of its own: positions with metres of noise tell yaw and scale, and σ covers."""
+"""`positions` against a simulation of its own: positions with metres of noise tell yaw and scale, and σ covers."""
 
 from __future__ import annotations
 

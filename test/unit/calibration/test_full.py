@@ -32,7 +32,7 @@ PHI = (0.0, 0.01, -0.02)
 NOISE = Parameters(gnss_aided_std=0.021)
 GNSS_STD, DVL_STD = 0.02, 0.005
 BEYOND = [*range(*LEVER_ARM_STATES.indices(20)), DELAY]
-AUTO = ("F1", "full")  # what a run with a reference is calibrated with; the others cost, and say nothing here
+AUTO = ("unaided", "full")  # what a run with a reference is calibrated with; the others cost, and say nothing here
 
 
 @cache
@@ -187,7 +187,7 @@ def test_on_a_circle_what_takes_an_unknown_lever_arm_as_known_is_rejected_with_w
         assert all(says_that_an_arm_looks_like_yaw(each) for each in turns) and (
             turns or verification.reasons[0].code == "MISALIGNMENT_LARGE"
         )
-    assert "LEVER_ARM_TURNS_ANGLE" not in [each.code for each in unknown.verification("A1").reasons]
+    assert "LEVER_ARM_TURNS_ANGLE" not in [each.code for each in unknown.verification("unaided").reasons]
     known = calibrate(samples, NOISE.replace(lever_arm=(1.0, 0.3, 0.0), initial_std_lever_arm=0.01), verified=True)
     assert known.verification("full").verdict is not Severity.REJECT
     assert abs(known.estimate("full").state[2]) < 4.0 * known.estimate("full").std[2]

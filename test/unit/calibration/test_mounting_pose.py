@@ -82,7 +82,7 @@ def test_what_a_model_does_not_estimate_is_the_parameters_with_variance_minus_on
     found = mounting_pose(MODELS["M3"], state_of("M3", rng), PARAMETERS)
     assert found.position == PARAMETERS.lever_arm
     np.testing.assert_array_equal(found.covariance[:3, :3], -np.eye(3))
-    beside = scale_and_delay(MODELS["F1"], state_of("F1", rng), PARAMETERS)
+    beside = scale_and_delay(MODELS["unaided"], state_of("unaided", rng), PARAMETERS)
     assert (beside.scale, beside.scale_std, beside.time_offset, beside.time_offset_std) == (0.0, None, 0.25, None)
 
 

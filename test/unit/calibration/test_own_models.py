@@ -68,7 +68,7 @@ def test_full_finds_5_degrees_but_for_what_the_error_model_cannot_hold(degrees, 
     assert residual.max() < 0.01  # the symmetric part of a rotation, which neither ψ and κ nor φ and δk hold
 
 
-# ---------------------------------------------------------------- A1, F1: without GNSS
+# ---------------------------------------------------------------- unaided: without a reference
 
 
 def run_without_gnss(headings_deg, current_enu, misalignment, rng, trim=0.0, seconds_each=100):
@@ -89,7 +89,7 @@ def run_without_gnss(headings_deg, current_enu, misalignment, rng, trim=0.0, sec
 def test_two_headings_tell_yaw_from_a_current(rng):
     samples = run_without_gnss((20.0, 200.0), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
     calibrator = calibrate(samples, Parameters(current_std=0.3))
-    estimate = calibrator.estimate("A1")
+    estimate = calibrator.estimate("unaided")
     assert estimate.misalignment[2] == pytest.approx(0.04, abs=0.004)
     across = dict(zip(estimate.state_names, estimate.state, strict=True))
     heading = np.deg2rad(20.0)
@@ -119,101 +119,90 @@ def run_through_a_shear(misalignment, rng):
 
 @pytest.mark.parametrize("pitch_error", [0.0, 0.05, -0.05])
 def test_a_current_that_changes_with_depth_is_not_taken_for_the_mounting(pitch_error, rng):
-    estimate = calibrate(run_through_a_shear((0.0, pitch_error, 0.04), rng)).estimate("A1")
+    estimate = calibrate(run_through_a_shear((0.0, pitch_error, 0.04), rng)).estimate("unaided")
     # by a constant current alone it comes out as 0.071
     assert estimate.misalignment[2] == pytest.approx(0.04, abs=0.02)
     found = dict(zip(estimate.state_names, estimate.state, strict=True))
     assert found["shear_north"] == pytest.approx(0.01, abs=0.005)
 
 
-def test_one_heading_does_not_and_a1_says_so_and_falls_back_to_what_f1_says(rng):
+def test_one_heading_does_not_and_the_model_says_so(rng):
     samples = run_without_gnss((20.0,), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
     calibrator = calibrate(samples)
-    a1, f1 = calibrator.estimate("A1"), calibrator.estimate("F1")
-    yaw = a1.observability[2]
+    estimate = calibrator.estimate("unaided")
+    yaw = estimate.observability[2]
     assert not yaw.observed
     assert yaw.axis == "yaw"
     assert "heading" in yaw.missing
-    assert a1.misalignment[2] == pytest.approx(f1.misalignment[2], abs=0.004)
-    assert abs(a1.misalignment[2] - 0.04) < abs(calibrator.estimate("M7").misalignment[2] - 0.04)
+    assert abs(estimate.misalignment[2] - 0.04) < abs(calibrator.estimate("M7").misalignment[2] - 0.04)
 
 
 def test_holding_depth_shows_pitch_however_the_vehicle_is_trimmed(rng):
     samples = run_without_gnss((20.0, 200.0), (0.0, 0.0), (0.0, 0.03, 0.0), rng, trim=np.deg2rad(-3.0))
     estimates = calibrate(samples).result().estimates
-    assert estimates["A1"].misalignment[1] == pytest.approx(0.03, abs=0.012)
+    assert estimates["unaided"].misalignment[1] == pytest.approx(0.03, abs=0.012)
     assert abs(estimates["M7"].misalignment[1] - 0.03) > 0.015
 
 
-def test_without_attitude_a1_learns_nothing_and_the_others_are_not_kept_waiting():
-    calibrator = calibrate(only(make_samples(MatchedRun()), DvlSample))
-    assert calibrator.estimate("A1").used == 0
-    assert calibrator.estimate("F1").used == len(only(make_samples(MatchedRun()), DvlSample))
-    assert calibrator.counts["pairing"]["not_oriented"] > 0
+def test_without_attitude_sway_and_heave_are_constants():
+    samples = only(make_samples(MatchedRun("straight", phi=(0.0, 0.02, 0.03))), DvlSample)
+    calibrator = calibrate(samples)
+    estimate, parameters = calibrator.estimate("unaided"), Parameters()
+    waiting = calibrator.counts["pairing"]["awaiting_attitude"]  # for as long as an IMU may be late
+    assert estimate.used == calibrator.counts["pairing"]["not_oriented"] == len(samples) - waiting
+    assert waiting == 5
+    # the share of the sway that counts as yaw, by the priors
+    yaw, current = 1.5 * parameters.initial_std_misalignment, parameters.current_std
+    assert estimate.misalignment[2] == pytest.approx(0.03 * yaw**2 / (yaw**2 + current**2), rel=0.2)
+    assert estimate.misalignment[1] == pytest.approx(0.02, abs=0.004)
 
 
 def test_no_number_of_headings_tells_yaw_better_than_a_vehicle_swims_straight(rng):
     samples = run_without_gnss((20.0, 200.0) * 4, (0.2, -0.1), (0.0, 0.0, 0.04), rng)
-    yaw = calibrate(samples, Parameters(current_std=0.3)).estimate("A1").std[2]
+    yaw = calibrate(samples, Parameters(current_std=0.3)).estimate("unaided").std[2]
     assert np.deg2rad(0.34) < yaw < np.deg2rad(0.55)
 
 
-def test_auto_runs_a1_once_headings_tell_a_current_from_the_mounting_and_says_so(rng):
-    samples = run_without_gnss((20.0, 200.0, 20.0), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
-    calibrator = calibrate(samples)
-    first, second = calibrator.selection.segments
-    assert (first.model, second.model) == ("F1", "A1")
-    assert 100.0 < 1e-9 * (second.from_ns - first.from_ns) < 200.0  # on the second heading
-    assert calibrator.result().selected_because.numbers["why"].code == "HEADINGS_TELL_CURRENT"
-    for block_size in (1, 30):
-        assert calibrate(samples, block_size=block_size).selection.segments == calibrator.selection.segments
-    assert calibrate(samples, Parameters(gnss_free_model="M7")).selected == "M7"
-
-
-def test_auto_stays_with_f1_on_one_heading_or_without_attitude_and_says_so(rng):
-    samples = run_without_gnss((20.0,) * 3, (0.2, -0.1), (0.0, 0.0, 0.04), rng)
-    for each in (samples, only(run_without_gnss((20.0, 200.0), (0.0, 0.0), (0.0, 0.0, 0.0), rng), DvlSample)):
-        calibrator = calibrate(each)
-        assert calibrator.selected == "F1"
-        assert calibrator.result().selected_because.numbers["why"].code == "HEADINGS_TOO_FEW"
-
-
 @pytest.mark.parametrize("trim_deg", [3.0, -3.0])
-def test_auto_runs_a1_on_one_heading_too_where_the_vehicle_is_trimmed_and_says_so(trim_deg, rng):
-    """F1 takes a vehicle that holds its depth nose up for one that moves where it points: 7 sigma of pitch."""
+def test_a_trimmed_vehicle_on_one_heading_is_not_taken_for_a_pitch(trim_deg, rng):
+    """A vehicle that holds its depth nose up is not one that moves where it points."""
     samples = run_without_gnss((20.0,) * 3, (0.0, 0.0), (0.0, 0.03, 0.0), rng, trim=np.deg2rad(trim_deg))
-    calibrator = calibrate(samples)
-    assert [each.model for each in calibrator.selection.segments] == ["F1", "A1"]
-    assert calibrator.result().selected_because.numbers["why"].code == "TRIM_KNOWN"
-    pitch, std = calibrator.estimate().misalignment[1], calibrator.estimate().std[1]
-    assert abs(pitch - 0.03) < 3.0 * std
-    for block_size in (1, 30):
-        assert calibrate(samples, block_size=block_size).selection.segments == calibrator.selection.segments
+    estimate = calibrate(samples).estimate()
+    assert estimate.model == "unaided"
+    assert abs(estimate.misalignment[1] - 0.03) < 3.0 * estimate.std[1]
 
 
-def test_with_gnss_headings_change_nothing():
+def test_an_imu_that_starts_late_changes_little(rng):
+    """Samples without attitude have a sway of their own, which is no current."""
+    samples = run_without_gnss((20.0, 200.0), (0.2, -0.1), (0.0, 0.0, 0.04), rng)
+    late = [each for each in samples if isinstance(each, DvlSample) or each.stamp_ns > 30 * SECOND]
+    whole, part = (calibrate(each, Parameters(current_std=0.3)).estimate("unaided") for each in (samples, late))
+    assert part.used == whole.used
+    assert part.misalignment[2] == pytest.approx(0.04, abs=0.006)
+
+
+def test_with_gnss_auto_runs_full():
     segments = calibrate(make_samples(MatchedRun("box", 120.0, gnss_std=0.05))).selection.segments
-    assert [segment.model for segment in segments] == ["F1", "full"]
+    assert [segment.model for segment in segments] == ["unaided", "full"]
 
 
-def test_f1_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
+def test_unaided_finds_more_of_the_angle_than_m7_on_a_straight_run(rng):
     samples = run_without_gnss((20.0,), (0.0, 0.0), (0.0, 0.03, -0.04), rng, seconds_each=400)
     calibrator = calibrate(samples, Parameters(current_std=0.05))
     truth = np.array([0.0, 0.03, -0.04])
-    errors = {name: np.abs(calibrator.estimate(name).misalignment - truth)[1:] for name in ("M7", "F1")}
-    assert (errors["F1"] < 0.8 * errors["M7"]).all()
+    errors = {name: np.abs(calibrator.estimate(name).misalignment - truth)[1:] for name in ("M7", "unaided")}
+    assert (errors["unaided"] < 0.8 * errors["M7"]).all()
 
 
 @pytest.mark.slow
 def test_a_faster_dvl_does_not_make_the_models_of_motion_surer():
     run = MatchedRun("box", 300.0, dvl_std=0.01)
     slow, fast = (calibrate(make_samples(replace(run, dvl_every=every))) for every in (100, 10))
-    for name in ("A1", "F1"):
-        np.testing.assert_allclose(fast.estimate(name).std[:3], slow.estimate(name).std[:3], rtol=0.2)
+    np.testing.assert_allclose(fast.estimate("unaided").std[:3], slow.estimate("unaided").std[:3], rtol=0.2)
 
 
 def test_corrected_velocities_use_the_errors_not_the_nuisance():
-    estimate = calibrate(make_samples(MatchedRun("box", 60.0, phi=(0.0, 0.0, 0.02)))).estimate("A1")
+    estimate = calibrate(make_samples(MatchedRun("box", 60.0, phi=(0.0, 0.0, 0.02)))).estimate("unaided")
     velocity = np.array([[1.5, 0.1, 0.0]])
     expected = correct(velocity, estimate.state[:3], np.zeros(3), np.eye(3))
     np.testing.assert_array_equal(estimate.corrected_velocity(velocity, np.eye(3)), expected)

@@ -11,7 +11,7 @@ from dvl_calib_ros.files.parameter_files import load_parameters, model_table, pa
 
 # interfaces.md, "Parameters that scripts rely on by name"
 CONTRACT = {
-    "model": "auto", "gnss_model": "full", "gnss_free_model": "F1", "gnss_timeout": 2.0, "gnss_hysteresis": 3.0,
+    "model": "auto", "gnss_model": "M3", "gnss_free_model": "M7", "gnss_timeout": 2.0, "gnss_hysteresis": 3.0,
     "gnss_frame": "from_frame_id", "mounting_rpy": (0, 0, 0), "lever_arm": (0, 0, 0), "dvl_time_offset": 0.0,
     "initial_std_misalignment": 0.05, "initial_std_scale": 0.006, "process_std_misalignment": 0.0,
     "process_std_scale": 0.0, "use_message_covariance": True, "gnss_aided_std": 0.2, "gnss_free_std": 0.025,
@@ -36,7 +36,7 @@ def test_names_and_defaults_are_those_that_scripts_rely_on():
         ({"gnss_timeout": True}, "gnss_timeout: expected a number"),
         ({"model": "M8"}, "model: 'M8' is not one of auto, iac, M1"),
         ({"model": 3}, "model: expected text"),
-        ({"gnss_model": "M7"}, "gnss_model: 'M7' is not one of M1"),
+        ({"gnss_model": "M7"}, "gnss_model: 'M7' is not one of M3"),
         ({"gnss_free_model": "M3"}, "gnss_free_model: 'M3' is not one of M5"),
         ({"mounting_rpy": [0.0, 0.0]}, "mounting_rpy: expected an array of 3 numbers"),
         ({"mounting_rpy": "000"}, "mounting_rpy: expected an array of 3 numbers"),

@@ -93,6 +93,6 @@ def test_without_a_heading_no_course_is_named():
 
 def test_without_a_scale_it_is_said_that_it_stays_unknown():
     parameters = Parameters(target_drift=1000.0)
-    estimate = calibrate(make_samples(replace(RUN, gnss_every=0)), parameters).estimate("A1")
-    assert math.isnan(predicted_drift(MODELS["A1"], estimate.recording_covariance, parameters).ahead)
+    estimate = calibrate(make_samples(replace(RUN, gnss_every=0)), parameters).estimate("unaided")
+    assert math.isnan(predicted_drift(MODELS["unaided"], estimate.recording_covariance, parameters).ahead)
     assert outlook(estimate, parameters, EASTWARD).next.code == "NEXT_IS_GOOD_BUT_SCALE"

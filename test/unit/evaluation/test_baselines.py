@@ -13,7 +13,7 @@ from dvl_calib_ros.evaluation.metrics import BASELINES
 from dvl_calib_ros.evaluation.protocol import own_trajectories
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS, dvl_velocities, references
 
-MODELS = ("M3", "A1")
+MODELS = ("M3", "unaided")
 
 
 @pytest.mark.parametrize("name", BASELINES)
@@ -42,7 +42,7 @@ def found():
 
 
 def test_a_curve_is_there_for_each_reference_noise_and_for_none(found):
-    assert set(found) == set(curve_keys(MODELS)) and (("A1", None) in found)
+    assert set(found) == set(curve_keys(MODELS)) and (("unaided", None) in found)
     for each in found.values():
         assert each.rms.shape == (len(TIMES_S), 3) and (each.angle_deg >= each.level_deg).all()
 
@@ -56,4 +56,4 @@ def test_g1_is_better_with_time_with_a_better_receiver_and_than_the_baselines(fo
 
 
 def test_without_a_reference_the_error_stays_below_that_of_the_prior(found):
-    assert found["A1", None].angle_deg.max() < np.degrees(np.linalg.norm(protocol.truth()[:, :3], axis=1)).max()
+    assert found["unaided", None].angle_deg.max() < np.degrees(np.linalg.norm(protocol.truth()[:, :3], axis=1)).max()

@@ -17,7 +17,7 @@ from dvl_calib_ros.evaluation.results import Failure
 from dvl_calib_ros.evaluation.validation_study import DEFAULTS, evaluate, sensor_data
 
 N_SAMPLES, ENDS = 60, (20, 60)
-MODELS = ("M4", "M3", "A1")
+MODELS = ("M4", "M3", "unaided")
 COMMAND = ("evaluate", "--models", "M4,M3", "--sets", "E4", "--jobs", "1")
 
 

@@ -95,7 +95,7 @@ WRONG = [
     ("{lever_arm: [1, 2, x]}", "lever_arm[2]: expected a number"),
     ("{mounting_rpy: [0, 0, 7]}", "mounting_rpy[2]: 7 is outside"),
     ("{model: M9}", "model: 'M9' is not one of auto, iac, M1"),
-    ("{gnss_model: M7}", "gnss_model: 'M7' is not one of M1"),
+    ("{gnss_model: M7}", "gnss_model: 'M7' is not one of M3"),
     ("{model: 3}", "model: expected text"),
     ("[min_speed, 1]", "is not a list of name: value"),
     ("", "is not a list of name: value"),

@@ -399,7 +399,7 @@ def test_a_filter_continued_from_a_file_ends_as_if_both_had_been_one(tmp_path):
     for name, expected in whole.items():
         if MODELS[name].estimator:  # works in whole blocks, and each run has a rest
             continue
-        # the motion's news is shared with the sample before, which the first of a run has not (F1, A1)
+        # the motion's news is shared with the sample before, which the first of a run has not (unaided)
         exact = not MODELS[name].motion_is_noise
         tolerance = {"rel": 1e-9, "abs": 1e-12} if exact else {"rel": 5e-3, "abs": 3e-4}
         assert continued[name] == pytest.approx(expected, **tolerance)
