@@ -51,7 +51,8 @@ def test_every_sample_of_every_trajectory_is_accounted_for(name, trajectories, t
     pairing = result.counts["pairing"]  # no attitude in the bag
     assert pairing["not_oriented"] + pairing["awaiting_attitude"] == dvl["usable"]
     for model, estimate in result.estimates.items():
-        given = 0 if MODELS[model].needs is Needs.ATTITUDE else dvl["usable"]
+        needs = MODELS[model].needs
+        given = {Needs.ATTITUDE: 0, Needs.ATTITUDE_IF_KNOWN: pairing["not_oriented"]}.get(needs, dvl["usable"])
         if MODELS[model].estimator:  # whole blocks of 10 s; at 1 Hz, its last samples wait for theirs
             assert given - 25 < estimate.used + estimate.gated <= given
         else:
