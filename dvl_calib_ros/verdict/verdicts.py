@@ -143,6 +143,7 @@ MANOEUVRES = on_page(
     accept("NEXT_CIRCLE", "circle to {side}", means="Turns show the lever arm and average earth-fixed errors."),
     accept("NEXT_EIGHT", "drive a figure eight", means="Turns to both sides separate lever arm and yaw."),
     accept("NEXT_DIVE", "dive and rise by 10° of pitch", means="Pitching shows the vertical axis."),
+    accept("NEXT_REFERENCE", "surface: {model} learns only with the reference"),
     accept("NEXT_WAIT", "keep on: nothing is learnt yet"),
     accept("NEXT_REJECTED", "nothing: the findings say why this calibration is not to be used"),
     accept("NEXT_STANDS", "keep on until the drift has stayed on target"),

@@ -109,7 +109,12 @@ def test_without_gnss_a1_finds_the_yaw_of_a_real_vehicle_within_its_sigma_and_au
         sigmas.append(np.degrees(estimate.std[2]))
         selected.append(result.selected)
     error, scaled = np.array(errors), np.array(errors) / sigmas
-    print("unaided, deg:", np.round(error, 2), np.median(np.abs(error)), *(np.sqrt(np.mean(x**2)) for x in (error, scaled)))
+    print(
+        "unaided, deg:",
+        np.round(error, 2),
+        np.median(np.abs(error)),
+        *(np.sqrt(np.mean(x**2)) for x in (error, scaled)),
+    )
     assert np.median(np.abs(error)) < 0.32
     assert np.sqrt(np.mean(error**2)) < 0.38
     assert 0.6 < np.sqrt(np.mean(scaled**2)) < 1.0

@@ -255,9 +255,7 @@ def test_auto_keeps_the_calibration_by_the_reference_when_the_reference_ends():
 def test_auto_does_not_keep_what_few_references_tell():
     """Five seconds of a noisy receiver are no calibration, so the model without a reference is back in the dive."""
     run = variant(NOISY, seconds=100, gnss_phase=0, gnss_std=1.0)
-    dive = [
-        s for s in make_samples(run) if not (isinstance(s, ReferenceSample) and s.stamp_ns > START_NS + 5 * SECOND)
-    ]
+    dive = [s for s in make_samples(run) if not (isinstance(s, ReferenceSample) and s.stamp_ns > START_NS + 5 * SECOND)]
     assert [segment.model for segment in calibrate(dive).selection.segments] == ["unaided", "full", "unaided"]
 
 

@@ -13,7 +13,7 @@ from runs import MatchedRun, calibrate, make_samples
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.filters.observability import PredictedDrift, predicted_drift
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
+from dvl_calib_ros.calibration.numerics.samples import ReferenceSample, VelocityFrame
 from dvl_calib_ros.node.operator_card import (
     LEAST_LOOKS,
     SECTORS,
@@ -51,6 +51,17 @@ def test_before_the_first_sample_nothing_is_known_and_all_is_said_so():
     assert said["elapsed [s]"] == "1" and said["dvl rate [Hz]"] == said["dvl age [s]"] == said["seconds"] == "-"
     assert said["worth ahead"] == "-" and "goal ahead [%]" not in said  # no model without a reference knows the scale
     assert said["next code"] == "NEXT_WAIT" and float(said["goal worth [%]"]) == pytest.approx(0.0, abs=1.0)
+
+
+def test_in_a_dive_the_card_asks_for_the_reference():
+    start_ns = make_samples(RUN)[0].stamp_ns
+    dive = [
+        each
+        for each in make_samples(RUN)
+        if not isinstance(each, ReferenceSample) or each.stamp_ns < start_ns + 90_000_000_000
+    ]
+    said = values(Card(0.0), calibrate(dive, Parameters(target_drift=0.5)), counts(600), 1.0)
+    assert said["next"] == "surface: full learns only with the reference"
 
 
 def test_rates_are_those_of_the_last_seconds_and_ages_since_something_came():
