@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import struct
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, BinaryIO, NamedTuple
 
@@ -136,10 +136,16 @@ def one_batch(messages: Iterable[BagMessage]) -> Batch:
     log_ns, channels, data = tuple(zip(*messages, strict=True)) or ((), (), ())
     numbers: dict[int, int] = {}  # the channel's id is cheap; its hash would take most of the time
     number = np.array([numbers.setdefault(id(channel), len(numbers)) for channel in channels], dtype=np.intp)
-    known = {numbers[id(channel)]: channel for channel in channels}
-    end = np.cumsum([len(each) for each in data], dtype=np.intp)
-    start = np.concatenate([[0], end[:-1]]).astype(np.intp)
-    return Batch(times(log_ns), number, start, end, b"".join(data), known)
+    return numbered_batch(log_ns, number, data, {numbers[id(channel)]: channel for channel in channels})
+
+
+def numbered_batch(
+    log_ns: Sequence[int], number: Sequence[int] | Index, data: Sequence[bytes], channels: Mapping[int, Channel]
+) -> Batch:
+    """Return messages with log times and channel numbers (N,) as one batch, in their order."""
+    length = np.array([len(each) for each in data], dtype=np.intp)
+    end = np.cumsum(length)
+    return Batch(times(log_ns), np.asarray(number, dtype=np.intp), end - length, end, b"".join(data), channels)
 
 
 # bytes sorted in memory at a time; the rest waits on disk

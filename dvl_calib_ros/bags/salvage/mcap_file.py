@@ -26,7 +26,7 @@ from mcap.records import ChunkIndex
 from mcap.summary import Summary
 from numpy.typing import NDArray
 
-from ..batches import Batch, one_batch, times
+from ..batches import Batch, numbered_batch, times
 from ..channels import Channel
 from ..files import holes_in, open_raw
 from .damage import LARGEST_RECORD, Damage, DamagedError, Salvaged
@@ -215,8 +215,8 @@ def _whole_chunk(
     damage = Damage()
     messages = messages_of(at, chunk.records, tables, damage, channels)
     damage.raise_if_any()
-    singly = ((log_ns, channels[number], data) for log_ns, number, data in messages)
-    return one_batch(singly)
+    log_ns, number, data = tuple(zip(*messages, strict=True)) or ((), (), ())
+    return numbered_batch(log_ns, number, data, channels)
 
 
 def _indexed_starts(file: BinaryIO, index: ChunkIndex) -> NDArray[np.uint64] | None:
