@@ -1,7 +1,8 @@
 """Discovery of topics and frames while the node runs, by the same rules as in recordings.
 
 If the DVL's topic has no publisher and another topic may be a DVL's, or if the reference's frame is unknown, all
-candidate topics are recorded for a while and examined like a recording. The modules that read recordings are imported only then: a ROS machine need not have them.
+candidate topics are recorded for a while and examined like a recording. The modules that read recordings are imported
+only then: a ROS machine need not have them.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ class Discovering:
     def step(self, named: Mapping[str, str | None]) -> FoundTopics | None:
         """Start to record, subscribe to new topics, or examine the recording. Return a result once.
 
-        named: topic by role (dvl, gnss, imu), None where it is searched. If the DVL's is named, the frames are searched,
-        until the data decide between them. Raises InputError if recording or reading fails.
+        named: topic by role (dvl, gnss, imu), None where it is searched. With a named DVL the frames are searched,
+        until the data decide. Raises InputError if recording or reading fails.
         """
         if self._looked_through is not None:
             return self._outcome(self._looked_through)

@@ -412,7 +412,7 @@ class Parameters:
     )
     discover: bool = _parameter(
         True,
-        "Look for DVL, reference and IMU while the DVL's topic is silent and not remapped; choose the reference's frame.",
+        "Look for DVL, reference and IMU while its topic is silent and not remapped; choose the reference's frame.",
     )
     target_drift: float = _parameter(
         2.0,

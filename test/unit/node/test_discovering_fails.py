@@ -15,7 +15,6 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.drivers import TWIST_TYPE
 from dvl_calib_ros.node.live_discovery import Discovering
 
-
 NONE_NAMED = {"dvl": None, "gnss": None, "imu": None}
 
 
