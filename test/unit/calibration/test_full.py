@@ -37,7 +37,7 @@ AUTO = ("F1", "full")  # what a run with a reference is calibrated with; the oth
 
 @cache
 def late(seconds: float, seed: int = 0, arm=LEVER_ARM, duration: float = 150.0, bursts=()):
-    """A figure of eight with changes of speed, smooth at any time; the DVL's stamps late by so many seconds.
+    """A figure of eight with changes of speed, smooth at any time; the DVL's DVL late against IMU by so many seconds.
 
     bursts: times, s, about which the vehicle is faster by 0.8 m/s for a second or so.
     """
