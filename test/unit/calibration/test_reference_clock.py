@@ -15,7 +15,7 @@ from dvl_calib_ros.verdict.reasons import Reason
 
 
 def stamped_late(samples, kind, seconds):
-    """The same with one stream's DVL late against IMU."""
+    """The same with one stream's stamps late."""
     shift_ns = round(seconds * 1e9)
     moved = (s._replace(stamp_ns=s.stamp_ns + shift_ns) if isinstance(s, kind) else s for s in samples)
     return sorted(moved, key=lambda sample: sample.stamp_ns)
