@@ -298,6 +298,7 @@ class JointFit:
             if step @ last < 0.0:
                 self._x = 0.5 * (before + self._x)
             last = step
+        assert self._fitted is not None
         self._x = self._fitted.state.x.copy()
 
     def _forget(self) -> None:

@@ -335,7 +335,7 @@ class MotionFit:
         jacobian[:, :, ARM] = skew(rates)
         jacobian[:, :, APART] = -(1.0 + x[SCALE]) * slope @ rotation.T
         jacobian[:, :, LATE] = cross(rates, body)
-        drift = np.zeros((len(at), 3))
+        drift: Array = np.zeros((len(at), 3))
         if self.is_turned:
             since, seconds = self.times[at] - self.times.mean(), float(np.ptp(self.times))
             rate = min(DRIFT_STD_RADPS, DRIFT_AT_MOST / seconds)
