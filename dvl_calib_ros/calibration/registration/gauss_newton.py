@@ -147,11 +147,13 @@ class AxisFactors(NamedTuple):
 class _Rows(NamedTuple):
     """Linearised rows: residual (J, A) m/s, jacobian (J, A, 9), reference indices `at` (J,), RMS speed (m/s).
 
-    of_noise (J,): expected squared δ column by DVL noise alone. A drift of the heading is projected out.
+    of_noise (J,): expected squared δ column by DVL noise alone. drift (J, A): derivatives by a drift of
+    the heading, in its prior σ, which is projected out of residual and jacobian.
     """
 
     residual: Array
     jacobian: Array
+    drift: Array
     at: Index
     of_noise: Array
     speed: float
@@ -253,7 +255,7 @@ class MotionFit:
             return AxisFactors(np.ones(3), np.full(3, np.inf))
         axes = rows.residual.shape[1]
         weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_AT**2 * axes * fitted.level**2))
-        own = self._axes_of_dvl(fitted, rows, rotation)
+        _, own = _without(rows.drift, rows.residual, self._axes_of_dvl(fitted, rows, rotation))
         kept = [*range(N)[TURN], *range(N)[ARM], APART]
         h = np.concatenate([own, rows.jacobian[:, :, kept]], axis=2).reshape(-1, 3 + len(kept))
         w = np.repeat(weight, axes) / fitted.level**2
@@ -343,12 +345,13 @@ class MotionFit:
         measured = np.array(self._motion.measured)
         if not measured.all():
             if self._motion.in_earth:
-                residual, drift = (np.einsum("nij,nj->ni", attitude, each) for each in (residual, drift))
+                residual = np.einsum("nij,nj->ni", attitude, residual)
+                drift = np.einsum("nij,nj->ni", attitude, drift)
                 jacobian = attitude @ jacobian
             residual, jacobian, drift = residual[:, measured], jacobian[:, measured], drift[:, measured]
         speed = float(np.sqrt(squared(body).mean()))
-        residual, jacobian = _without(drift, residual, jacobian)
-        return _Rows(residual, jacobian, at, gain * self.dvl_noise * residual.shape[1], speed)
+        residual, projected = _without(drift, residual, jacobian)
+        return _Rows(residual, projected, drift, at, gain * self.dvl_noise * residual.shape[1], speed)
 
     def _solved(
         self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]
@@ -393,7 +396,7 @@ def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Cl
 
 
 def _without(column: Array, residual: Array, jacobian: Array) -> tuple[Array, Array]:
-    """Project a nuisance column (J, A), in its prior σ, out of residuals (J, A) and derivatives (J, A, 9)."""
+    """Project a nuisance column (J, A), in its prior σ, out of residuals (J, A) and derivatives (J, A, k)."""
     axes = residual.shape[1]
     squares = squared(residual)
     level2 = max(float(median(squares)) / _MEDIAN_CHI2[axes - 1], 1e-8)
