@@ -14,7 +14,7 @@ from ..bag_replay.replay import Replayed
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
-from ..calibration.results.mounting_quantities import Quantity, quantities
+from ..calibration.results.mounting_quantities import LATE, Quantity, quantities
 from ..discovery.discovery import Discovery
 from ..errors import InputError, printable
 from ..verdict.reasons import Reason
@@ -46,8 +46,8 @@ class Mounting:
     not_observable
         Names of estimated quantities that the data do not make observable, as in the report.
     time_offset_s, time_offset_std_s
-        Delay of the DVL's stamps, s, estimated or else configured; of several recordings the last one's
-        (`Result.delays`).
+        Delay of the DVL's stamps against the IMU's, s, estimated or else configured; of several recordings the last
+        one's (`Result.delays`).
     scale_percent, scale_std_percent
         Scale error of forward motion, positive if the DVL measures too much; nan if the model has no scale.
     base_frame, dvl_frame
@@ -87,10 +87,10 @@ class Mounting:
             )
             parts.append(f"lever arm {', '.join(values)}")
         if math.isnan(self.time_offset_std_s):
-            parts.append(f"stamps late {self.time_offset_s:g} s as configured, not estimated")
+            parts.append(f"{LATE} {self.time_offset_s:g} s as configured, not estimated")
         else:
             offset = f"{self.time_offset_s:.3f} ± {self.time_offset_std_s:.3f} s"
-            parts.append(f"stamps late {offset}{self._remark('stamps late')}")
+            parts.append(f"{LATE} {offset}{self._remark(LATE)}")
         return printable(f"{self.dvl_frame} in {self.base_frame}: {', '.join(parts)}")
 
     def _remark(self, name: str) -> str:

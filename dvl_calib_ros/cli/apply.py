@@ -172,8 +172,8 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     if calibrated.dvl_time_offset:
         late = "late" if calibrated.dvl_time_offset > 0.0 else "early"
         lines.append(
-            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late} in this recording: URDF and "
-            "TF have no delay; --params writes dvl_time_offset, or set the DVL's clock"
+            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late} against the IMU's in "
+            "this recording: URDF and TF have no delay; --params writes dvl_time_offset, or set the DVL's clock"
         )
     if calibrated.position is not None:
         lines.append(f"position: {_metres(calibrated.position)} in {calibrated.base_frame}")

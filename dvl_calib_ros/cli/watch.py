@@ -143,7 +143,7 @@ STREAMS = (("dvl", "DVL"), ("gnss", "reference"), ("imu", "IMU"))
 MOUNTING = (
     (("roll", "deg", "°"), ("pitch", "deg", "°"), ("yaw", "deg", "°")),
     (("arm x", "m", " m"), ("arm y", "m", " m"), ("arm z", "m", " m")),
-    (("scale", "%", " %"), ("delay", "s", " s")),
+    (("scale", "%", " %"), ("delay", "s", " s against the IMU")),
 )
 SECTORS = ("N", "NE", "E", "SE", "S", "SW", "W", "NW")
 HEIGHTS = " ▁▂▃▄▅▆▇█"

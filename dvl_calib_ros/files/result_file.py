@@ -33,7 +33,7 @@ from ..calibration.numerics.frames import (
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.tests import chi2_sf
 from ..calibration.results.held_out_verification import verification_document
-from ..calibration.results.mounting_quantities import Quantity, quantities
+from ..calibration.results.mounting_quantities import LATE, Quantity, quantities
 from ..calibration.results.results import (
     Estimate,
     Result,
@@ -161,7 +161,7 @@ def days_document(result: Result) -> dict[str, Any]:
 def _found(result: Result) -> dict[str, str]:
     """Return each quantity with its σ, and which configured values the model does not estimate."""
     found = {each.name: _in_words(each) for each in quantities(result)}
-    configured = {"lever arm": result.parameters["lever_arm"], "stamps late": [result.parameters["dvl_time_offset"]]}
+    configured = {"lever arm": result.parameters["lever_arm"], LATE: [result.parameters["dvl_time_offset"]]}
     for (name, values), unit in zip(configured.items(), ("m", "s"), strict=True):
         if not any(each.startswith(name) for each in found):
             found[name] = f"{' '.join(f'{value + 0.0:g}' for value in values)} {unit} as configured, not estimated"

@@ -23,7 +23,7 @@ from ..bags.files import STORAGE_SUFFIXES, storage_suffix
 from ..calibration.checks.speed_of_sound import Water
 from ..calibration.models.parameters import Parameters
 from ..calibration.results.extrinsics import Extrinsics
-from ..calibration.results.mounting_quantities import quantities
+from ..calibration.results.mounting_quantities import LATE, quantities
 from ..calibration.results.results import Estimate, Result
 from ..discovery.discover import discover
 from ..discovery.discovery import Given
@@ -353,7 +353,7 @@ def _quantities(result: Result) -> list[Row]:
     ]
     return [
         {
-            "parameter": "time_offset" if last.name.startswith("stamps late") else last.name.replace(" ", "_"),
+            "parameter": "time_offset" if last.name.startswith(LATE) else last.name.replace(" ", "_"),
             "unit": _UNITS.get(last.unit, last.unit.strip()),
             "nominal": last.nominal,
             "value": last.value,

@@ -267,7 +267,11 @@ def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
 
 def _delay(calibrated: CalibratedMounting) -> list[str]:
     late = calibrated.dvl_time_offset
-    return [f"the DVL's stamps are {late:+.3f} s late, for which the instrument has no setting"] if late else []
+    return (
+        [f"the DVL's stamps are {late:+.3f} s late against the IMU's, for which the instrument has no setting"]
+        if late
+        else []
+    )
 
 
 INSTRUMENTS: Mapping[str, Instrument] = {

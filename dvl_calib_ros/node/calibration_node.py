@@ -142,7 +142,10 @@ class CalibrationNode(AnsweringNode):
         _check_distinct(topics | {"~/calibrated_twist": self._corrected_publisher.topic_name})
         now_s = self._pauses.running_s(steady_s())
         self._silence, self._recent, self._card = Silence(now_s, topics), RecentCounts(), Card(now_s)
-        self._discovering = self._to_discover(parameters, topics)
+        space = self.get_namespace().rstrip("/")
+        self._remapped = {own for own, topic in topics.items() if topic != f"{space}/{own}"}
+        given = self._given if initial is None else {*self._given, "mounting_rpy"}
+        self._discovering = Discovering(self, parameters, given, self._worker) if parameters.discover else None
         self._water_heard = WaterHeard(self, parameters.discover)
         self._water: Water | None = None
         self._newest_dvl: Any = None
@@ -155,26 +158,28 @@ class CalibrationNode(AnsweringNode):
         self.create_timer(1.0, self._publish_diagnostics, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._log_configuration()
 
-    def _to_discover(self, parameters: Parameters, topics: Mapping[str, str]) -> Discovering | None:
-        """Return the search for topics, or None if the DVL's topic was remapped or discovery is off."""
+    def _named_topics(self, *, has_dvl: bool) -> dict[str, str | None]:
+        """Return the topics that a search must keep, by role: remapped ones and, next to a DVL, published ones."""
         roles = {"dvl": "dvl/twist", "gnss": "gnss/twist", "imu": "imu/data"}
-        space = self.get_namespace().rstrip("/")
-        named = {role: None if topics[own] == f"{space}/{own}" else topics[own] for role, own in roles.items()}
-        if not parameters.discover or named["dvl"] is not None:
-            return None
-        given = self._given if self._initial is None else {*self._given, "mounting_rpy"}
-        return Discovering(self, named, parameters, given, self._worker)
+        topics = {role: self._inputs[own].topic_name for role, own in roles.items()}
+        return {
+            role: topic if roles[role] in self._remapped or (has_dvl and self.count_publishers(topic)) else None
+            for role, topic in topics.items()
+        }
 
     def _discover(self) -> None:
-        """Search for topics while the DVL's has no publisher, and subscribe to the topics found."""
-        searching = self._discovering
+        """Search while the DVL has no publisher or the reference's frame is unknown, and start with what was found."""
+        searching, decoder, dvl = self._discovering, self._feed.decoder, self._inputs["dvl/twist"].topic_name
         if searching is None:
             return
-        if self.count_publishers(self._inputs["dvl/twist"].topic_name) or self._calibrator.counts["dvl"]["received"]:
+        has_dvl = bool(
+            "dvl/twist" in self._remapped or self.count_publishers(dvl) or self._calibrator.counts["dvl"]["received"]
+        )
+        if has_dvl and (decoder.frame_of_reference is not None or "reference frame" not in decoder.problems):
             searching.close()
             return
         try:
-            found = searching.step()
+            found = searching.step(self._named_topics(has_dvl=has_dvl))
         except InputError as error:
             self.warn(f"{error}; topics are not searched")
             searching.close()
@@ -184,10 +189,11 @@ class CalibrationNode(AnsweringNode):
             return
         self._discovering = None
         discovery, parameters = found
-        self._found = [finding("TOPICS_FOUND", own=self._inputs["dvl/twist"].topic_name, found=discovery.found[0])]
+        self._found = [] if has_dvl else [finding("TOPICS_FOUND", own=dvl, found=discovery.found[0])]
         for sentence in discovery.found[1:]:
             self.info(sentence)
-        self.warn(str(self._found[0]))
+        for topics_found in self._found:
+            self.warn(str(topics_found))
         for doubt in discovery.doubts:
             self.warn(doubt)
         topics = discovery.topics

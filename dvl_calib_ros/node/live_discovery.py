@@ -1,20 +1,25 @@
-"""Discovery of topics while the node runs, by the same rules as in recordings.
+"""Discovery of topics and frames while the node runs, by the same rules as in recordings.
 
-If the DVL's topic has no publisher and another topic may be a DVL's, all candidate topics are recorded for a while and
-examined like a recording. The modules that read recordings are imported only then: a ROS machine need not have them.
+If the DVL's topic has no publisher and another topic may be a DVL's, or if the reference's frame is unknown, all
+candidate topics are recorded for a while and examined like a recording. The modules that read recordings are imported
+only then: a ROS machine need not have them.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from ..calibration.models.parameters import Parameters
+from ..calibration.numerics.frames import Array, rotation_from_quaternion
+from ..calibration.streams.screening import unit_quaternions
 from ..discovery.topic_choice import may_be_dvl
 from ..errors import InputError
 from .services import AnsweringNode
@@ -26,6 +31,9 @@ if TYPE_CHECKING:
 # Length of a recording, s. It is extended up to MOST_S while a published topic has fewer than ENOUGH messages: a USBL
 # gives a position every 5 to 10 s.
 LISTEN_S, MOST_S, ENOUGH = 20.0, 60.0, 3
+# Length of the mean of unit vectors of the headings, below which the vehicle turned enough (by 90°) to tell a frame of
+# the earth from the body's.
+ONE_HEADING = 0.9
 
 
 class _Running(NamedTuple):
@@ -45,36 +53,31 @@ class FoundTopics(NamedTuple):
 
 
 class Discovering:
-    """Repeated search, one step per call, until topics are found.
+    """Repeated search, one step per call, until topics and frames are found.
 
-    named: topic that the user named by role (dvl, gnss, imu), None for the node's own. given: names of parameters that
-    the user set. worker: examines the recordings.
+    given: names of parameters that the user set. worker: examines the recordings.
     """
 
     def __init__(
-        self,
-        node: AnsweringNode,
-        named: dict[str, str | None],
-        parameters: Parameters,
-        given: Collection[str],
-        worker: ThreadPoolExecutor,
+        self, node: AnsweringNode, parameters: Parameters, given: Collection[str], worker: ThreadPoolExecutor
     ) -> None:
         self._node, self._parameters, self._worker = node, parameters, worker
-        self._named, self._given = named, frozenset(given)
+        self._given = frozenset(given)
         self._recording: _Running | None = None
         self._looked_through: Future[FoundTopics] | None = None
-        self._said = ""
+        self._said: set[str] = set()
 
-    def step(self) -> FoundTopics | None:
+    def step(self, named: Mapping[str, str | None]) -> FoundTopics | None:
         """Start to record, subscribe to new topics, or examine the recording. Return a result once.
 
-        Raises InputError if recording or reading fails.
+        named: topic by role (dvl, gnss, imu), None where it is searched. With a named DVL the frames are searched,
+        until the data decide. Raises InputError if recording or reading fails.
         """
         if self._looked_through is not None:
             return self._outcome(self._looked_through)
         if self._recording is None:
-            if any(self._may_be_dvl()):
-                self._begin()
+            if named["dvl"] is not None or any(self._may_be_dvl()):
+                self._begin(named)
             return None
         folder, recorder, ends, began = self._recording
         if recorder.failed is not None:
@@ -88,7 +91,7 @@ class Discovering:
         self._recording = None
         ends.close()
         path = Path(folder.name) / "live"
-        self._looked_through = self._worker.submit(self._look_through, folder, path)
+        self._looked_through = self._worker.submit(self._look_through, folder, path, dict(named))
         return None
 
     def _may_be_dvl(self) -> list[str]:
@@ -100,9 +103,12 @@ class Discovering:
             and self._node.count_publishers(topic)
         ]  # fmt: skip
 
-    def _begin(self) -> None:
-        topics = ", ".join(self._may_be_dvl())
-        self._node.info(f"the DVL's topic has no publisher; examining the others ({topics}) ...")
+    def _begin(self, named: Mapping[str, str | None]) -> None:
+        if named["dvl"] is None:
+            others = ", ".join(self._may_be_dvl())
+            self._once(self._node.info, f"the DVL's topic has no publisher; examining the others ({others}) ...")
+        else:
+            self._once(self._node.info, "the frame of the reference is unknown; comparing it with the DVL ...")
         try:
             from ..bags.writer import BagWriter
             from .topic_recorder import TopicRecorder
@@ -121,30 +127,47 @@ class Discovering:
         try:
             return looked_through.result()
         except InputError as error:
-            if str(error) != self._said:  # the search repeats, the message does not
-                self._said = str(error)
-                self._node.warn(self._said)
+            self._once(self._node.warn, str(error))
             return None
 
+    def _once(self, say: Callable[[str], None], text: str) -> None:
+        if text not in self._said:  # the search repeats, the message does not
+            self._said.add(text)
+            say(text)
+
     def close(self) -> None:
-        """Stop recording."""
+        """Stop the search."""
+        self._looked_through = None
         if self._recording is not None:
             folder, _, ends, _ = self._recording
             self._recording = None
             ends.close()
             folder.cleanup()
 
-    def _look_through(self, folder: TemporaryDirectory[str], path: Path) -> FoundTopics:
+    def _look_through(
+        self, folder: TemporaryDirectory[str], path: Path, named: Mapping[str, str | None]
+    ) -> FoundTopics:
         from ..discovery.discover import discover
         from ..discovery.discovery import Given
         from ..recordings.recording import open_recording
 
-        given = Given(self._named["dvl"], self._named["gnss"], self._named["imu"], self._given)
+        given = Given(named["dvl"], named["gnss"], named["imu"], self._given)
         with folder:
             try:
                 recording = open_recording([path], parameters=self._parameters)
                 found = discover(recording, self._parameters, given)
             except InputError as error:
                 raise InputError(str(error).replace(str(path), "the topics there are")) from error
+        imu = recording.survey.looks.get(found.topics.imu)
+        turned = imu is not None and _mean_heading_length(imu.values[:, :4]) < ONE_HEADING
+        if named["dvl"] is not None and not (turned and "gnss_frame" in found.values):
+            raise InputError("the frame of the reference is not observable yet: drive a turn, or set gnss_frame")
         # the node itself subtracts clock offsets once two estimates agree
         return FoundTopics(found, recording.of_types(found.topics, self._parameters.replace(**found.values)))
+
+
+def _mean_heading_length(orientation: Array) -> float:
+    """Return the length of the mean unit vector of the headings: 1 on one heading. orientation: (N, 4) x, y, z, w."""
+    quaternion = unit_quaternions(orientation)
+    ahead = rotation_from_quaternion(quaternion[np.isfinite(quaternion).all(axis=1)])[:, :2, 0]
+    return float(np.linalg.norm(ahead.mean(axis=0))) if len(ahead) else 1.0

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from ..calibration.comparison.mounting_change import Comparison, Difference, reasons, remarks
 from ..calibration.results.extrinsics import MOUNTING, Extrinsics
-from ..calibration.results.mounting_quantities import date
+from ..calibration.results.mounting_quantities import LATE, date
 from .document import Answer, Columns, Document, Section, Sentence, Table, Where, columns_for, figures, table_by
 from .numbers import with_std
 
@@ -38,7 +38,7 @@ QUANTITIES = (
     ComparedQuantity(4, "lever arm y", "m", 1.0, "moved"),
     ComparedQuantity(5, "lever arm z", "m", 1.0, "moved"),
     ComparedQuantity(6, "scale", "%", 100.0, "scale_changed"),
-    ComparedQuantity(7, "stamps late", "s", 1.0, "clock_changed"),
+    ComparedQuantity(7, LATE, "s", 1.0, "clock_changed"),
 )
 
 

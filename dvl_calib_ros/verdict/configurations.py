@@ -172,18 +172,17 @@ CONFIGURATIONS = on_page(
     # clocks
     reject(
         "CLOCK_OFF",
-        "{whose} stamps are {seconds:.3f} ± {std:.3f} s {way}",
-        means="Estimated from velocities and turns, against the IMU's clock.",
+        "{whose} stamps are {seconds:.3f} ± {std:.3f} s {way} against {against}",
+        means="Estimated from velocities and turns.",
     ),
     reject(
         "CLOCK_LATE",
-        "{whose} stamps are {seconds:.2f} s {way}",
-        means="The other clocks agree.",
+        "{whose} stamps are {seconds:.2f} s {way} against the others, which agree",
         remedy="set {parameter} to {offset:g}",
     ),
     reject(
         "CLOCKS_LATE",
-        "the reference's stamps are {seconds:.2f} s {way}, and the DVL's {dvl_seconds:.2f} s {dvl_way}",
+        "against the IMU the reference's stamps are {seconds:.2f} s {way}, and the DVL's {dvl_seconds:.2f} s {dvl_way}",
         means="A calibration estimates the DVL's delay.",
         remedy="set {parameter} to {offset:g}",
     ),

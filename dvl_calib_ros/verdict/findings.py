@@ -185,7 +185,7 @@ FINDINGS = (
     warning(
         "REFERENCE_FRAME",
         "reference not used: its frame_id {frame_id!r} is neither {base} nor an earth frame",
-        means="Earth frames are enu, map, odom, world and ned.",
+        means="Earth frames are enu, map, odom, world and ned. After a turn the node chooses by the data (`discover`).",
         remedy="set gnss_frame to body, enu or ned",
     ),
     warning(

@@ -111,14 +111,14 @@ def test_a_printed_mounting_has_no_powers_of_ten(bag):
 
 def test_the_mounting_is_printed_with_arm_and_delay_and_findings_are_of_the_selected_model(calibration):
     said = str(calibration.mounting)
-    assert "lever arm x " in said and "stamps late " in said
+    assert "lever arm x " in said and "DVL late against IMU " in said
     assert not any(each.says.startswith(("M1: ", "M7: ", "unaided: ")) for each in calibration.findings)
 
 
 def test_values_that_no_data_support_are_marked_where_the_mounting_is_printed(bag):
     said = str(dc.replay(bag, model="M3", lever_arm=(1.0, 0.0, -0.5), history=False).mounting)
     assert "lever arm 1 0 -0.5 m as configured, not estimated" in said
-    assert "stamps late 0 s as configured, not estimated" in said
+    assert "DVL late against IMU 0 s as configured, not estimated" in said
     assert "roll" in said and "(not observable)" in said.partition("pitch")[0]
 
 

@@ -482,7 +482,7 @@ def test_what_a_bare_bag_shows_is_applied_as_parameters_and_nothing_is_left(tmp_
     parameters.write_text("/**:\n  ros__parameters:\n    # by hand\n    mounting_rpy: [0.0, 0.0, 0.0]\n")
     before = parameters.read_bytes()
     assert apply(saved, "--params", parameters) == 0
-    assert "s late in this recording" in capsys.readouterr().out
+    assert "s late against the IMU's in this recording" in capsys.readouterr().out
     written = load_parameters(parameters)
     mounting = parsed(saved.read_text())["mounting"]
     assert written.dvl_time_offset == pytest.approx(mounting["dvl_time_offset"], abs=1e-8)

@@ -108,7 +108,7 @@ def test_the_report_says_where_the_dvl_is_and_how_late(tmp_path, monkeypatch):
     page = calibration.report(tmp_path / "report.html").read_text().replace("\N{MINUS SIGN}", "-")
     ahead, to_port, late = (
         float(re.search(rf"<span>{name}</span><b>([+-]?[\d.]+)&nbsp;", page)[1])
-        for name in ("lever arm, ahead", "lever arm, to port", "stamps late")
+        for name in ("lever arm, ahead", "lever arm, to port", "DVL late against IMU")
     )
     np.testing.assert_allclose((ahead, to_port, late), (1.3, 0.2, -2.2), atol=0.05)
     assert re.search(r"<span>lever arm, up</span><b>.*not observable in this data", page)

@@ -55,7 +55,7 @@ def test_doctor_replay_and_diagnose_agree_on_how_late_a_reference_is(tmp_path, c
     bag = bag_of(tmp_path, reference_s=seconds)
     print(dc.doctor(bag))
     text = " ".join(capsys.readouterr().out.split())
-    found = re.search(r"the reference's stamps are (\S+) ± (\S+) s late", text)
+    found = re.search(r"the reference's stamps are (\S+) ± (\S+) s late against DVL and IMU", text)
     assert found is not None and abs(float(found[1]) - seconds) < 2.0 * float(found[2]), text
     run = dc.replay(bag, history=False)
     assert run.verdict == "accept"

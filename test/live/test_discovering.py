@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -10,12 +11,15 @@ import pytest
 pytest.importorskip("rclpy", reason="the node needs ROS 2: pip install '.[ros]'")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from io_fixtures import run, write_bag
+from io_fixtures import rewrite, run, write_bag
 from position_fixtures import USBL, write_positions
 from ros import NODE, until
 from std_srvs.srv import Trigger
 
+from dvl_calib_ros.calibration.models.parameters import Parameters
+from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.demo.player import BagPlayer
+from dvl_calib_ros.discovery.discover import discover
 from validation.positions import Truth, driven
 
 TARGETS = {"dvl/twist": "/a50/velocity", "gnss/twist": "/gps", "imu/data": "/imu"}
@@ -26,29 +30,31 @@ QUICKLY = (
 )
 
 
-@pytest.fixture
-def playing(world, tmp_path):
-    """A vehicle whose topics nobody named, again and again."""
-    player = BagPlayer(world.node, [write_bag(tmp_path / "bag", run(120.0))], TARGETS)
+@contextmanager
+def repeated(player, speed=30.0):
+    """A bag that is played again and again."""
     ended = threading.Event()
 
     def play() -> None:
         while not ended.is_set():
-            player.play(30.0, has_ended=ended.is_set)
+            player.play(speed, has_ended=ended.is_set)
 
     thread = threading.Thread(target=play)
     thread.start()
-    yield player
-    ended.set()
-    thread.join()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def latest(messages):
     return {item.key: item.value for item in messages[-1].status[0].values} if messages else {}
 
 
-def test_topics_that_nobody_named_are_found_and_calibrated_with(world, playing):
-    with world.calibration_node(entry=("-c", QUICKLY)) as node:
+def test_topics_that_nobody_named_are_found_and_calibrated_with(world, tmp_path):
+    player = BagPlayer(world.node, [write_bag(tmp_path / "bag", run(120.0))], TARGETS)
+    with repeated(player), world.calibration_node(entry=("-c", QUICKLY)) as node:
         said = world.received(DiagnosticArray, "/diagnostics")
         for stream in ("dvl", "reference", "imu"):
             until(lambda stream=stream: int(latest(said).get(f"{stream} received", 0)) > 20, f"{stream} to be heard")
@@ -60,6 +66,23 @@ def test_topics_that_nobody_named_are_found_and_calibrated_with(world, playing):
         assert any("[TOPICS_FOUND]" in value for key, value in latest(said).items() if key.startswith("finding"))
     assert "the DVL's topic has no publisher" in node.output
     assert "DVL /a50/velocity (TwistWithCovarianceStamped" in node.output and "reference /gps" in node.output
+
+
+def test_the_unknown_frame_of_a_reference_is_chosen_by_the_data_as_in_a_replay(world, tmp_path):
+    def in_gps(topic, message):
+        if topic == "gnss/twist":
+            message.header.frame_id = "gps"
+        return message
+
+    bag = rewrite(tmp_path / "bag", in_gps, run(120.0, VelocityFrame.BODY))
+    chosen = discover([bag], Parameters()).values["gnss_frame"]
+    # a faster bag has more jitter; in 40 s of it the vehicle turns
+    quickly = QUICKLY.replace("1.0", "8.0")
+    with repeated(BagPlayer(world.node, [bag]), 5.0), world.calibration_node(entry=("-c", quickly)) as node:
+        said = world.received(DiagnosticArray, "/diagnostics")
+        until(lambda: "REFERENCE_FRAME" in " ".join(latest(said).values()), "the frame to be unknown")
+        until(lambda: int(latest(said)["pairing paired"]) > 50, lambda: f"the reference to be used: {latest(said)}")
+    assert f"the reference is used as {chosen}" in node.output and chosen == "body"
 
 
 @pytest.mark.slow

@@ -182,7 +182,7 @@ s save  r r forget  w warnings  q quit
 mounting now
 roll    0.108 ±1.177°     pitch  -0.512 ±0.322°     yaw     3.036 ±0.116°
 arm x   0.300 m, as set   arm y   0.000 m, as set   arm z  -0.120 m, as set
-scale   0.412 ±0.120 %    delay   0.102 ±0.011 s
+scale   0.412 ±0.120 %    delay   0.102 ±0.011 s against the IMU
 no usable DVL message for 7 s; check the sensor, its driver and the topic
 /dvl/velocity [DVL_SILENT]
 +2 more (w)
@@ -210,7 +210,7 @@ arm x   0.300 m, as set
 arm y   0.000 m, as set
 arm z  -0.120 m, as set
 scale   0.412 ±0.120 %
-delay   0.102 ±0.011 s
+delay   0.102 ±0.011 s against the IMU
 DVL 5.0 Hz, 0 s ago   reference 1.0 Hz,
 3 s ago   IMU 50.0 Hz, 0 s ago""",
 }

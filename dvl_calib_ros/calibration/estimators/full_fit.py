@@ -284,15 +284,22 @@ class JointFit:
         """Run Gauss-Newton from the newest estimate over all blocks whose streams are kept."""
         self._forget()
         self._search_delay(self._days[-1])
+        last = np.zeros_like(self._x)
         for _ in range(STEPS):
             self._linearise()
             before = self._x.copy()
             self._solve()
             self._recentre()
             assert self._fitted is not None
-            moved = np.abs((self._x - before) / np.sqrt(np.diag(self._fitted.state.p))).max()
-            if not self._are_contradicted() and moved < LAST_STEP:
+            step = (self._x - before) / np.sqrt(np.diag(self._fitted.state.p))
+            if not self._are_contradicted() and np.abs(step).max() < LAST_STEP:
                 break
+            # acceleration columns reduced for noise make steps too long: halve a step that turns back
+            if step @ last < 0.0:
+                self._x = 0.5 * (before + self._x)
+            last = step
+        assert self._fitted is not None
+        self._x = self._fitted.state.x.copy()
 
     def _forget(self) -> None:
         """Fix the contribution of the oldest blocks, and drop their streams."""

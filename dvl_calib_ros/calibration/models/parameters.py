@@ -407,7 +407,7 @@ class Parameters:
     )
     discover: bool = _parameter(
         True,
-        "Look for DVL, reference and IMU in all topics while the DVL's is silent and not remapped.",
+        "Look for DVL, reference and IMU while its topic is silent and not remapped; choose the reference's frame.",
     )
     target_drift: float = _parameter(
         2.0,

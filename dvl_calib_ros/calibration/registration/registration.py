@@ -158,7 +158,15 @@ class Registration:
         if not self.is_turned and name == "reference_time_offset":
             clocks[name] = replace(self.apart, late=-self.apart.late)
         clock = clocks[name]
-        return finding("CLOCK_OFF", whose=OFFSETS[name], seconds=abs(clock.late), std=clock.std, way=_way(clock))
+        if name == "imu_time_offset":
+            against = "DVL and reference"
+        else:
+            against, other = ("reference", self.reference) if name == "dvl_time_offset" else ("DVL", self.dvl)
+            if self.is_turned:
+                against = "IMU" if other.is_shown else f"{against} and IMU"
+        return finding(
+            "CLOCK_OFF", whose=OFFSETS[name], seconds=abs(clock.late), std=clock.std, way=_way(clock), against=against
+        )
 
     def contradiction(self, parameters: Parameters) -> Reason | None:
         """Return the finding of a significant delay of reference or IMU, or of a clock change; else None."""

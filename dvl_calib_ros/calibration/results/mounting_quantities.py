@@ -15,6 +15,8 @@ from .results import Result, corrected_rpy, rpy_std, scale_and_delay
 
 # Axes of `observability` that need angular velocities.
 _NEED_IMU = ("lever arm x", "lever arm y", "lever arm z", "time offset")
+# name of the DVL's delay
+LATE = "DVL late against IMU"
 
 
 class Quantity(NamedTuple):
@@ -64,7 +66,7 @@ def quantities(result: Result) -> list[Quantity]:
     for delay in result.delays:
         of_day = "" if delay.day is None else f", {delay.day.name or date(delay.day.first_ns)}"
         found.append(
-            Quantity(f"stamps late{of_day}", parameters.dvl_time_offset, delay.seconds, delay.std, " s", delay.shown)
+            Quantity(f"{LATE}{of_day}", parameters.dvl_time_offset, delay.seconds, delay.std, " s", delay.shown)
         )
     return found
 

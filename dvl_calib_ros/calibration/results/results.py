@@ -215,7 +215,7 @@ class Day:
 
 
 class Delay(NamedTuple):
-    """DVL delay, s, configured plus estimated; its σ; whether it is observable (shown).
+    """DVL delay against the IMU, s, configured plus estimated; its σ; whether it is observable (shown).
 
     day: recording of the delay, None if there is only one.
     """

@@ -64,7 +64,7 @@ def test_a_configured_value_that_the_model_does_not_estimate_says_so(bag):
     run = replayed(bag, lever_arm=(1.0, 0.0, -0.5), dvl_position="from_reference", model="M3")
     text = result_text(result_document(run.result))
     assert "  lever arm: 1 0 -0.5 m as configured, not estimated\n" in text
-    assert "  stamps late: 0 s as configured, not estimated\n" in text
+    assert "  DVL late against IMU: 0 s as configured, not estimated\n" in text
 
 
 def test_every_model_comes_back_bit_for_bit(saved, result):

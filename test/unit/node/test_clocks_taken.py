@@ -37,7 +37,7 @@ class Look:
         return {"reference_time_offset": self.late}
 
     def told(self, name: str) -> Reason:
-        return finding("CLOCK_OFF", whose=name, seconds=self.late, std=0.01, way="late")
+        return finding("CLOCK_OFF", whose=name, seconds=self.late, std=0.01, way="late", against="IMU")
 
 
 def test_two_looks_that_agree_take_a_clock_off_once():

@@ -15,6 +15,8 @@ from dvl_calib_ros.errors import InputError
 from dvl_calib_ros.messages.drivers import TWIST_TYPE
 from dvl_calib_ros.node.live_discovery import Discovering
 
+NONE_NAMED = {"dvl": None, "gnss": None, "imu": None}
+
 
 def searching(*topics):
     node = SimpleNamespace(
@@ -27,24 +29,23 @@ def searching(*topics):
         info=lambda _: None,
         warn=lambda _: None,
     )
-    named = {"dvl": None, "gnss": None, "imu": None}
-    return Discovering(node, named, Parameters(), (), ThreadPoolExecutor(1))
+    return Discovering(node, Parameters(), (), ThreadPoolExecutor(1))
 
 
 def test_nothing_is_recorded_while_no_topic_may_be_a_dvls_nor_of_what_the_node_says_itself():
     search = searching("/odometry", "/cmd_vel", "/dvl_calibration/calibrated_twist")
-    assert search.step() is None and search._recording is None
+    assert search.step(NONE_NAMED) is None and search._recording is None
 
 
 def test_without_what_reads_recordings_it_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "dvl_calib_ros.bags.writer", None)
     with pytest.raises(InputError, match="discover needs rosbags"):
-        searching("/dvl").step()
+        searching("/dvl").step(NONE_NAMED)
 
 
 def test_a_full_disk_ends_the_search(monkeypatch):
     search = searching("/dvl")
-    assert search.step() is None
+    assert search.step(NONE_NAMED) is None
     recorder = search._recording.recorder
 
     def full(*_):
@@ -54,7 +55,7 @@ def test_a_full_disk_ends_the_search(monkeypatch):
     for each in recorder._subscriptions:
         each.taken(b"")
     with pytest.raises(InputError, match="no space left"):
-        search.step()
+        search.step(NONE_NAMED)
     search.close()
     assert search._recording is None
 
@@ -65,13 +66,13 @@ def test_a_topic_that_brings_something_each_10_s_is_listened_to_for_longer(monke
     now = 100.0
     monkeypatch.setattr("dvl_calib_ros.node.live_discovery.time", SimpleNamespace(monotonic=lambda: now))
     search = searching("/dvl")
-    search.step()
+    search.step(NONE_NAMED)
     recorder = search._recording.recorder
     search._recording = search._recording._replace(began=now)
     monkeypatch.setattr(recorder, "look", lambda: False)
     monkeypatch.setattr(type(recorder), "topics", property(lambda _: ["/dvl", "/usbl"]))
     recorder.counts.update({"/dvl": 100, "/usbl": heard})
     now += after
-    search.step()
+    search.step(NONE_NAMED)
     assert (search._recording is None) == is_enough
     search.close()
