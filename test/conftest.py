@@ -11,6 +11,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Container, Iterable
+from enum import Enum
 from functools import wraps
 from pathlib import Path
 from typing import Any
@@ -134,7 +135,7 @@ def _add_to(digest: Any, value: Any) -> None:
     if isinstance(value, np.ndarray):
         digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
     elif isinstance(value, tuple):
-        digest.update(f"{len(value)}".encode())
+        digest.update(f"({len(value)}".encode())
         for each in value:
             _add_to(digest, each)
     elif isinstance(value, Readings):
@@ -142,7 +143,8 @@ def _add_to(digest: Any, value: Any) -> None:
     elif dataclasses.is_dataclass(value):
         _add_to(digest, tuple(getattr(value, field.name) for field in dataclasses.fields(value)))
     else:
-        digest.update(repr(value).encode())
+        assert value is None or isinstance(value, str | int | float | Enum | np.generic), type(value)
+        digest.update(f"{value!r},".encode())
 
 
 # Half of a replay. Its commands, formats and types are tested with the same few recordings; tests of the registration
