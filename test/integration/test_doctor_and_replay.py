@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import runpy
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -51,7 +50,6 @@ SHARED = [
     for words in VARIANTS.get(each.stem, ("",))
 ]
 GAPS = sorted(CASES.glob("gap/*/a"))
-STACKS = "b_robot_localization", "d_no_imu", "e_dvl_imu_only", "f_two_dvls_camera"
 TRAPS = sorted(each for each in CASES.glob("traps/*.py") if each.stem not in ("helpers", "judge", "phys"))
 BAGS = ".mcap", ".db3", ".bag"
 # A diagnosis that names an effect; the real one takes minutes, and what it begins with is the calibration's.
@@ -126,12 +124,6 @@ def test_a_shared_case_has_one_answer(script, words, tmp_path, monkeypatch):
 @pytest.mark.parametrize("bag", GAPS, ids=lambda bag: bag.parent.name)
 def test_a_recording_of_the_trial_has_one_answer(bag, monkeypatch):
     assert_one_answer(bag, monkeypatch)
-
-
-@pytest.mark.parametrize("name", STACKS)
-def test_a_stack_has_one_answer(name, tmp_path, monkeypatch):
-    subprocess.run([sys.executable, CASES / "stacks.py", tmp_path, name], check=True, capture_output=True)
-    assert_one_answer(tmp_path / name, monkeypatch)
 
 
 class JudgedError(Exception):
