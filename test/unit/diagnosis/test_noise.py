@@ -115,7 +115,7 @@ def test_an_effect_is_found_by_what_samples_claim_that_is_not_without():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "trajectory"), [(20, "free"), (21, "box"), (22, "lawnmower")])
+@pytest.mark.parametrize(("seed", "trajectory"), [(20, "free"), (21, "box")])
 def test_noise_that_is_louder_for_a_while_and_says_so_is_no_effect(seed, trajectory):
     given, std = floating(streams(seed=seed, trajectory=trajectory), seed)
     assert diagnose_recordings([recorded(given, std)], Parameters()).verdict not in CLAIMS
