@@ -149,8 +149,7 @@ def _add_to(digest: Any, value: Any) -> None:
 
 # Half of a replay. Its commands, formats and types are tested with the same few recordings; tests of the registration
 # itself import it from where it is.
-for _user in (registration_schedule, clock_offsets):
-    _user.register = remembered(_user.register)  # type: ignore[attr-defined]
+registration_schedule.register = clock_offsets.register = remembered(registration_schedule.register)
 registration_schedule.fitting_configuration = remembered(registration_schedule.fitting_configuration)
 for _method in ("registered", "are_axes_mirrored"):
     setattr(Readings, _method, remembered(getattr(Readings, _method)))
