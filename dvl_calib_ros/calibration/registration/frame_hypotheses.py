@@ -225,12 +225,10 @@ class Readings:
         """
         turn = FLU_FROM_FRD if reading.turned else np.eye(3)
         fit = self._fit(reading)
-        if fit is None:
-            return NOT_REGISTERED
 
         def of(rotation: Array | None) -> Registered:
             nominal = None if rotation is None else rotation.T @ turn
-            found = nearest(fit, nominal, (REFERENCE,))
+            found = nearest(fit, nominal, (REFERENCE,)) if fit else None
             if found is None:
                 return NOT_REGISTERED
             left = math.sqrt(float(_better(found.squares).mean())) / max(found.speed, 1e-9)
@@ -248,8 +246,7 @@ class Readings:
     def are_axes_mirrored(self, reading: Reading, found: Array, rotation_dvl_from_body: Array) -> bool:
         """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
         motion, turn = self._read(reading), FLU_FROM_FRD if reading.turned else np.eye(3)
-        fit = self._fit(reading)
-        rotated = None if fit is None else nearest(fit, found.T @ turn, (REFERENCE,))
+        rotated = nearest(fit, found.T @ turn, (REFERENCE,)) if (fit := self._fit(reading)) else None
         if motion is None or rotated is None:
             return False
         mounting = rotation_dvl_from_body.T @ turn
