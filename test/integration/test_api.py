@@ -15,6 +15,7 @@ import pytest
 from command_line import in_fresh_process, succeed
 from conftest import ROOT
 from io_fixtures import run, write_bag
+from report_fixtures import drawn
 
 import dvl_calib_ros as dc
 from dvl_calib_ros import api
@@ -254,7 +255,8 @@ def test_what_was_found_is_exported_as_by_the_command(calibration, tmp_path, cap
 
 
 @pytest.mark.slow
-def test_results_become_pages_and_json(calibration, bag, tmp_path, capsys):
+def test_results_become_pages_and_json(calibration, bag, tmp_path, capsys, monkeypatch):
+    drawn(monkeypatch)
     assert dc.report(calibration, tmp_path / "r.html").read_text().startswith("<!DOCTYPE html>")
     both = ["--json", tmp_path / "command.json", "--report", tmp_path / "command.html"]  # which keeps the history, too
     succeed(capsys, "replay", bag, *both)

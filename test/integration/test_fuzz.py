@@ -109,7 +109,7 @@ def test_a_fuzz_target_takes_its_seeds_what_was_found_and_some_damage(name):
     found = [path.read_bytes() for path in sorted((ROOT / "test" / "fuzz" / "found" / name).glob("*"))]
     for content in (*seeds, *found):
         target.run(content)
-    for _ in range(30):
+    for _ in range(target.damaged):
         content = bytearray(source.choice(seeds))
         for _ in range(source.randint(1, 4)):
             content[source.randrange(len(content))] = source.randrange(256)

@@ -48,7 +48,7 @@ def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_t
 @pytest.mark.slow
 def test_doctor_replay_and_diagnose_begin_with_one_cause(tmp_path):
     """`diagnose` said no_gap, as it fits a mounting of any size."""
-    told = Told(motion=long_motion())
+    told = Told()
     sound(told, yaw=math.radians(-135.0), said_yaw=math.radians(135.0))
     bag = told.write(tmp_path / "bag")
     calibration = dc.replay(bag, history=False)

@@ -224,16 +224,11 @@ class Readings:
         better.
         """
         turn = FLU_FROM_FRD if reading.turned else np.eye(3)
-        motion = self._read(reading)
-        if motion is None:
-            return NOT_REGISTERED
-        if reading not in self._fits:
-            self._fits[reading] = MotionFit(motion, self._position, Curves(motion), FEW_ROWS)
-        fit = self._fits[reading]
+        fit = self._fit(reading)
 
         def of(rotation: Array | None) -> Registered:
             nominal = None if rotation is None else rotation.T @ turn
-            found = nearest(fit, nominal, (REFERENCE,))
+            found = nearest(fit, nominal, (REFERENCE,)) if fit else None
             if found is None:
                 return NOT_REGISTERED
             left = math.sqrt(float(_better(found.squares).mean())) / max(found.speed, 1e-9)
@@ -251,7 +246,7 @@ class Readings:
     def are_axes_mirrored(self, reading: Reading, found: Array, rotation_dvl_from_body: Array) -> bool:
         """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
         motion, turn = self._read(reading), FLU_FROM_FRD if reading.turned else np.eye(3)
-        rotated = nearest(self._fits[reading], found.T @ turn, (REFERENCE,))
+        rotated = nearest(fit, found.T @ turn, (REFERENCE,)) if (fit := self._fit(reading)) else None
         if motion is None or rotated is None:
             return False
         mounting = rotation_dvl_from_body.T @ turn
@@ -274,6 +269,13 @@ class Readings:
         dvl = self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl
         directions.add(dvl @ found.rotation_dvl_from_body, attitude_at(motion.imu, self._at, GAP_S)[0])
         return directions.stay_in_the_body
+
+    def _fit(self, reading: Reading) -> MotionFit | None:
+        """Return the least squares of a reading; None if a required attitude is missing."""
+        motion = self._read(reading)
+        if motion is not None and reading not in self._fits:
+            self._fits[reading] = MotionFit(motion, self._position, Curves(motion), FEW_ROWS)
+        return self._fits.get(reading)
 
     def _read(self, reading: Reading) -> MotionStreams | None:
         """Return the motion under a reading, except the DVL; None if a required attitude is missing."""

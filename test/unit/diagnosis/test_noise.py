@@ -77,7 +77,6 @@ def claimed_otherwise(std: np.ndarray) -> dict[str, np.ndarray | None]:
     rng = np.random.default_rng(5)
     return {
         "random": 0.03 * np.exp(rng.standard_normal((len(std), 1))) * np.ones(3),
-        "constant": np.full_like(std, 0.1),
         "nothing": None,
     }
 
@@ -116,14 +115,14 @@ def test_an_effect_is_found_by_what_samples_claim_that_is_not_without():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "trajectory"), [(20, "free"), (21, "box"), (22, "lawnmower")])
+@pytest.mark.parametrize(("seed", "trajectory"), [(20, "free"), (21, "box")])
 def test_noise_that_is_louder_for_a_while_and_says_so_is_no_effect(seed, trajectory):
     given, std = floating(streams(seed=seed, trajectory=trajectory), seed)
     assert diagnose_recordings([recorded(given, std)], Parameters()).verdict not in CLAIMS
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("what", ["random", "constant", "nothing"])
+@pytest.mark.parametrize("what", ["random", "nothing"])
 def test_claims_that_say_nothing_change_nothing(what):
     given = streams(seed=4)
     time, velocity = given["reference"]

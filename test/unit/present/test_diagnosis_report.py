@@ -64,7 +64,8 @@ def test_held_out_gap_before_and_after_and_the_closure_stand_large(page):
         assert shown in start
 
 
-def test_an_effect_whose_sizes_may_be_zero_is_not_offered_for_applying(tmp_path):
+def test_an_effect_whose_sizes_may_be_zero_is_not_offered_for_applying(tmp_path, monkeypatch):
+    drawn(monkeypatch)
     for low, is_offered in ((0.1, True), (-0.1, False)):
         arm = FoundEffect("lever_arm", (), {"x_m": (0.5, low, 0.9)}, 0.85, 1e-9)
         series = diagnosis().series
@@ -73,7 +74,8 @@ def test_an_effect_whose_sizes_may_be_zero_is_not_offered_for_applying(tmp_path)
         assert ("To do for lever_arm" in offered.text) == is_offered
 
 
-def test_what_the_gap_costs_is_said_in_metres_per_kilometre(tmp_path):
+def test_what_the_gap_costs_is_said_in_metres_per_kilometre(tmp_path, monkeypatch):
+    drawn(monkeypatch)
     found = diagnosis()
     costly = replace(found, gap=replace(found.gap, drift=(Drift(21.4, 0.0), Drift(3.26, 0.0))))
     said = "Drift per straight km, noise included: 21 m (2.1 %), 3.3 m (0.33 %) with the effects."
@@ -86,12 +88,9 @@ def test_effects_that_cannot_be_told_apart_are_named_together_and_none_is_prefer
     assert "cannot distinguish lever_arm from sideslip" in page.text
 
 
-def test_sizes_that_this_data_cannot_show_are_marked_against_those_worth_knowing(tmp_path):
-    path = tmp_path / "diagnosis.html"
-    write_report(path, diagnosis())
-    html = path.read_text()
-    assert re.search('<td[^>]* class="text good"[^>]*>x 0.110 m</td>', html)  # 0.3 m would be worth knowing of
-    assert re.search('<td[^>]* class="text far"[^>]*>z 0.900 m</td>', html)
+def test_sizes_that_this_data_cannot_show_are_marked_against_those_worth_knowing(page):
+    assert re.search('<td[^>]* class="text good"[^>]*>x 0.110 m</td>', page.source)  # 0.3 m would be worth knowing of
+    assert re.search('<td[^>]* class="text far"[^>]*>z 0.900 m</td>', page.source)
 
 
 def test_places_noise_and_untestable_effects_have_their_tables(page):
@@ -104,7 +103,8 @@ def test_the_calibration_beside_the_effects_has_its_uncertainty(page):
     assert "misalignment x +1.00 ± 0.10°, y −2.00 ± 0.20°, z +3.00 ± 0.30°; scale error x +1.00 ± 0.10 %" in page.text
 
 
-def test_what_is_left_says_what_it_follows_if_it_follows_anything(tmp_path, page):
+def test_what_is_left_says_what_it_follows_if_it_follows_anything(tmp_path, page, monkeypatch):
+    drawn(monkeypatch)
     assert "Nothing in it follows motion or time" in page.text
     found = diagnosis()
     rest = replace(found.series.rest, log_p=-50.0)
@@ -113,7 +113,8 @@ def test_what_is_left_says_what_it_follows_if_it_follows_anything(tmp_path, page
     assert f"{said} (p < 0.001)" in page_of(tmp_path, unknown).text
 
 
-def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_path):
+def test_without_an_effect_there_is_one_residual_and_no_before_and_after(tmp_path, monkeypatch):
+    drawn(monkeypatch)
     found = diagnosis()
     series = replace(found.series, traces={})
     nothing = replace(

@@ -30,7 +30,7 @@ from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.simulator_export.dvl_description import load_description
 from dvl_calib_ros.unpaired.both_sides import Log, RecordedSide, facts_of, is_copied, read_log
-from dvl_calib_ros.unpaired.comparison import Scatter, at_one_motion, block_levels, compare, compare_logs, slopes_of
+from dvl_calib_ros.unpaired.comparison import Scatter, at_one_motion, block_levels, compare_logs, slopes_of
 from dvl_calib_ros.unpaired.effect_comparison import Size, compared_names, is_there, p_alike, smallest_difference
 from dvl_calib_ros.unpaired.gap_ladder import (
     AS_IT_IS,
@@ -74,8 +74,14 @@ def bags(tmp_path_factory) -> dict[str, Path]:
 
 
 @pytest.fixture(scope="module")
-def compared(bags):
-    return compare(source(bags["vehicle"]), source(bags["simulator"]))
+def vehicle(bags) -> Log:
+    """The vehicle's log, diagnosed."""
+    return read_log(source(bags["vehicle"]))
+
+
+@pytest.fixture(scope="module")
+def compared(bags, vehicle):
+    return compare_logs(vehicle, read_log(source(bags["simulator"])))
 
 
 # ------------------------------------------------------------------ the whole way
@@ -140,34 +146,34 @@ def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys
 
 
 @pytest.mark.slow
-def test_what_both_have_alike_is_no_claim_and_what_only_the_simulator_has_is_said_so(bags, tmp_path):
+def test_what_both_have_alike_is_no_claim_and_what_only_the_simulator_has_is_said_so(vehicle, tmp_path):
     arm = "lever_arm:x_m=0.8,y_m=-0.3"
     made = bag(
         tmp_path / "sim", (arm, "velocity_bias:x_mps=0.05"), gnss_rate=10.0, gnss_std=0.0, seed=3,
         errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.005),
     )  # fmt: skip
-    found = {each.name: each.status for each in compare(source(bags["vehicle"]), source(made)).effects}
+    found = {each.name: each.status for each in compare_logs(vehicle, read_log(source(made))).effects}
     assert found["lever_arm"] is ComparisonStatus.ALIKE
     assert found["velocity_bias"] is ComparisonStatus.ONLY_SIMULATOR
 
 
 @pytest.mark.slow
-def test_a_simulator_whose_dvl_is_its_truth_is_told_so_and_lacks_no_less(bags, tmp_path):
+def test_a_simulator_whose_dvl_is_its_truth_is_told_so_and_lacks_no_less(vehicle, tmp_path):
     made = bag(
         tmp_path / "sim", trajectory="lawnmower", gnss_rate=10.0, gnss_std=0.0,
         errors=DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.0),
     )  # fmt: skip
-    found = compare(source(bags["vehicle"]), source(made))
+    found = compare_logs(vehicle, read_log(source(made)))
     leak = next(each for each in found.noise if each.name == "truth_leaks")
     assert leak.status is ComparisonStatus.ONLY_SIMULATOR and "without any noise" in leak.note
     assert [each.name for each in found.effects if each.status.is_claim] == ["lever_arm"]
 
 
 @pytest.mark.slow
-def test_a_loud_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(bags, tmp_path):
+def test_a_loud_simulator_that_goes_straight_on_cannot_tell_of_a_lever_arm(vehicle, tmp_path):
     loud = DvlErrors((0.0,) * 3, (0.0,) * 3, (0.0,) * 4, 0.5)
     made = bag(tmp_path / "sim", trajectory="straight", gnss_rate=10.0, gnss_std=0.0, errors=loud)
-    found = compare(source(bags["vehicle"]), source(made))
+    found = compare_logs(vehicle, read_log(source(made)))
     arm = next(each for each in found.effects if each.name == "lever_arm")
     assert arm.status is ComparisonStatus.CANNOT_TELL and "with the simulator" in arm.needs
 
