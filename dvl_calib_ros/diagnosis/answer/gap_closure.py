@@ -12,7 +12,7 @@ from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_ov
 from ...calibration.numerics.frames import Array
 from ..fit.cross_validation import fitted_without, folds_of, stretch_of
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.selection_criteria import NuisanceFit, blocks_of, coloured_anew, with_slow_noise
+from ..fit.selection_criteria import SlowNoise, blocks_of
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
@@ -283,12 +283,10 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
-    known = NuisanceFit.of_fit(problem, fit)
-    noise, unfollowed = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)
-    followed = np.zeros(len(unfollowed))
+    slow = SlowNoise.of_fit(problem, fit)
+    noise, unfollowed, followed = slow.noise, slow.left, np.zeros(len(slow.left))
     if matters(problem, fit, rest):
-        both = known.and_rest(rest.clearest, fit.residual)
-        noise, without = coloured_anew(noise, both, fit.residual)
+        *_, noise, without = slow.with_rest(problem, slow.noise, rest.clearest)
         followed, unfollowed = (unfollowed**2 - without**2).sum(axis=1), without
     usual, claimed = noise.energy, claimed_std(problem)
     slower = (unfollowed**2).sum(axis=1) - usual
