@@ -114,15 +114,15 @@ class ScoreTest:
     has: NDArray[np.bool_]
 
     @staticmethod
-    def of(q: Array, white_columns: Array, white: Array) -> ScoreTest:
-        """Test whitened columns (m, c) beside an orthonormal basis q for a whitened series."""
-        rows = len(white_columns)
-        known, square = q[:rows].T @ white_columns, white_columns.T @ white_columns
+    def of(q: Array, white_columns: Array, white: Array, first: int = 0) -> ScoreTest:
+        """Test whitened columns (m, c), zero but from row `first` on, beside an orthonormal basis q for a series."""
+        rows = slice(first, first + len(white_columns))
+        known, square = q[rows].T @ white_columns, white_columns.T @ white_columns
         left = square - known.T @ known
         before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, left))
         has = after > 0.02 * np.maximum(before, 1e-300)
         size = np.where(has, after, 1.0)
-        along = white_columns.T @ white[:rows] - known.T @ (q.T @ white)
+        along = white_columns.T @ white[rows] - known.T @ (q.T @ white)
         return ScoreTest(left / np.outer(size, size), along / size, has)
 
     def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
