@@ -21,7 +21,7 @@ from .answer.confidence_intervals import Times, Triple, covariance_of
 from .answer.dvl_description import dvl_seen
 from .answer.gap_closure import Gap, closure_alone, held_out, measure_gap, with_closure
 from .answer.gap_location import places
-from .answer.held_out_validation import confirmed, settled
+from .answer.held_out_validation import settled
 from .answer.noise_findings import noise_findings
 from .answer.plotted_series import collect_series
 from .answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
@@ -111,14 +111,8 @@ def diagnose_recordings(
     _check_bounds(selection)
     selection, rest = settled(selection)
     residuals = held_out(selection, rest)
-    gap = measure_gap(selection, residuals)
-    stands, rest = confirmed(selection, rest, gap)
-    if stands is not selection:
-        selection = stands
-        residuals = held_out(selection, rest)
-        gap = measure_gap(selection, residuals)
     covariance, times = covariance_of(selection)
-    gap = with_closure(gap, selection, covariance, residuals)
+    gap = with_closure(measure_gap(selection, residuals), selection, covariance, residuals)
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
     verdict = _verdict(selection, rest, gap, len(visible) / len(testable))

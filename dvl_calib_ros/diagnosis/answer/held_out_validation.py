@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import itertools
 
-import numpy as np
-
 from ...effects.base import Effect
-from ..fit.cross_validation import surprise_elsewhere
-from ..fit.gauss_newton import Fit
-from ..fit.selection_criteria import NuisanceFit
-from ..model.forward_model import Problem
+from ..fit.cross_validation import predictive_gain
+from ..fit.selection_criteria import SlowNoise
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
-from ..search.event_scan import EVENTS
 from ..search.unexplained import (
     INEXACT,
     Unexplained,
@@ -21,7 +16,6 @@ from ..search.unexplained import (
     matters,
     unexplained,
 )
-from .gap_closure import Gap
 
 
 def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
@@ -41,36 +35,14 @@ def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
         other = unexplained(fitter, reduced.fit, asked=0.0)
         if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
             continue
-        gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop
+        cause = SlowNoise.of_fit(problem, reduced.fit).with_rest(problem, reduced.fit.noise, other.clearest)
+        gain = predictive_gain(problem, SlowNoise.of_fit(problem, fit), cause)
+        gain -= SETTINGS.indistinguishable + INEXACT * drop
         if gain > 0.0 and (best is None or gain > best[0]):
             best = gain, reduced, other
     return (selection, rest) if best is None else best[1:]
 
 
-def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
-    """Return the held-out deviance gain of an unmodelled regressor over the removed effects."""
-    whole, rest = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
-    rest = rest.and_rest(other.clearest, reduced.residual)
-    effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
-    return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
-
-
 def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     effects = selection.fit.effects
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
-
-
-def confirmed(selection: EffectSelection, rest: Unexplained, gap: Gap) -> tuple[EffectSelection, Unexplained]:
-    """Return a selection and its residual's cause, or without any effect if the selection may enlarge the error.
-
-    An effect that one stretch alone determines, as a clock jump by one turn, is kept if no unknown cause replaces it.
-    """
-    shrinks = gap.falls_from > 0.0 or (np.isnan(gap.falls_from) and gap.after < gap.before)
-    if not selection.selected or shrinks:
-        return selection, rest
-    none = selection.withdrawn()
-    left = unexplained(none.fitter, none.fit)
-    is_event = left.about in EVENTS  # such as the only turn after a clock jump
-    if gap.shown_from > 0.0 and (is_event or not matters(none.fitter.problem, none.fit, left)):
-        return selection, rest
-    return none, left
