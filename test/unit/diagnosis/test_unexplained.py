@@ -222,7 +222,7 @@ def test_an_unknown_cause_takes_the_place_of_effects_only_where_it_predicts_bett
     cause = looking.Unexplained(-50.0, told, "speed", nothing, nothing, told, told)
     monkeypatch.setattr(held_out_validation, "unexplained", lambda *_, **__: cause)
     monkeypatch.setattr(held_out_validation, "matters", lambda _, of, __: of.effects == ())
-    monkeypatch.setattr(held_out_validation, "_better_elsewhere", lambda *_: better)
+    monkeypatch.setattr(held_out_validation, "predictive_gain", lambda *_: better)
     selected = (Selected(drift, -50.0, ()),)
     left, _ = settled(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS))
     assert bool(left.selected) == kept
@@ -258,7 +258,7 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
     cause = looking.Unexplained(-50.0, told, about, nothing, nothing, told, told)
     monkeypatch.setattr(held_out_validation, "unexplained", lambda *_, **__: cause)
     monkeypatch.setattr(held_out_validation, "matters", lambda _, of, __: of.effects == ())
-    monkeypatch.setattr(held_out_validation, "_better_elsewhere", lambda *_: 1000.0)
+    monkeypatch.setattr(held_out_validation, "predictive_gain", lambda *_: 1000.0)
     left, _ = settled(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
     assert bool(left.selected) == is_some
 
