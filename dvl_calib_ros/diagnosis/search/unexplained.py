@@ -6,6 +6,7 @@ of the vehicle's motion, so a residual that follows the motion is systematic.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -27,6 +28,7 @@ from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import ScoreTest, orthonormal
 from .alternative_regressors import ALTERNATIVES, dictionary
+from .effect_selection import EffectSelection
 from .event_scan import events
 
 # Spectral lines: longer than wave periods; more periods than the time dictionary resolves
@@ -280,6 +282,36 @@ def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
     """Return the held-out deviance gain of columns (M, A, c) beside a fit's."""
     slow = SlowNoise.of_fit(problem, fit)
     return predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
+
+
+def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
+    """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
+
+    Better means better prediction of held-out stretches. A group of functions that contains the effects includes their
+    cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
+    """
+    fitter, fit = selection.fitter, selection.fit
+    problem, rest = fitter.problem, unexplained(fitter, fit)
+    best: tuple[float, EffectSelection, Unexplained] | None = None
+    for out in _subsets(selection):
+        reduced = selection.without({effect.name for effect in out})
+        drop = reduced.fit.deviance - fit.deviance
+        if drop > SETTINGS.instead_of:
+            continue
+        other = unexplained(fitter, reduced.fit, asked=0.0)
+        if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
+            continue
+        cause = SlowNoise.of_fit(problem, reduced.fit).with_rest(problem, reduced.fit.noise, other.clearest)
+        gain = predictive_gain(problem, SlowNoise.of_fit(problem, fit), cause)
+        gain -= SETTINGS.indistinguishable + INEXACT * drop
+        if gain > 0.0 and (best is None or gain > best[0]):
+            best = gain, reduced, other
+    return (selection, rest) if best is None else best[1:]
+
+
+def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
+    effects = selection.fit.effects
+    return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
