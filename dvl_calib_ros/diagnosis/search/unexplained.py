@@ -76,11 +76,11 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
-def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
+def unexplained(fitter: Fitter, fit: Fit, asked: float = 0.0) -> Unexplained:
     """Test the residual of a fit against the dictionary.
 
-    The null distribution is from recordings simulated from the fit (parametric bootstrap). asked: required excess over
-    the price; return early without a finding if no test can reach it.
+    The null distribution is from recordings simulated from the fit (parametric bootstrap). asked: deviance that a
+    cause must explain; return early without a finding if none does.
     """
     problem, noise = fitter.problem, fit.noise
     looks, white, raw, basis = _looked(fitter, fit, problem, fit.seen, fit.residual)
@@ -88,7 +88,8 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
     left = noise.whiten(fit.residual)
-    left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
+    variance = float(left @ left) / (left.size - basis.shape[1])
+    left = left / np.sqrt(variance)
     followed = lines(problem, left.reshape(-1, problem.axes))
     tested = len(looks) + len(followed)
     happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
@@ -100,14 +101,10 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
             for each in happened
             if _is_predictive(problem, fit, each.columns, least + _price(tested + each.tried, each.columns.shape[2]))
         ]
-    if asked > -np.inf and not happened:
-        most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
-        for line in followed:
-            waves = _along_axes(line.waves, problem.axes)
-            energy = explained(basis[: left.size, :0], noise.whiten(waves), left, 1.0)[1]
-            most.append((energy + waves.shape[2], waves.shape[2]))
-        prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
-        if max(each - prices[columns] for each, columns in most) < asked:
+    if asked > 0.0 and not happened:
+        waves = (noise.whiten(_along_axes(line.waves, problem.axes)) for line in followed)
+        of_lines = (ScoreTest.of(basis[: left.size, :0], each, left).energy(np.arange(each.shape[1])) for each in waves)
+        if variance * max(*(look.energy for look in looks), *(energy for energy, _ in of_lines)) < asked:
             return Unexplained(0.0, 0.0, "", nothing, nothing)
     looked_at = float(np.log(tested))
     nominal = [
@@ -298,7 +295,8 @@ def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
         drop = reduced.fit.deviance - fit.deviance
         if drop > SETTINGS.instead_of:
             continue
-        other = unexplained(fitter, reduced.fit, asked=0.0)
+        by_effects = predictive_gain(problem, SlowNoise.of_fit(problem, reduced.fit), SlowNoise.of_fit(problem, fit))
+        other = unexplained(fitter, reduced.fit, asked=by_effects)
         if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
             continue
         cause = SlowNoise.of_fit(problem, reduced.fit).with_rest(problem, reduced.fit.noise, other.clearest)

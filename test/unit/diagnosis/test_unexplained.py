@@ -55,16 +55,15 @@ def test_what_could_not_be_clear_enough_is_not_held_against_made_up_recordings(s
     fitter, fit = stepped
     monkeypatch.setattr(looking, "events", lambda *_: [])
     whole = unexplained(fitter, fit)
-    excess = whole.clear_energy - whole.price
-    assert whole.found and excess > 20.0
-    asked = unexplained(fitter, fit, asked=excess)
+    assert whole.found and whole.clear_energy - whole.price > 20.0
+    asked = unexplained(fitter, fit, asked=whole.clear_energy)
     assert asked.found and (asked.energy, asked.clear_energy, asked.about) == (
         whole.energy,
         whole.clear_energy,
         whole.about,
     )
     monkeypatch.setattr(looking, "simulated_recordings", lambda *_: pytest.fail("asked for nothing"))
-    assert not unexplained(fitter, fit, asked=excess + 1000.0).found
+    assert not unexplained(fitter, fit, asked=3.0 * whole.clear_energy).found
 
 
 def test_a_fit_from_what_was_looked_at_already_is_the_same():
