@@ -258,13 +258,10 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
 
 
 def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:
-    return holds_out(problem, fit, columns) > least - columns.shape[2]
-
-
-def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
-    """Return the held-out deviance gain of columns (M, A, c) beside a fit's."""
+    """Return whether columns (M, A, c) together with a fit's predict held-out data better by more than the least."""
     slow = SlowNoise.of_fit(problem, fit)
-    return predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
+    gain = predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
+    return gain > least - columns.shape[2]
 
 
 def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:

@@ -25,7 +25,6 @@ from dvl_calib_ros.diagnosis.search import unexplained as looking
 from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection
 from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import (
-    holds_out,
     is_of_group,
     matters,
     settled,
