@@ -193,7 +193,7 @@ def _likely(raw: Array, residual: Array) -> float:
 
 
 class SlowNoise(NamedTuple):
-    """Noise with a memory up to multipath's, estimated together with columns known of a residual (M, A).
+    """Noise as slow as multipath or faster, estimated together with known columns of a residual (M, A).
 
     left: (M, A), the residual with the columns subtracted.
     """
