@@ -270,17 +270,16 @@ def dvl_velocity(case: Case, motion: Motion, effects: Effects) -> Array:
         body += rotation(motion.angles).inv().apply(earth)
     body[:, 0] += e.get("thrust_bias", {}).get("mps", 0.0) * motion.thrust
     body[:, 0] += e.get("roll_rate_coupling", {}).get("m", 0.0) * motion.rate[:, 0]
-    seen = body @ case.calibration.T
-    fast = np.linalg.norm(seen, axis=1)[:, None]
-    hours = (t[:, None]) / 3600.0
+    hours = t[:, None] / 3600.0
     flexed = speed[:, None] * _three(e, "mount_flexure", *(f"{axis}_rad_per_mps" for axis in "xyz"))
     drifted = hours * _three(e, "misalignment_drift", *(f"{axis}_rad_per_hour" for axis in "xyz"))
+    seen = Rotation.from_rotvec(flexed + drifted).apply(body @ case.calibration.T)
+    fast = np.linalg.norm(seen, axis=1)[:, None]
     xy, xz, yz = _three(e, "axis_nonorthogonality", "xy_rad", "xz_rad", "yz_rad")
     shear = np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
     depth = motion.depth[:, None] - 30.0
     velocity: Array = (
         seen
-        + np.cross(flexed + drifted, seen)
         + seen @ shear
         + seen * hours * e.get("scale_drift", {}).get("rate_per_hour", 0.0)
         + seen * fast * e.get("quadratic_scale", {}).get("coefficient_s_per_m", 0.0)

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from validation.second_recordings import START_S, TYPES, Case, Noise, motion_of, residual, rotation, streams_of, write
+from validation.second_recordings import (
+    START_S,
+    TYPES,
+    Case,
+    Noise,
+    dvl_velocity,
+    motion_of,
+    residual,
+    rotation,
+    streams_of,
+    write,
+)
 from validation.second_trial import KINDS, TABLE, TIMES, draw, is_right, sizes_of, true_closure, visibility
 
 LATE_S = 0.3
@@ -82,6 +93,15 @@ def test_a_lever_arm_ahead_is_omega_cross_arm(boat):
     straight = replace(boat, mounting_rpy=(0.0, 0.0, 0.0), misalignment_rad=(0.0, 0.0, 0.0), scale=0.0)
     difference = residual(straight, motion, {"lever_arm": {"x_m": 0.5}}, stamps)
     np.testing.assert_allclose(difference[:, 1], 0.5 * motion.at(stamps).rate[:, 2], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["mount_flexure", "misalignment_drift"])
+def test_a_mounting_that_turns_measures_the_same_speed(boat, name):
+    motion, per = motion_of(boat), {"mount_flexure": "rad_per_mps", "misalignment_drift": "rad_per_hour"}[name]
+    effects = {name: {f"y_{per}": 0.07, f"z_{per}": -0.1}}
+    without, turned = (dvl_velocity(boat, motion, each) for each in ({}, effects))
+    speeds = (np.linalg.norm(each, axis=1) for each in (without, turned))
+    np.testing.assert_allclose(*speeds, rtol=1e-12)
 
 
 def test_the_bag_holds_the_streams_with_stamps_that_are_late(boat, tmp_path):

@@ -15,11 +15,9 @@ from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .gauss_newton import Fit, Fitter
-from .selection_criteria import NuisanceFit, coloured_anew, with_slow_noise
+from .selection_criteria import NuisanceFit, SlowNoise
 
 Integers = NDArray[np.intp]
-# Columns, and the residual (M, A) m/s to which they are fitted
-Predictor = tuple[NuisanceFit, Array]
 # Steps of a fit that starts from the fit to all data
 FOLD_STEPS = 6
 
@@ -77,16 +75,15 @@ def _held_out(
         yield held, replace(held, gram=trained)
 
 
-def predictive_gain(problem: Problem, noise: Noise, simpler: Predictor, richer: Predictor) -> float:
-    """Return the held-out deviance gain of one set of columns over a simpler one, each under its own noise.
+def predictive_gain(problem: Problem, simpler: SlowNoise, richer: SlowNoise) -> float:
+    """Return the held-out deviance gain of one set of columns over a simpler one.
 
     The noise is re-estimated with either, so that slow noise is an alternative explanation. Each takes the noise with
-    the better prediction. noise: its level and frame.
+    the better prediction.
     """
-    noise = with_slow_noise(problem, noise)
-    colours = [coloured_anew(noise, *each)[0] for each in (simpler, richer)]
+    colours = simpler.noise, richer.noise
     worse, better = (
-        min(surprise_elsewhere(problem, colour, *each) + colour.log_size for colour in colours)
+        min(surprise_elsewhere(problem, colour, each.known, each.residual) + colour.log_size for colour in colours)
         for each in (simpler, richer)
     )
     return worse - better
@@ -94,6 +91,6 @@ def predictive_gain(problem: Problem, noise: Noise, simpler: Predictor, richer: 
 
 def predictive_gain_of(problem: Problem, simpler: Fit, richer: Fit) -> float:
     """Return the `predictive_gain` of a fit over a simpler one, without the gain from smoothing instrument noise."""
-    own, other = ((NuisanceFit.of_fit(problem, each), each.residual) for each in (simpler, richer))
+    own, other = (SlowNoise.of_fit(problem, each) for each in (simpler, richer))
     smoothed = float(simpler.own_noise @ simpler.own_noise - richer.own_noise @ richer.own_noise)
-    return predictive_gain(problem, richer.noise, own, other) + max(-smoothed, 0.0)
+    return predictive_gain(problem, own, other) + max(-smoothed, 0.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,8 @@ from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 
-# Largest number of steps; converged if each step is shorter than this share of its standard deviation
-MAX_STEPS, STANDS_STILL = 30, 0.01
-# or if it reduces the deviance by less than this; differences of 1 begin to matter
-GAINS_NOTHING = 1e-3
+# Largest number of steps; converged if a step would reduce the deviance by less than this; differences of 1 matter
+MAX_STEPS, GAINS_NOTHING = 30, 1e-3
 HALVINGS = 5
 # The last step is rejected if it increases the misfit by this factor
 ASTRAY = 30.0
@@ -72,6 +71,8 @@ class Fit:
     deviance: float
     own_noise: Array
     of_tails: float = 0.0
+    # results of tests of this fit, by name, each computed once
+    kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @cached_property
     def columns(self) -> Array:
@@ -207,13 +208,15 @@ class Fitter:
             evaluated = looked.seen, looked.residual
         seen, residual = evaluated or self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)
-        length, before, moved = 1.0, np.zeros(len(kept)), True
+        length, before = 1.0, np.zeros(len(kept))
         for _ in range(max_steps):
             looked = looked or self._looked(hypothesis, noise, seen, residual)
             system = looked.system
             free = np.flatnonzero(~kept)
             step, std = np.zeros(len(kept)), np.sqrt(np.diag(system.covariance()))
             step[free] = system.part(free).solution() if len(free) else 0.0
+            if misfit - system.misfit(step) < GAINS_NOTHING:
+                break
             length = _length(step / std, before, length)
             moved, tried, before = False, length * step, step / std
             for _ in range(HALVINGS):
@@ -226,10 +229,8 @@ class Fitter:
                 tried = 0.4 * tried
             if not moved:
                 break
-            gained, looked = misfit - trial_misfit, None
+            looked = None
             hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
-            if np.abs(step / std).max() < STANDS_STILL or gained < GAINS_NOTHING:
-                break
         looked = looked or self._looked(hypothesis, noise, seen, residual)
         columns, plain = looked.columns, looked.system
         made: Callable[[], Array] = partial(np.asarray, columns)

@@ -123,9 +123,9 @@ def robust_covariance(problem: Problem, fit: Fit) -> tuple[Array, int]:
     The uncertain correlation time is sampled from its posterior.
     """
     block = blocks_of(problem)
-    covariance, known, rng = fit.covariance(block), NuisanceFit.of_fit(problem, fit), np.random.default_rng(0)
-    slower, left = coloured_anew(with_slow_noise(problem, fit.noise), known, fit.residual)
-    drawn = np.stack(list(slower.drawn(left, slower.taken_by(known.columns, known.std), DRAWN, rng)), axis=2)
+    covariance, slow, rng = fit.covariance(block), SlowNoise.of_fit(problem, fit), np.random.default_rng(0)
+    taken = slow.noise.taken_by(slow.known.columns, slow.known.std)
+    drawn = np.stack(list(slow.noise.drawn(slow.left, taken, DRAWN, rng)), axis=2)
     steps = fit.system.covariance() @ fit.noise.whiten(fit.columns).T @ fit.noise.whiten(drawn)
     grown = np.sqrt(np.maximum((steps**2).mean(axis=1) / np.diag(covariance), 1.0))
     return np.asarray(covariance * np.outer(grown, grown)), int(block.max()) + 1
@@ -192,15 +192,35 @@ def _likely(raw: Array, residual: Array) -> float:
     return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
 
 
-def with_slow_noise(problem: Problem, noise: Noise) -> Noise:
-    """Return a noise whose memory may be as long as that of multipath."""
-    return replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
+class SlowNoise(NamedTuple):
+    """Noise as slow as multipath or faster, estimated together with known columns of a residual (M, A).
 
+    left: (M, A), the residual with the columns subtracted.
+    """
 
-def coloured_anew(noise: Noise, fitted: NuisanceFit, residual: Array) -> tuple[Noise, Array]:
-    """Return the noise re-estimated from a residual (M, A) with fitted columns subtracted, and the difference."""
-    left = residual
-    for _ in range(2):
-        left = residual + fitted.columns @ fitted.step(noise, residual).solution()
-        noise = noise.refitted(left, taken=noise.taken_by(fitted.columns, fitted.std))
-    return noise, left
+    known: NuisanceFit
+    residual: Array
+    noise: Noise
+    left: Array
+
+    @staticmethod
+    def of(problem: Problem, noise: Noise, known: NuisanceFit, residual: Array) -> SlowNoise:
+        """Estimate from a residual (M, A), with the level and frame of a noise."""
+        left, noise = residual, replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
+        for _ in range(2):
+            left = residual + known.columns @ known.step(noise, residual).solution()
+            noise = noise.refitted(left, taken=noise.taken_by(known.columns, known.std))
+        return SlowNoise(known, residual, noise, left)
+
+    @staticmethod
+    def of_fit(problem: Problem, fit: Fit) -> SlowNoise:
+        """Estimate from the residual of a fit, once."""
+        if "slow noise" not in fit.kept:
+            known = NuisanceFit.of_fit(problem, fit)
+            fit.kept["slow noise"] = SlowNoise.of(problem, fit.noise, known, fit.residual)
+        slow: SlowNoise = fit.kept["slow noise"]
+        return slow
+
+    def with_rest(self, problem: Problem, noise: Noise, columns: Array) -> SlowNoise:
+        """Estimate again with columns (M, A, c) that may explain the residual."""
+        return SlowNoise.of(problem, noise, self.known.and_rest(columns, self.residual), self.residual)

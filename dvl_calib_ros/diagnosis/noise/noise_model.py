@@ -34,6 +34,8 @@ MAX_FREQUENCIES = 300
 POSTERIOR_POINTS, MA_REACH = 40, 2.5
 # Upper bound of the share of noise at a frequency that a fit absorbs
 MOST_TAKEN = 0.99
+# Share of a whitened value that is rounding
+FADED = 1e-12
 # m/s; below any instrument's resolution: streams equal to rounding would otherwise have no noise
 LEAST_MPS = 1e-6
 Integers = NDArray[np.intp]
@@ -122,9 +124,9 @@ class Noise:
         return white.reshape(-1, *values.shape[2:])
 
     def part(self, rows: slice) -> Noise:
-        """Return the noise of some samples; no segment may cross their ends."""
-        within = [each for each in self.segments if rows.start <= each.start and each.stop <= rows.stop]
-        segments = tuple(slice(each.start - rows.start, each.stop - rows.start) for each in within)
+        """Return the noise of some samples; it restarts at their first."""
+        ends = ((max(each.start, rows.start), min(each.stop, rows.stop)) for each in self.segments)
+        segments = tuple(slice(start - rows.start, stop - rows.start) for start, stop in ends if start < stop)
         rotation = None if self.rotation is None else self.rotation[rows]
         return replace(self, segments=segments, rotation=rotation, level=self.level[rows])
 
@@ -188,6 +190,12 @@ class Noise:
         power = np.einsum("map,map->am", parts, parts) / m
         half = np.arange(m // 2 + 1)
         return np.clip(0.5 * (power[:, half] + power[:, -half]), 0.0, MOST_TAKEN)
+
+    @property
+    def fading(self) -> int:
+        """Return the number of samples in which whitened values fade to `FADED` after the last that is not zero."""
+        most = max(abs(arma.ma) for arma in self.axes)
+        return 1 + (int(np.log(FADED) / np.log(most)) if most else 0)
 
     @property
     def is_coloured(self) -> bool:

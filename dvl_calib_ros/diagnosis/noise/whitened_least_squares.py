@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...calibration.numerics.distributions import chi2_logsf
 from ...calibration.numerics.frames import Array
 
 # Share of noise in a direction's squares from which the direction is excluded
@@ -114,15 +115,15 @@ class ScoreTest:
     has: NDArray[np.bool_]
 
     @staticmethod
-    def of(q: Array, white_columns: Array, white: Array) -> ScoreTest:
-        """Test whitened columns (m, c) beside an orthonormal basis q for a whitened series."""
-        rows = len(white_columns)
-        known, square = q[:rows].T @ white_columns, white_columns.T @ white_columns
+    def of(q: Array, white_columns: Array, white: Array, first: int = 0) -> ScoreTest:
+        """Test whitened columns (m, c), zero but from row `first` on, beside an orthonormal basis q for a series."""
+        rows = slice(first, first + len(white_columns))
+        known, square = q[rows].T @ white_columns, white_columns.T @ white_columns
         left = square - known.T @ known
         before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, left))
         has = after > 0.02 * np.maximum(before, 1e-300)
         size = np.where(has, after, 1.0)
-        along = white_columns.T @ white[:rows] - known.T @ (q.T @ white)
+        along = white_columns.T @ white[rows] - known.T @ (q.T @ white)
         return ScoreTest(left / np.outer(size, size), along / size, has)
 
     def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
@@ -134,3 +135,8 @@ class ScoreTest:
         apart = squares > INDEPENDENT**2
         along = directions[:, apart].T @ self.along[at]
         return float(np.sum(along**2 / squares[apart])), int(np.count_nonzero(apart))
+
+    def log_p(self, at: NDArray[np.intp]) -> float:
+        """Return log p of the energy that columns `at` explain jointly."""
+        energy, dof = self.energy(at)
+        return float(chi2_logsf(energy, dof)) if dof else 0.0

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.numerics.distributions import chi2_logsf
 from ...calibration.numerics.frames import Array
 from ..fit.gauss_newton import Fit
 from ..model.forward_model import Problem
@@ -43,25 +42,30 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
     basis: orthonormal (m, k) of the fit's whitened columns, with its prior rows. white: (m,) whitened residual of unit
     variance, orthogonal to it.
     """
-    found, beside = [], _beside_known_times(problem, fit)
+    found, beside, fading = [], _beside_known_times(problem, fit), fit.noise.fading
     for about, (courses_of, error_of) in EVENTS.items():
         error = error_of(problem, fit)
         if error is None:
             continue
-        best, tried, event = 0.0, 0, None
+        best, tried, event = 0.0, 0, np.zeros((*error.shape[:2], error.shape[2]))
         for rows in problem.rows_of:
             courses = courses_of(problem.time[rows])
             tried += courses.shape[1]
             for first in range(0, courses.shape[1], BATCH):
                 course = courses[:, first : first + BATCH]
-                columns = np.zeros((*error.shape[:2], course.shape[1], error.shape[2]))
-                columns[rows] = error[rows, :, None] * course[:, None, :, None]
-                columns[beside] = 0.0
-                log_p = _log_p(fit, basis, white, columns)
+                acts = rows.start + np.flatnonzero(course.any(axis=1))
+                if not len(acts):  # all within a gap
+                    continue
+                part = slice(max(rows.start, acts[0] - 1), min(rows.stop, acts[-1] + 1 + fading))
+                course = course[part.start - rows.start : part.stop - rows.start]
+                columns = error[part, :, None] * course[:, None, :, None]
+                columns[beside[part]] = 0.0
+                log_p = _log_p(fit, basis, white, columns, part)
                 at = int(np.argmin(log_p))
                 if log_p[at] < best:
-                    best, event = log_p[at], columns[:, :, at]
-        if event is not None:
+                    best, event = log_p[at], np.zeros_like(event)
+                    event[part] = columns[:, :, at]
+        if best < 0.0:
             found.append(Event(about, best + float(np.log(tried)), event, tried))
     return found
 
@@ -76,12 +80,12 @@ def _beside_known_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     return beside
 
 
-def _log_p(fit: Fit, basis: Array, white: Array, columns: Array) -> list[float]:
-    """Return log p of each of K events with columns (M, A, K, c)."""
+def _log_p(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) -> list[float]:
+    """Return log p of each of K events with columns (m, A, K, c) in a part of the bins, zero in others."""
     m, axes, k, c = columns.shape
-    test = ScoreTest.of(basis, fit.noise.whiten(columns.reshape(m, axes, k * c)), white)
-    energies = (test.energy(at) for at in np.arange(k * c).reshape(k, c))
-    return [float(chi2_logsf(energy, dof)) if dof else 0.0 for energy, dof in energies]
+    whitened = fit.noise.part(part).whiten(columns.reshape(m, axes, k * c))
+    test = ScoreTest.of(basis, whitened, white, axes * part.start)
+    return [test.log_p(at) for at in np.arange(k * c).reshape(k, c)]
 
 
 def _steps(time: Array) -> Array:

@@ -413,3 +413,14 @@ def test_an_outlier_does_not_shift_the_level_of_slow_noise():
     assert abs(step(noise.robust(hit)) - step(noise.robust(sound))) < 0.15 * abs(step(hit) - step(sound))
     deviations = arma.deviations(sound[:, 0], noise.segments)
     assert np.std(deviations[5:-5]) == pytest.approx(1.0, rel=0.15)
+
+
+def test_an_event_is_whitened_from_the_bins_about_it_alone(rng):
+    arma = Arma(np.array([0.95]), -0.6, 0.02, 1.5)
+    noise = Noise((slice(0, 150), slice(150, 400)), None, rng.uniform(0.5, 2.0, (400, 3)), (arma,) * 3)
+    event, about = np.zeros((400, 3)), slice(139, 164 + noise.fading)
+    event[140:164] = rng.normal(size=(24, 3))
+    whole = noise.whiten(event).reshape(400, 3)
+    np.testing.assert_allclose(noise.part(about).whiten(event[about]).reshape(-1, 3), whole[about], atol=1e-9)
+    assert about.stop < 250
+    np.testing.assert_allclose(whole[about.stop :], 0.0, atol=1e-9)
