@@ -21,6 +21,7 @@ from .answer.confidence_intervals import Times, Triple, covariance_of
 from .answer.dvl_description import dvl_seen
 from .answer.gap_closure import Gap, closure_alone, held_out, measure_gap, with_closure
 from .answer.gap_location import places
+from .answer.held_out_validation import confirmed, settled
 from .answer.noise_findings import noise_findings
 from .answer.plotted_series import collect_series
 from .answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
@@ -44,7 +45,7 @@ from .search.effect_selection import EffectSelection, TooFewBinsError, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
 from .search.observable_parameters import somewhere, with_observable
-from .search.unexplained import Unexplained, matters, moved_by, settled
+from .search.unexplained import Unexplained, matters, moved_by
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 
@@ -110,8 +111,14 @@ def diagnose_recordings(
     _check_bounds(selection)
     selection, rest = settled(selection)
     residuals = held_out(selection, rest)
+    gap = measure_gap(selection, residuals)
+    stands, rest = confirmed(selection, rest, gap)
+    if stands is not selection:
+        selection = stands
+        residuals = held_out(selection, rest)
+        gap = measure_gap(selection, residuals)
     covariance, times = covariance_of(selection)
-    gap = with_closure(measure_gap(selection, residuals), selection, covariance, residuals)
+    gap = with_closure(gap, selection, covariance, residuals)
     detectable = {name: _minimum_detectable(selection, effect, len(testable)) for name, effect in testable.items()}
     visible = [name for name, sizes in detectable.items() if _is_visible(testable[name], sizes)]
     verdict = _verdict(selection, rest, gap, len(visible) / len(testable))

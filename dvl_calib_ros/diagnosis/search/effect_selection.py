@@ -79,7 +79,11 @@ class EffectSelection:
         kept = [effect for effect in self.fit.effects if effect.name not in names]
         hypothesis = self.fit.hypothesis.with_effects(kept, len(self.fit.seen), {})
         selected = tuple(each for each in self.selected if each.effect.name not in names)
-        return replace(self, selected=selected, fit=self.fitter.fit_kept(hypothesis, self.fit.noise))
+        return replace(self, selected=selected, fit=self.fitter.fit(hypothesis, self.fit.noise))
+
+    def withdrawn(self) -> EffectSelection:
+        """Return the selection without any effect."""
+        return replace(self, selected=(), fit=self.base, opened=None, moved={})
 
 
 class TooFewBinsError(Exception):
@@ -134,6 +138,7 @@ def select(
     if far.any():
         problem = problem.without(far)
         fitter, fit = _about(*_first_fit(problem, fit.hypothesis), every)
+    best = fit
     seen_before: set[frozenset[str]] = set()
     for _ in range(ROUNDS):
         candidates = [*proposed(fitter, fit, effects), *with_two_cycles(fitter, fit, heading)]
@@ -145,13 +150,13 @@ def select(
             as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
             fits.append(fitter.fit(as_white.hypothesis, fit.noise))
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
-        fit = in_gaps(fitter, fitter.refined(best_of(fits, effects), finer[3:]))
-        fit = eliminate(fitter, fit, len(effects))
+        best = in_gaps(fitter, fitter.refined(best_of(fits, effects), finer[3:]))
+        best = eliminate(fitter, best, len(effects))
+        fitter, fit = _about(fitter, best, every)
         names = frozenset(effect.name for effect in fit.effects)
         if names in seen_before:
             break
         seen_before.add(names)
-        fitter, fit = _about(fitter, fit, every)
     wider = eliminate(fitter, fit, len(effects))
     fit = only_predictive(fitter, wider, len(effects))
     fitter, fit = _about(fitter, fit, every)

@@ -6,7 +6,6 @@ of the vehicle's motion, so a residual that follows the motion is systematic.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -28,7 +27,6 @@ from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import ScoreTest, orthonormal
 from .alternative_regressors import ALTERNATIVES, dictionary
-from .effect_selection import EffectSelection
 from .event_scan import events
 
 # Spectral lines: longer than wave periods; more periods than the time dictionary resolves
@@ -50,15 +48,17 @@ OF_GROUP = 0.02
 class Unexplained:
     """Result of the score tests. log_p: of the best entry or of all jointly, adjusted for multiple tests.
 
-    about: name of the regressor, or a period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest:
-    (M, A, c), the most significant columns. price: quantile of the best test under the null at
-    `SETTINGS.robust_level`.
+    energy: excess over the null, in noise variances. about: name of the regressor, or a period (s). columns: (M, A, f),
+    the dictionary; empty if insignificant. clearest: (M, A, c), the most significant columns. clear_energy: explained
+    by these. price: quantile of the best test under the null at `SETTINGS.robust_level`.
     """
 
     log_p: float
+    energy: float
     about: str | float
     columns: Array
     clearest: Array
+    clear_energy: float = 0.0
     price: float = 0.0
 
     @property
@@ -74,11 +74,11 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
-def unexplained(fitter: Fitter, fit: Fit, asked: float = 0.0) -> Unexplained:
+def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
     """Test the residual of a fit against the dictionary.
 
-    The null distribution is from recordings simulated from the fit (parametric bootstrap). asked: deviance that a
-    cause must explain; return early without a finding if none does.
+    The null distribution is from recordings simulated from the fit (parametric bootstrap). asked: required excess over
+    the price; return early without a finding if no test can reach it.
     """
     problem, noise = fitter.problem, fit.noise
     looks, white, raw, basis = _looked(fitter, fit, problem, fit.seen, fit.residual)
@@ -86,8 +86,7 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = 0.0) -> Unexplained:
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
     left = noise.whiten(fit.residual)
-    variance = float(left @ left) / (left.size - basis.shape[1])
-    left = left / np.sqrt(variance)
+    left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
     tested = len(looks) + len(followed)
     happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
@@ -99,11 +98,15 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = 0.0) -> Unexplained:
             for each in happened
             if _is_predictive(problem, fit, each.columns, least + _price(tested + each.tried, each.columns.shape[2]))
         ]
-    if asked > 0.0 and not happened:
-        waves = (noise.whiten(_along_axes(line.waves, problem.axes)) for line in followed)
-        of_lines = (ScoreTest.of(basis[: left.size, :0], each, left).energy(np.arange(each.shape[1])) for each in waves)
-        if variance * max(*(look.energy for look in looks), *(energy for energy, _ in of_lines)) < asked:
-            return Unexplained(0.0, "", nothing, nothing)
+    if asked > -np.inf and not happened:
+        most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
+        for line in followed:
+            waves = _along_axes(line.waves, problem.axes)
+            energy = explained(basis[: left.size, :0], noise.whiten(waves), left, 1.0)[1]
+            most.append((energy + waves.shape[2], waves.shape[2]))
+        prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
+        if max(each - prices[columns] for each, columns in most) < asked:
+            return Unexplained(0.0, 0.0, "", nothing, nothing)
     looked_at = float(np.log(tested))
     nominal = [
         *(each.log_p for each in happened),
@@ -111,8 +114,9 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = 0.0) -> Unexplained:
         *(line.log_p for line in followed),
     ]
     if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
-        return Unexplained(min(min(nominal) + looked_at, 0.0), "", nothing, nothing)
+        return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
     grown = _grown(fitter, fit, looks)
+    of_group = {look.name: by for look, by in zip(looks, grown, strict=True) if look.is_whole}
     tests: list[tuple[float, str | float, Array]]
     tests = [(look.log_p(by), look.name, raw[look.name][:, :, look.at]) for look, by in zip(looks, grown, strict=True)]
     tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
@@ -120,11 +124,21 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = 0.0) -> Unexplained:
     best = min(tests, key=_first)
     about = _plainest(tests, best[0])
     log_p = best[0] + looked_at
+    whole = [(look.energy / by, look.dof) for look, by in zip(looks, grown, strict=True) if look.is_whole]
+    energy = max(*(each - dof for each, dof in whole), 0.0)
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
+    clearest = noise.whiten(best[2])
     tested = next((tested + each.tried for each in happened if each.about == best[1]), tested)
-    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _price(tested, best[2].shape[2]))
+    held_against = (basis[: left.size, :0], clearest, left)
+    if not isinstance(best[1], float):
+        held_against = (basis, clearest, white)
+    clear_energy = explained(*held_against, 1.0)[1]
+    clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
+    energy = max(energy, clear_energy - best[2].shape[2])  # a period is of no group
+    cost = _price(tested, best[2].shape[2])
+    found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
 
 
@@ -146,10 +160,11 @@ def _first(each: tuple[float, str | float, Array]) -> float:
 
 @dataclass(frozen=True)
 class FollowTest:
-    """Score test. name: of the group; at: columns under test; energy: chi-square of dof."""
+    """Score test. name: of the group; at: columns under test; energy: chi-square of dof; is_whole: all columns."""
 
     name: str
     at: NDArray[np.intp]
+    is_whole: bool
     energy: float
     dof: int
 
@@ -178,8 +193,8 @@ def _looked(
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions * sound, problem.axes)
         told = ScoreTest.of(q, noise.whiten(raw[name]), white)
-        for at in _looks(name, functions.shape[1], problem.axes):
-            looks.append(FollowTest(name, at, *told.energy(at)))
+        for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
+            looks.append(FollowTest(name, at, number == 0, *told.energy(at)))
     return looks, white, raw, q
 
 
@@ -258,41 +273,13 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
 
 
 def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:
-    """Return whether columns (M, A, c) together with a fit's predict held-out data better by more than the least."""
+    return holds_out(problem, fit, columns) > least - columns.shape[2]
+
+
+def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
+    """Return the held-out deviance gain of columns (M, A, c) beside a fit's."""
     slow = SlowNoise.of_fit(problem, fit)
-    gain = predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
-    return gain > least - columns.shape[2]
-
-
-def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
-    """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
-
-    Better means better prediction of held-out stretches. A group of functions that contains the effects includes their
-    cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
-    """
-    fitter, fit = selection.fitter, selection.fit
-    problem, rest = fitter.problem, unexplained(fitter, fit)
-    best: tuple[float, EffectSelection, Unexplained] | None = None
-    for out in _subsets(selection):
-        reduced = selection.without({effect.name for effect in out})
-        drop = reduced.fit.deviance - fit.deviance
-        if drop > SETTINGS.instead_of:
-            continue
-        by_effects = predictive_gain(problem, SlowNoise.of_fit(problem, reduced.fit), SlowNoise.of_fit(problem, fit))
-        other = unexplained(fitter, reduced.fit, asked=by_effects)
-        if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
-            continue
-        cause = SlowNoise.of_fit(problem, reduced.fit).with_rest(problem, reduced.fit.noise, other.clearest)
-        gain = predictive_gain(problem, SlowNoise.of_fit(problem, fit), cause)
-        gain -= SETTINGS.indistinguishable + INEXACT * drop
-        if gain > 0.0 and (best is None or gain > best[0]):
-            best = gain, reduced, other
-    return (selection, rest) if best is None else best[1:]
-
-
-def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
-    effects = selection.fit.effects
-    return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
+    return predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
@@ -335,3 +322,10 @@ def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
         return looks
     together = ALTERNATIVES[name]
     return [*looks, *(index[:, at : at + together].ravel() for at in range(0, c, together))]
+
+
+def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
+    """Return log p of the energy of a whitened series in some columns, and its excess over the null."""
+    energy, dof = ScoreTest.of(q, white_columns, white).energy(np.arange(white_columns.shape[1]))
+    energy /= variance
+    return (float(chi2_logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)
