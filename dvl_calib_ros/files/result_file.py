@@ -21,7 +21,7 @@ from ..calibration.filters.cross_validation import with_states_of
 from ..calibration.filters.filter_setup import prior
 from ..calibration.filters.observability import Convergence
 from ..calibration.models import MODELS
-from ..calibration.models.parameters import FLU, FRD, Parameters
+from ..calibration.models.parameters import FLU, FRD, SCHEMA, Parameters
 from ..calibration.numerics.frames import (
     FLU_FROM_FRD,
     Array,
@@ -401,6 +401,10 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
     if not known:
         raise InputError(f"{path}: none of its models {', '.join(map(str, models))} is one of {', '.join(MODELS)}")
     _check_says_one_thing(path, content)
+    if isinstance(parameters := content.get("parameters"), dict):
+        for name in ("gnss_model", "gnss_free_model"):  # in 0.1.0 of auto, now of iac alone
+            if name in parameters and parameters[name] not in SCHEMA[name].choices:
+                parameters[name] = SCHEMA[name].default
     return content, known
 
 

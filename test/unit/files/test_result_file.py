@@ -75,6 +75,17 @@ def test_every_model_comes_back_bit_for_bit(saved, result):
         assert loaded[name].p.tobytes() == np.ascontiguousarray(estimate.covariance).tobytes()
 
 
+def test_a_file_whose_parameters_name_the_models_of_auto_is_read(saved, result):
+    """As version 0.1.0 wrote it."""
+    text = saved.read_text()
+    assert "gnss_model: M3" in text
+    saved.write_text(
+        text.replace("gnss_model: M3", "gnss_model: full").replace("gnss_free_model: M7", "gnss_free_model: F1")
+    )
+    assert load_extrinsics(saved, "a").model == "full"
+    assert load_result(saved)[0]["parameters"]["gnss_model"] == "M3"
+
+
 def test_what_is_of_the_day_is_not_gone_on_with_and_all_else_is(saved, result):
     loaded = load_initial_calibration(saved, MOUNTING)
     for name, estimate in result.estimates.items():
