@@ -35,9 +35,6 @@ BOTH_ALIKE: Array = np.array([0.0] * 7 + [1.0, 0.0])
 HELD_STD_S = 1e-4
 # Prior σ of the states; it decides what the motion does not: at one speed a delay looks like a lever arm.
 LIKELY: Array = np.array([0.1] * 3 + [0.03] + [1.0] * 3 + [30.0, 30.0])
-# Prior σ of the heading's drift (rad/s; 30°/h, a low-cost gyro), and at most from start to end (rad): a heading that
-# settles. At a steady turn rate a drift looks like a delay of the reference.
-DRIFT_STD_RADPS, DRIFT_AT_MOST = math.radians(30.0) / 3600.0, math.radians(2.0)
 # Most references in a full and in a quick fit, evenly spread.
 MOST_ROWS, FEW_ROWS = 4000, 800
 # Most rounds, and the largest step (s, m, rad) of a converged fit.
@@ -147,13 +144,11 @@ class AxisFactors(NamedTuple):
 class _Rows(NamedTuple):
     """Linearised rows: residual (J, A) m/s, jacobian (J, A, 9), reference indices `at` (J,), RMS speed (m/s).
 
-    of_noise (J,): expected squared δ column by DVL noise alone. drift (J, A): derivatives by a drift of
-    the heading, in its prior σ, which is projected out of residual and jacobian.
+    of_noise (J,): expected squared δ column by DVL noise alone.
     """
 
     residual: Array
     jacobian: Array
-    drift: Array
     at: Index
     of_noise: Array
     speed: float
@@ -255,7 +250,7 @@ class MotionFit:
             return AxisFactors(np.ones(3), np.full(3, np.inf))
         axes = rows.residual.shape[1]
         weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_AT**2 * axes * fitted.level**2))
-        _, own = _without(rows.drift, rows.residual, self._axes_of_dvl(fitted, rows, rotation))
+        own = self._axes_of_dvl(fitted, rows, rotation)
         kept = [*range(N)[TURN], *range(N)[ARM], APART]
         h = np.concatenate([own, rows.jacobian[:, :, kept]], axis=2).reshape(-1, 3 + len(kept))
         w = np.repeat(weight, axes) / fitted.level**2
@@ -337,21 +332,14 @@ class MotionFit:
         jacobian[:, :, ARM] = skew(rates)
         jacobian[:, :, APART] = -(1.0 + x[SCALE]) * slope @ rotation.T
         jacobian[:, :, LATE] = cross(rates, body)
-        drift: Array = np.zeros((len(at), 3))
-        if self.is_turned:
-            since, seconds = self.times[at] - self.times.mean(), float(np.ptp(self.times))
-            rate = min(DRIFT_STD_RADPS, DRIFT_AT_MOST / seconds)
-            drift = rate * since[:, None] * cross(attitude[:, 2], body)
         measured = np.array(self._motion.measured)
         if not measured.all():
             if self._motion.in_earth:
                 residual = np.einsum("nij,nj->ni", attitude, residual)
-                drift = np.einsum("nij,nj->ni", attitude, drift)
                 jacobian = attitude @ jacobian
-            residual, jacobian, drift = residual[:, measured], jacobian[:, measured], drift[:, measured]
+            residual, jacobian = residual[:, measured], jacobian[:, measured]
         speed = float(np.sqrt(squared(body).mean()))
-        residual, projected = _without(drift, residual, jacobian)
-        return _Rows(residual, projected, drift, at, gain * self.dvl_noise * residual.shape[1], speed)
+        return _Rows(residual, jacobian, at, gain * self.dvl_noise * residual.shape[1], speed)
 
     def _solved(
         self, x: Array, rows: _Rows, nominal: Array, rotation: Array, in_time: Sequence[Array]
@@ -393,19 +381,6 @@ def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Cl
     factor = blocks.inflation(0, np.zeros(N), p, LASTS_BEYOND_DOUBT, None)
     inflation = max(float(factor[[APART, LATE]].max()), _lasting(rows.residual))
     return Claimed(p * np.outer(factor, factor), inflation, factor)
-
-
-def _without(column: Array, residual: Array, jacobian: Array) -> tuple[Array, Array]:
-    """Project a nuisance column (J, A), in its prior σ, out of residuals (J, A) and derivatives (J, A, k)."""
-    axes = residual.shape[1]
-    squares = squared(residual)
-    level2 = max(float(median(squares)) / _MEDIAN_CHI2[axes - 1], 1e-8)
-    w = column / (level2 + squares / (HALF_AT**2 * axes))[:, None]
-    known = 1.0 + float((w * column).sum())
-    return (
-        residual - column * (float((w * residual).sum()) / known),
-        jacobian - column[:, :, None] * (np.einsum("na,nak->k", w, jacobian) / known),
-    )
 
 
 def _robust(squares: Array, axes: int, level: float) -> Array:

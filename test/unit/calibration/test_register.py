@@ -268,31 +268,8 @@ def test_on_a_circle_the_clock_of_a_reference_is_in_the_yaw():
     found = register(_of_its_own(circle), np.eye(3), np.zeros(3))
     assert found is not None
     std = np.sqrt(np.diag(found.left_open))
-    assert std[2] == pytest.approx(0.1 * std[6], rel=0.15) and std[6] > 0.2
+    assert std[2] == pytest.approx(0.1 * std[6], rel=0.15) and std[6] > 0.4
     assert max(std[0], std[1]) < 0.01 * std[2]
-
-
-@pytest.mark.parametrize("drift_deg", [-1.0, 1.0])
-def test_a_heading_that_drifts_on_a_circle_is_no_late_reference(drift_deg):
-    """A drift of 1° in three minutes was a clock that is off by 0.65 s ± 0.10 s, which turned the mounting."""
-    rng, times = np.random.default_rng(1), np.arange(0.0, 180.0, 0.2)
-    rate = 0.105 + 0.02 * (times / 180.0 - 0.5) + 0.003 * np.sin(times / 9.0)
-    yaw, zero = 0.2 * np.cumsum(rate), np.zeros(len(times))
-    speed = 1.9 + 0.3 * np.sin(times / 6.0)
-    ahead = np.stack([speed, zero, zero], axis=1)
-    east_north = speed[:, None] * np.stack([np.cos(yaw), np.sin(yaw), zero], axis=1) + rng.normal(
-        0.0, 0.03, ahead.shape
-    )
-    claimed = 0.5 * (yaw + np.radians(drift_deg) * (times / 180.0 - 0.5))
-    quaternions = np.stack([zero, zero, np.sin(claimed), np.cos(claimed)], axis=1)
-    rates = np.stack([zero, zero, rate], axis=1)
-    dvl = ahead + rng.normal(0.0, 0.004, ahead.shape)
-    measured = make_motion(
-        (times, dvl), (times, east_north), True, (True, True, True), ImuColumns(times, quaternions, rates)
-    )
-    assert measured is not None
-    found = register(measured, np.eye(3), np.zeros(3))
-    assert found is not None and not found.offsets, found
 
 
 def _of_its_own(one: MotionStreams) -> MotionStreams:
