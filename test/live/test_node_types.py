@@ -236,10 +236,12 @@ def test_a_package_or_class_that_is_not_there_is_named_with_the_remedy():
         message_class("dvl_type", "nav_msgs/msg/Dvl")
 
 
-def test_topics_are_looked_for_unless_the_dvls_was_named_or_nobody_wants_it(world):
+def test_topics_that_were_named_are_kept_and_none_is_looked_for_if_nobody_wants_it(world):
     for options in ({}, {"discover": False}, {"cli_args": ["--ros-args", "-r", "dvl/twist:=/a50/velocity"]}):
         with node_here(world, **options) as node:
-            assert (node._discovering is not None) == (not options)
+            assert (node._discovering is not None) == options.get("discover", True)
+            named = {role for role, topic in node._named_topics(has_dvl=False).items() if topic is not None}
+            assert named == ({"dvl"} if "cli_args" in options else set())
 
 
 def test_the_model_of_positions_is_refused_while_the_reference_is_velocities(world):

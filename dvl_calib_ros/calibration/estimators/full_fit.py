@@ -2,8 +2,7 @@
 
 The method is in docs/models.md, "full: all unknowns in one fit". Blocks are linearised about one point and added to a
 chain (slow_errors.py), so each further block costs one step. The point is renewed when a day's number of blocks reaches
-a power of two, or when the estimate has moved away from it. Both depend on the blocks only, so a live run and a replay
-agree.
+a power of two, or when the estimate has moved away from it. Both depend on the blocks only, so live and replay agree.
 """
 
 from __future__ import annotations
@@ -291,15 +290,13 @@ class JointFit:
             self._solve()
             self._recentre()
             assert self._fitted is not None
-            step = (self._x - before) / np.sqrt(np.diag(self._fitted.state.p))
+            state = self._fitted.state
+            step = (self._x - before) / np.sqrt(np.diag(state.p))
             if not self._are_contradicted() and np.abs(step).max() < LAST_STEP:
                 break
             # acceleration columns reduced for noise make steps too long: halve a step that turns back
-            if step @ last < 0.0:
-                self._x = 0.5 * (before + self._x)
-            last = step
-        assert self._fitted is not None
-        self._x = self._fitted.state.x.copy()
+            self._x, last = 0.5 * (before + self._x) if step @ last < 0.0 else self._x, step
+        self._x = state.x.copy()
 
     def _forget(self) -> None:
         """Fix the contribution of the oldest blocks, and drop their streams."""

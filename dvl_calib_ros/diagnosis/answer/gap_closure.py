@@ -12,7 +12,7 @@ from ...calibration.assessment.dead_reckoning import SHORTEST_M, Drift, drift_ov
 from ...calibration.numerics.frames import Array
 from ..fit.cross_validation import fitted_without, folds_of, stretch_of
 from ..fit.gauss_newton import Fit, Fitter
-from ..fit.selection_criteria import SlowNoise, blocks_of
+from ..fit.selection_criteria import SlowNoiseOfFit, blocks_of
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis
 from ..model.settings import SETTINGS
@@ -283,7 +283,7 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
-    slow = SlowNoise.of_fit(problem, fit)
+    slow = SlowNoiseOfFit.of_fit(problem, fit)
     noise, unfollowed, followed = slow.noise, slow.left, np.zeros(len(slow.left))
     if matters(problem, fit, rest):
         *_, noise, without = slow.with_rest(problem, slow.noise, rest.clearest)

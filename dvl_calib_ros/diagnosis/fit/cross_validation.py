@@ -15,7 +15,7 @@ from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .gauss_newton import Fit, Fitter
-from .selection_criteria import NuisanceFit, SlowNoise
+from .selection_criteria import NuisanceFit, SlowNoiseOfFit
 
 Integers = NDArray[np.intp]
 # Steps of a fit that starts from the fit to all data
@@ -75,7 +75,7 @@ def _held_out(
         yield held, replace(held, gram=trained)
 
 
-def predictive_gain(problem: Problem, simpler: SlowNoise, richer: SlowNoise) -> float:
+def predictive_gain(problem: Problem, simpler: SlowNoiseOfFit, richer: SlowNoiseOfFit) -> float:
     """Return the held-out deviance gain of one set of columns over a simpler one.
 
     The noise is re-estimated with either, so that slow noise is an alternative explanation. Each takes the noise with
@@ -91,6 +91,6 @@ def predictive_gain(problem: Problem, simpler: SlowNoise, richer: SlowNoise) -> 
 
 def predictive_gain_of(problem: Problem, simpler: Fit, richer: Fit) -> float:
     """Return the `predictive_gain` of a fit over a simpler one, without the gain from smoothing instrument noise."""
-    own, other = (SlowNoise.of_fit(problem, each) for each in (simpler, richer))
+    own, other = (SlowNoiseOfFit.of_fit(problem, each) for each in (simpler, richer))
     smoothed = float(simpler.own_noise @ simpler.own_noise - richer.own_noise @ richer.own_noise)
     return predictive_gain(problem, own, other) + max(-smoothed, 0.0)

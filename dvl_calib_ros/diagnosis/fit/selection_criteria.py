@@ -123,7 +123,7 @@ def robust_covariance(problem: Problem, fit: Fit) -> tuple[Array, int]:
     The uncertain correlation time is sampled from its posterior.
     """
     block = blocks_of(problem)
-    covariance, slow, rng = fit.covariance(block), SlowNoise.of_fit(problem, fit), np.random.default_rng(0)
+    covariance, slow, rng = fit.covariance(block), SlowNoiseOfFit.of_fit(problem, fit), np.random.default_rng(0)
     taken = slow.noise.taken_by(slow.known.columns, slow.known.std)
     drawn = np.stack(list(slow.noise.drawn(slow.left, taken, DRAWN, rng)), axis=2)
     steps = fit.system.covariance() @ fit.noise.whiten(fit.columns).T @ fit.noise.whiten(drawn)
@@ -192,7 +192,7 @@ def _likely(raw: Array, residual: Array) -> float:
     return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
 
 
-class SlowNoise(NamedTuple):
+class SlowNoiseOfFit(NamedTuple):
     """Noise as slow as multipath or faster, estimated together with known columns of a residual (M, A).
 
     left: (M, A), the residual with the columns subtracted.
@@ -204,23 +204,23 @@ class SlowNoise(NamedTuple):
     left: Array
 
     @staticmethod
-    def of(problem: Problem, noise: Noise, known: NuisanceFit, residual: Array) -> SlowNoise:
+    def of(problem: Problem, noise: Noise, known: NuisanceFit, residual: Array) -> SlowNoiseOfFit:
         """Estimate from a residual (M, A), with the level and frame of a noise."""
         left, noise = residual, replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
         for _ in range(2):
             left = residual + known.columns @ known.step(noise, residual).solution()
             noise = noise.refitted(left, taken=noise.taken_by(known.columns, known.std))
-        return SlowNoise(known, residual, noise, left)
+        return SlowNoiseOfFit(known, residual, noise, left)
 
     @staticmethod
-    def of_fit(problem: Problem, fit: Fit) -> SlowNoise:
+    def of_fit(problem: Problem, fit: Fit) -> SlowNoiseOfFit:
         """Estimate from the residual of a fit, once."""
         if "slow noise" not in fit.kept:
             known = NuisanceFit.of_fit(problem, fit)
-            fit.kept["slow noise"] = SlowNoise.of(problem, fit.noise, known, fit.residual)
-        slow: SlowNoise = fit.kept["slow noise"]
+            fit.kept["slow noise"] = SlowNoiseOfFit.of(problem, fit.noise, known, fit.residual)
+        slow: SlowNoiseOfFit = fit.kept["slow noise"]
         return slow
 
-    def with_rest(self, problem: Problem, noise: Noise, columns: Array) -> SlowNoise:
+    def with_rest(self, problem: Problem, noise: Noise, columns: Array) -> SlowNoiseOfFit:
         """Estimate again with columns (M, A, c) that may explain the residual."""
-        return SlowNoise.of(problem, noise, self.known.and_rest(columns, self.residual), self.residual)
+        return SlowNoiseOfFit.of(problem, noise, self.known.and_rest(columns, self.residual), self.residual)

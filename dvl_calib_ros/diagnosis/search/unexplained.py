@@ -20,7 +20,7 @@ from ...verdict.reasons import Reason, finding
 from ..fit.cross_validation import predictive_gain
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
-from ..fit.selection_criteria import NuisanceFit, SlowNoise
+from ..fit.selection_criteria import NuisanceFit, SlowNoiseOfFit
 from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
@@ -278,13 +278,13 @@ def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> 
 
 def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
     """Return the held-out deviance gain of columns (M, A, c) beside a fit's."""
-    slow = SlowNoise.of_fit(problem, fit)
+    slow = SlowNoiseOfFit.of_fit(problem, fit)
     return predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
     """Return the shift (6 + p,) of a fit's parameters with the most significant columns as nuisance."""
-    both = SlowNoise.of_fit(problem, fit).with_rest(problem, fit.noise, rest.clearest)
+    both = SlowNoiseOfFit.of_fit(problem, fit).with_rest(problem, fit.noise, rest.clearest)
     stands = both.known._replace(centre=np.zeros_like(both.known.centre))  # linearised at the fit, whatever its prior
     return stands.step(both.noise, fit.residual).solution()[: fit.columns.shape[2]]
 
