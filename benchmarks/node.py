@@ -29,14 +29,14 @@ LATENCY_TARGET = 1.8
 SOAK_MINUTES = 10.0
 SOAK_RATES = {"dvl": 5.0, "gnss": 5.0, "imu": 20.0}
 SOAK_SPEED = 10.0
-# First so much of operation comes at once: queues grow to what a stall of the machine may make of them, and then stay.
+# Operation (s) sent first, as fast as possible: queues grow as in a stall of the machine, and then stay.
 SOAK_BURST_S = 200.0
 # Share of a soak after which memory and CPU are to be steady.
 SOAK_WARM_UP = 0.25
 MEMORY_TARGET_MB_PER_H = 1.0
 CPU_GROWTH_TARGET = 1.1
 ROUNDS = 3
-# CPU is measured in so many windows of so long, once all have had so long to start, s.
+# Number of windows in which CPU is measured, their length (s), and the time to start before the first (s).
 WINDOWS, WINDOW_S, STARTING_S = 12, 3.0, 8.0
 MEGABYTE = 1 << 20
 
@@ -59,7 +59,7 @@ except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
 def measure_cpu() -> list[Measurement]:
     """CPU per DVL sample at 50 Hz with GNSS at 10 Hz, every model in the bank.
 
-    Node and peer at once, with the same messages: what else the machine does meets both. The best of some windows.
+    Node and peer run together on the same messages, so other load affects both. The best of some windows counts.
     """
     ours, peer = _cpu_per_sample([_NODE, [sys.executable, "-c", _REPUBLISHER]], 50.0)
     ratio = ours / peer
@@ -98,7 +98,7 @@ def measure_latency() -> list[Measurement]:
 
 
 def measure_rate() -> list[Measurement]:
-    """1000 Hz for 60 s from a reliable publisher: what the node received, and its memory early and late."""
+    """1000 Hz for 60 s from a reliable publisher: samples received, and memory early and late."""
     with _running_node() as (node, environment):
         publisher = _publish(environment, dvl_rate=1000.0, gnss_rate=10.0, seconds=60.0, echo=_CORRECTED)
         time.sleep(15.0)
@@ -121,7 +121,7 @@ def measure_rate() -> list[Measurement]:
 
 
 def measure_soak(minutes: float = SOAK_MINUTES) -> list[Measurement]:
-    """So many minutes of operation, at ten times the rates: samples lost, growth of memory and of CPU."""
+    """Minutes of operation at ten times the usual rates: samples lost, growth of memory and of CPU."""
     with _running_node(f"max_latency:={SOAK_BURST_S}") as (node, environment):
         rates = {f"{name}_rate": rate for name, rate in SOAK_RATES.items()}
         publisher = _publish(

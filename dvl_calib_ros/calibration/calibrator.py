@@ -23,7 +23,7 @@ from .assessment.manoeuvre_planner import RecentMotion, recent_motion
 from .assessment.model_selection import Selection
 from .assessor import Assessor, Estimates, NonlinearEstimators
 from .estimators.estimator import Estimator, EstimatorSetup, LinearEstimator, kind_of
-from .filters.build_observations import Observer, RowsSeen, own_copy
+from .filters.build_observations import ROWS_WITH, Observer, RowsSeen, own_copy
 from .filters.filter_bank import Group, groups_of
 from .filters.state_history import Counts, Numbers, StateTrace
 from .models import BROKEN, LINEAR_MODELS, MODELS, POSITIONS, Model, Needs
@@ -35,7 +35,6 @@ from .numerics.samples import (
     DvlSample,
     ImuSample,
     Index,
-    Mask,
     Pairing,
     ReferenceSample,
     Stamps,
@@ -57,12 +56,6 @@ ROWS_HELD, ROWS_HELD_BLOCKS = 1024, 4
 # Samples that one 10 s block of the full model counts for when blocks are gathered.
 SAMPLES_OF_A_BLOCK = 128
 
-_HAS: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
-    Needs.NOTHING: lambda block: block.usable,
-    Needs.ATTITUDE: lambda block: block.oriented,
-    Needs.ATTITUDE_IF_KNOWN: lambda block: block.usable,
-    Needs.REFERENCE: lambda block: block.paired,
-}
 # Imported here because no live message may wait for an import.
 _KINDS = {model.name: kind_of(model) for model in MODELS.values() if model.estimator}
 
@@ -313,7 +306,7 @@ class Calibrator:
         seen = self._seen.get(needs)
         if seen is None or (seen.first, seen.decided) != (first, decided):
             block = self._aligner.rows.block(first, decided)
-            has = _HAS[needs](block)
+            has = ROWS_WITH[needs](block)
             numbers = np.arange(first, decided)
             if not has.all():
                 block, numbers = block.part(has), numbers[has]

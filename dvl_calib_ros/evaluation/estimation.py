@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..calibration.calibrator import Calibrator
-from ..calibration.filters.build_observations import Observer
+from ..calibration.filters.build_observations import ROWS_WITH, Observer
 from ..calibration.filters.filter_bank import RelativeHeight
 from ..calibration.filters.filter_setup import Assembler
 from ..calibration.models import MODELS, Model, Needs
@@ -103,13 +103,7 @@ def aligned(data: SensorData, parameters: Parameters) -> AlignedVariants:
         first += len(block)
     columns = (np.concatenate(column) for column in zip(*(block.columns() for block, _ in found), strict=True))
     rows = AlignedBlock(*columns).part(at.ravel())
-    has = {
-        needs: present & mask.reshape(at.shape)
-        for needs, mask in (
-            (Needs.NOTHING, rows.usable), (Needs.ATTITUDE, rows.oriented), (Needs.ATTITUDE_IF_KNOWN, rows.usable),
-            (Needs.REFERENCE, rows.paired),
-        )
-    }  # fmt: skip
+    has = {needs: present & rows_with(rows).reshape(at.shape) for needs, rows_with in ROWS_WITH.items()}
     # missing velocities are 0; covariances are unchanged
     reference = np.concatenate([np.nan_to_num(rows.reference[:, :3]), rows.reference[:, 3:]], axis=1)
     rows = replace(rows, reference=reference)

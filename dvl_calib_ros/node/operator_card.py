@@ -20,7 +20,7 @@ from ..calibration.assessment.manoeuvre_planner import (
 )
 from ..calibration.calibrator import Calibrator
 from ..calibration.filters.observability import KM, PredictedDrift, predicted_drift
-from ..calibration.models import MODELS, Needs
+from ..calibration.models import MODELS
 from ..calibration.numerics.kalman import GaussianState
 from ..calibration.results.results import Estimate, corrected_rpy, rpy_std, scale_and_delay
 from ..verdict.reasons import Reason, finding
@@ -177,7 +177,6 @@ class Card:
     def _next(self, calibrator: Calibrator, estimate: Estimate, now_s: float, rejected: bool) -> dict[str, str]:
         """Update drift, goals and remaining time; return them as values of the diagnostics."""
         parameters, model = calibrator.parameters, MODELS[estimate.model]
-        needs_reference = model.needs is Needs.REFERENCE
         motion, step = calibrator.latest_motion(), self._dvl_time_step(calibrator.last_ns)
         self._shown_s += step
         if motion is not None and motion.speed > 0.0:
@@ -194,7 +193,7 @@ class Card:
             found = Outlook(is_good_enough(model), None)
         elif now.both <= target:
             found = Outlook(finding("NEXT_STANDS"), worth.seconds_left(self._shown_s))
-        elif needs_reference and estimate.used and not calibrator.selection.gnss.available:
+        elif calibrator.selection.keeps_full(parameters):
             found = Outlook(finding("NEXT_REFERENCE", model=model.name), None)
         else:
             found = self._suggestion(calibrator, estimate, motion, now_s)

@@ -243,7 +243,7 @@ FINDINGS = (
     warning(
         "GNSS_OUTAGE",
         "no GNSS for {seconds:.0f} s: {model} still corrects with its last estimate, but learns nothing more",
-        remedy="in a dive, nothing; else check the receiver and the topic {topic}",
+        remedy="if the vehicle has not dived, check the receiver and the topic {topic}",
     ),
     warning(
         "GNSS_OUTAGE_WITHOUT",

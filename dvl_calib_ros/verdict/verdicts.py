@@ -179,12 +179,12 @@ SELECTIONS = on_page(
     accept("MODEL_CHOSEN_AS", "{by}: {gnss}; {why}"),
     accept("GNSS_AVAILABLE", "GNSS is available"),
     accept("GNSS_NOT_AVAILABLE", "GNSS is not available", means="No reference for `gnss_timeout`."),
-    accept("GNSS_GOING", "GNSS has stopped; the model changes if it stays away for gnss_hysteresis"),
-    accept("GNSS_COMING", "GNSS is back; the model changes if it stays for gnss_hysteresis"),
+    accept("GNSS_GOING", "GNSS has stopped; it counts as lost after gnss_hysteresis"),
+    accept("GNSS_COMING", "GNSS is back; it counts as available after gnss_hysteresis"),
     accept(
-        "REFERENCE_HAS_TOLD",
-        "the calibration by the reference so far stays in use",
-        means="The mounting is known from the time with a reference.",
+        "CALIBRATION_KEPT",
+        "the calibration with the reference so far stays in use",
+        means="The mounting is known from the data with a reference.",
     ),
     accept(
         "ARM_LOOKS_LIKE_ANGLE",

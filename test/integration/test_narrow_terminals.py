@@ -108,7 +108,7 @@ def test_a_recording_too_short_to_diagnose_is_exit_code_1(monkeypatch, capsys, f
     assert capsys.readouterr().out.startswith("insufficient_excitation: ")
 
 
-@pytest.mark.parametrize("command", ["replay", "diagnose"])
+@pytest.mark.parametrize("command", ["replay", "doctor", "diagnose"])
 def test_the_verdict_is_the_first_line_and_warnings_break_between_words(folder, command):
     wide, narrow = (on_a_terminal(folder, columns, command, "two", "-p", "gnss_frame:=body") for columns in (500, 80))
     assert re.match(r"(accept|marginal|reject|yes|partly|no|insufficient_excitation): ", narrow[0])

@@ -94,7 +94,7 @@ class Selection:
 
     def take(self, from_ns: int, evidence: Evidence) -> None:
         """Use an estimator's evidence from this stamp on."""
-        if evidence != NO_EVIDENCE:
+        if evidence is not NO_EVIDENCE:
             insort(self._coming, (from_ns, evidence), key=lambda each: each[0])
 
     def update(self, stamps_ns: Stamps, paired: Mask, parameters: Parameters) -> None:
@@ -144,6 +144,10 @@ class Selection:
             return POSITIONS.name
         return FULL.name if self.gnss.available or self._is_known else UNAIDED.name
 
+    def keeps_full(self, parameters: Parameters) -> bool:
+        """Return whether `auto` runs `full` without a reference, because the calibration is known."""
+        return self.model(parameters) == FULL.name and parameters.model == AUTO and not self.gnss.available
+
     def iac_model(self, parameters: Parameters) -> str:
         """Return the model that the paper's selection runs now."""
         return parameters.gnss_model if self.gnss.available else parameters.gnss_free_model
@@ -156,6 +160,6 @@ class Selection:
         if parameters.model == AUTO and self._by_positions is not None:
             why = finding(self._by_positions.code, **self._by_positions.numbers)
             return finding("MODEL_CHOSEN_AS", **chosen, why=why)
-        if parameters.model == AUTO and not self.gnss.available and self._is_known:
-            return finding("MODEL_CHOSEN_AS", **chosen, why=finding("REFERENCE_HAS_TOLD"))
+        if self.keeps_full(parameters):
+            return finding("MODEL_CHOSEN_AS", **chosen, why=finding("CALIBRATION_KEPT"))
         return finding("MODEL_CHOSEN", **chosen)

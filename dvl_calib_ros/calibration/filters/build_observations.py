@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -10,13 +11,20 @@ from ..models import Needs
 from ..models.base import Assumptions, Observations, Unmeasured
 from ..models.parameters import Parameters
 from ..numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion, skew
-from ..numerics.samples import FRAME_CODES, AlignedBlock, Codes, VelocityFrame
+from ..numerics.samples import FRAME_CODES, AlignedBlock, Codes, Mask, VelocityFrame
 from .state_history import Numbers
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 _BITS = np.array([1, 2, 4], dtype=np.uint8)
-# attitude (4) and angular velocity (3) of rows without
+# Attitude (4) and angular velocity (3) of rows that have none
 _UNKNOWN = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+# Mask of the rows of a block that meet each need
+ROWS_WITH: Mapping[Needs, Callable[[AlignedBlock], Mask]] = {
+    Needs.NOTHING: lambda block: block.usable,
+    Needs.ATTITUDE: lambda block: block.oriented,
+    Needs.ATTITUDE_IF_KNOWN: lambda block: block.usable,
+    Needs.REFERENCE: lambda block: block.paired,
+}
 
 
 class Observer:

@@ -19,6 +19,7 @@ SIDESLIP_STD = 0.006
 SHEAR_STD = 0.005
 # Least vertical component of the body z axis at which a vehicle holds depth by its pitch (60 degrees of tilt).
 UPRIGHT = 0.5
+_AHEAD = np.array([1.0, 0.0, 0.0])
 
 
 def _unaided(seen: Observations) -> Linearised:
@@ -32,19 +33,14 @@ def _unaided(seen: Observations) -> Linearised:
     Samples without attitude have a constant sway a instead, and of [v×] the forward part only: in turns, sway and heave
     vary together and would look like roll.
     """
-    rotation, rates, v, oriented = (
-        seen.rotation_enu_from_body,
-        seen.angular_velocity,
-        seen.velocity_in_body,
-        seen.oriented,
-    )
+    rotation, rates = seen.rotation_enu_from_body, seen.angular_velocity
+    oriented, v = seen.oriented, seen.velocity_in_body
     assert rotation is not None and rates is not None and oriented is not None
     up = rotation[:, 2]
     upright = oriented & (np.abs(up[:, 2]) > UPRIGHT)
     level_heave = np.where(upright, -(up[:, 0] * v[:, 0] + up[:, 1] * v[:, 1]) / np.where(upright, up[:, 2], 1.0), 0.0)
     h = np.zeros((len(v), 2, 11))
-    turned = v if oriented.all() else np.where(oriented[:, None], v, v * _AHEAD)
-    h[:, :, :3] = -(skew(turned) @ seen.rotation_dvl_from_body.T)[:, 1:]
+    h[:, :, :3] = -(skew(np.where(oriented[:, None], v, v * _AHEAD)) @ seen.rotation_dvl_from_body.T)[:, 1:]
     across = rotation[:, :2, 1] * oriented[:, None]
     h[:, 0, 3:5] = across
     h[:, 0, 5] = rates[:, 2] * v[:, 0]
@@ -56,9 +52,6 @@ def _unaided(seen: Observations) -> Linearised:
     z = v[:, 1:].copy()
     z[:, 1] -= level_heave
     return z, h
-
-
-_AHEAD = np.array([1.0, 0.0, 0.0])
 
 
 def _unaided_noise(seen: Observations) -> Array:
@@ -75,7 +68,7 @@ SCALE_PER_AXIS = (("delta_k_x", (0,)), ("delta_k_y", (1,)))
 UNAIDED = Model(
     "unaided", Needs.ATTITUDE_IF_KNOWN, 2, _unaided,
     SHOWN_WITHOUT | {
-        "yaw": "another heading, best the opposite one: on one, yaw cannot be told from a current (needs attitude)",
+        "yaw": "another heading, best the opposite one: on one, yaw and a current look alike (needs attitude)",
         "pitch": "motion ahead, holding depth",
     },
     assumes="no GNSS; a current that changes only with depth, skid in proportion to the turn rate, depth held or pitch "

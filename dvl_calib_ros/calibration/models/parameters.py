@@ -129,7 +129,7 @@ class Parameters:
     )
     gnss_hysteresis: float = _parameter(
         3.0,
-        "How long GNSS must be present (or absent) before auto changes the model.",
+        "How long GNSS must be present (or absent) before it counts as available (or lost).",
         unit="s",
         within=(0.0, 600.0),
         read_only=False,
@@ -407,7 +407,8 @@ class Parameters:
     )
     discover: bool = _parameter(
         True,
-        "Look for DVL, reference and IMU while its topic is silent and not remapped; choose the reference's frame.",
+        "Look for DVL, reference and IMU while the DVL's topic is silent and not remapped; choose the reference's "
+        "frame.",
     )
     target_drift: float = _parameter(
         2.0,

@@ -12,6 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from runs import ONE_HERTZ, SECOND, START_NS, STRETCH, MatchedRun, calibrate, feed, make_samples, only, shifted, variant
 
+from dvl_calib_ros.calibration.assessment.model_selection import Evidence, Selection
 from dvl_calib_ros.calibration.calibrator import Calibrator
 from dvl_calib_ros.calibration.checks.data_warnings import recording_warnings
 from dvl_calib_ros.calibration.filters import filter_bank
@@ -247,9 +248,19 @@ def test_auto_keeps_the_calibration_by_the_reference_when_the_reference_ends():
     ]
     calibrator = calibrate(dive)
     assert [segment.model for segment in calibrator.selection.segments] == ["unaided", "full"]
-    assert calibrator.result().selected_because.numbers["why"].code == "REFERENCE_HAS_TOLD"
+    assert calibrator.result().selected_because.numbers["why"].code == "CALIBRATION_KEPT"
     for block_size in (1, 30):
         assert calibrate(dive, block_size=block_size).selection.segments == calibrator.selection.segments
+
+
+def test_auto_does_not_keep_a_calibration_that_is_known_no_longer():
+    selection, stamps_ns = Selection(), SECOND * np.arange(1, 11)
+    selection.take(3 * SECOND, Evidence(is_known=True))
+    selection.take(6 * SECOND, Evidence())
+    selection.update(stamps_ns, np.zeros(10, dtype=bool), Parameters())
+    assert [(each.from_ns // SECOND, each.model) for each in selection.segments] == [
+        (1, "unaided"), (3, "full"), (6, "unaided")
+    ]  # fmt: skip
 
 
 def test_auto_does_not_keep_what_few_references_tell():
