@@ -4,7 +4,7 @@ Each RESULT is a result file of the node or of replay --save, or a bag, which is
 mounting with lever arm, scale and delay is compared, weighted by the stated σ; models and configured mountings may
 differ.
 
-Exit code 0: the same mounting within 2 σ. 2: bad usage or input. 3: suspicious, 2 to 4 σ. 4: moved, by more than 4 σ.
+Exit code 0: the same mounting within 2 σ. 2: bad usage or input. 3: suspicious, 2 to 3.7 σ. 4: moved, beyond 3.7 σ.
 """
 
 from __future__ import annotations

@@ -16,6 +16,7 @@ from ..calibration.models.parameters import FLU, FRD, Parameters
 from ..calibration.numerics.block_covariance import of_few
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.robust import robust_std
+from ..calibration.numerics.tests import BY_CHANCE
 from ..calibration.registration.frame_hypotheses import ImuFrame
 from ..calibration.streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..messages.decode import turns_dvl
@@ -31,8 +32,8 @@ from .frame_choice import SAME_ANSWER
 OVER_S = 4.0
 # Longest interpolated gap of an IMU, s; smallest change of the heading in a turn, rad.
 GAP_S, TURNED_FROM = 1.0, 0.2
-# Fewest turns, and significance of the sign (σ, two-sided p = 0.003), corrected for few turns by Student's t.
-FEWEST_TURNS, SIGNIFICANT = 5, 3.0
+# Fewest turns. σ of the sign is corrected for few turns by Student's t.
+FEWEST_TURNS = 5
 # Scale of the Cauchy weights, in σ (95 % efficiency), and number of reweighted fits.
 CAUCHY, PASSES = 2.385, 10
 # Largest misalignment of a mounting that a mirrored axis leaves likely, rad.
@@ -53,7 +54,7 @@ class SwaySign(NamedTuple):
         """1 or -1 if significant, else 0."""
         if self.turns < FEWEST_TURNS:
             return 0
-        least = SIGNIFICANT * float(of_few(np.array(self.turns - 1.0))) * self.std
+        least = BY_CHANCE * float(of_few(np.array(self.turns - 1.0))) * self.std
         return int(np.sign(self.slope)) if abs(self.slope) > least else 0
 
 

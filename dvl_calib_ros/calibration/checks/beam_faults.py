@@ -18,15 +18,13 @@ from ...verdict.reasons import Reason, finding
 from ..models.own import BIAS
 from ..numerics.block_covariance import TimeBlocks, inflations
 from ..numerics.frames import Array
+from ..numerics.tests import COVERED, FOUND
 
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
-# Limits in σ from which an error of the DVL (a beam, a bias) is reported, and from which it rejects. Normal noise would
-# allow smaller ones, but references at sea have errors that no model holds.
-NAMED_FROM, SURELY_WRONG = 3.7, 4.2
-# Error of the velocity ahead (share of the speed) from which a beam is reported, even if it is better by WITHIN σ: 10 m
-# per km, the limit of acceptance.
-SAID_FROM, WITHIN = 0.01, 2.0
+# Error of the velocity ahead (share of the speed) from which a beam is reported, even if it is better by `COVERED` σ:
+# 10 m per km, the limit of acceptance.
+SAID_FROM = 0.01
 # Prior σ of the nuisances: the scale of z, and the DVL's bias (m/s), which at one speed looks like a beam.
 Z_SCALE_STD, BIAS_STD = 1.0, 0.1
 
@@ -69,8 +67,8 @@ class BeamFault(NamedTuple):
 
     @property
     def least(self) -> float:
-        """Return the error of the mean velocity by a beam that is better by WITHIN σ."""
-        return self.off * (1.0 - WITHIN * self.std / self.share)
+        """Return the error of the mean velocity by a beam that is better by `COVERED` σ."""
+        return self.off * (1.0 - COVERED * self.std / self.share)
 
 
 def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean: Array) -> BeamFault | None:
@@ -109,8 +107,7 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
 
 def beam_warning(found: BeamFault | None) -> list[Reason]:
     """Return the reason against a calibration by a faulty beam; its roll and yaw are wrong by several σ."""
-    if found is None or found.share < NAMED_FROM * found.std or found.least < SAID_FROM:
+    if found is None or found.share < FOUND * found.std or found.least < SAID_FROM:
         return []
-    word = Severity.REJECT if found.share > SURELY_WRONG * found.std else Severity.MARGINAL
     percent, std = 100.0 * found.share, 100.0 * found.std
-    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(word)]
+    return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.REJECT)]

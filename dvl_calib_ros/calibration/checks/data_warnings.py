@@ -9,6 +9,7 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
+from ..numerics.tests import SURE
 from ..results.mounting_quantities import date
 from ..results.results import ARM, OFFSETS, Day, Estimate
 
@@ -21,8 +22,8 @@ ENOUGH_SAMPLES = 20
 SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
 OFTEN_OFF = 4.0
-# Constant reference error that is reported, m/s, and its significance, σ.
-OFFSET_SAID_FROM, OFFSET_SIGMAS = 0.01, 5.0
+# Constant reference error that is reported, m/s.
+OFFSET_SAID_FROM = 0.01
 # Share of the reference error that yaw absorbs, above which the two are not separable.
 NOT_SHOWN = 0.6
 # Uncertainty due to a clock offset that is reported: lever arm (m), delay (s), yaw (°).
@@ -146,7 +147,7 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
     ] or [("", np.array([estimate.state_of(name) for name in OFFSETS]), std)]
     for where, offset, own_std in found:
         size = float(np.linalg.norm(offset))
-        if size < OFFSET_SAID_FROM or (np.abs(offset) < OFFSET_SIGMAS * own_std).all():
+        if size < OFFSET_SAID_FROM or (np.abs(offset) < SURE * own_std).all():
             continue
         course = math.degrees(math.atan2(*offset)) % 360.0
         said.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))

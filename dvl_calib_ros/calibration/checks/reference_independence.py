@@ -20,6 +20,7 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..numerics.samples import Mask
+from ..numerics.tests import BY_CHANCE, FOUND
 
 # Longest sample intervals, s: of both streams, because slower differences hold waves; and of a reference next to a fast
 # DVL.
@@ -32,11 +33,8 @@ EVEN, NEAR = 0.25, 0.6
 LEAST_NOISE_MPS = 1e-4
 # Stretches needed, differences per stretch (three axes), and samples per stretch of a slow reference.
 ENOUGH, FEWEST, FEWEST_SLOW = 12, 30, 12
-# Share of the noise that is reported, and its significance in σ of the stretches' scatter, of 13 shifts. A filter that
-# smooths passes little noise on.
-SHARED_FROM, SURE_FROM = 0.06, 4.0
-# Significance in σ (0.6 % one-sided) of random steps of the vehicle; below it, its motion is taken to be smooth.
-STEPS_FROM = 2.5
+# Share of the noise that is reported. A filter that smooths passes little noise on.
+SHARED_FROM = 0.06
 # Smallest share of noise in the differences; with less they are motion.
 LEAST_SHARE = 0.3
 # Largest correlation of differences without a common sample; vibration has more.
@@ -108,12 +106,12 @@ class SharedNoise:
         std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0) / (n - 1.0))
         best = int(np.argmax(np.where(self._stretches >= ENOUGH, mean[:, 0], -math.inf)))
         c_4, v_4, steps = mean[best].tolist()
-        if steps < STEPS_FROM * float(std[best, 2]):
+        if steps < BY_CHANCE * float(std[best, 2]):
             steps = 0.0
         passed, own = c_4 - steps, v_4 - steps
         if own < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
             return 0.0
-        return passed / own if passed > max(SHARED_FROM * own, SURE_FROM * float(std[best, 0])) else 0.0
+        return passed / own if passed > max(SHARED_FROM * own, FOUND * float(std[best, 0])) else 0.0
 
     def contradiction(self) -> Reason | None:
         """Return the reason if the reference contains the DVL's noise."""

@@ -27,8 +27,9 @@ from ..numerics.block_covariance import alike_of, of_few
 from ..numerics.frames import Array, cross, skew
 from ..numerics.robust import median, robust_std
 from ..numerics.samples import Index
+from ..numerics.tests import BY_CHANCE, COVERED, FOUND, SURE, SURE_AT_SEA
 from ..results.results import ARM, OFFSETS, Estimate
-from .beam_faults import NAMED_FROM, SURELY_WRONG, BeamFault, beam_warning
+from .beam_faults import BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
 
 # Time constants, s, between which a change of tilt is the vehicle's; slower ones may be the IMU's error.
@@ -39,8 +40,6 @@ BEND_S = 1.0
 STRETCH_S, ENOUGH = 15.0, 12
 # Numbers of stretches combined for σ: slow errors of references and attitudes last a minute or two.
 QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
-# Limits in σ. Smoothing has the lower one, because its σ includes the small number of turns and all likely errors.
-SURELY, SURELY_SMOOTHED = 6.0, 5.0
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
 # about the earth's vertical (rad), which differs from yaw when the vehicle tilts. BY_HEADING: heading errors with one
 # and two cycles of the heading, and with a drift over the recording (rad), similar to a bias but not to fast signals.
@@ -65,8 +64,8 @@ SEEN_BIAS, BIAS_OPEN = 0.02, 0.008
 # Share of tilt from which a sign is wrong, instead of a levelled velocity.
 WRONG_SIGN_FROM = 1.6
 # Mounting error (rad) from which it is reported, and from which the calibration is rejected. It is not rejected if
-# WITHIN σ of the calibration cover the error.
-SAID_FROM, WRONG_FROM, WITHIN = math.radians(0.2), math.radians(0.5), 2.0
+# the calibration's own σ cover the error.
+SAID_FROM, WRONG_FROM = math.radians(0.2), math.radians(0.5)
 # Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 # Residual, relative to the median, beyond which it is an outlier; number of iterations.
@@ -77,17 +76,12 @@ QUIETEST_MPS = 1e-3
 FORGOTTEN_S, SLOWEST_S = (0.5, 1.0, 3.0), 0.3
 # Samples to either side that predict one; innovations beyond NEW_AT_MOST σ are outliers.
 FORETOLD_BY, NEW_AT_MOST = 12, 4.0
-# Significance, in σ, of the DVL's noise in the reference, for three memories and one sign. OF_WAVES: σ of the share due
-# to waves (0.2 m/s at 8 Hz: up to 0.05).
-FOLLOWED_SURELY, OF_WAVES = 4.5, 0.015
-# Significance, in σ, needed if smoothing by FILTER_SHOWN σ also indicates a filter: both are rarely false alarms.
-FOLLOWED_BY_FILTER, FILTER_SHOWN = 2.4, 2.4
-# Limit of the smoothing, in σ, if the reference also has the delay that such a filter makes. The delay agrees within
-# this factor of the time constant, and is significant from LEAST_LAG_S.
-FILTER_SHOWN_LAGGING = 1.8
+# σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
+OF_WAVES = 0.015
+# Delay of a reference that a filter explains: within this factor of the filter's time constant, and at least this, s.
 LAGS_WITHIN, LEAST_LAG_S = 2.0, 0.2
-# Corrections (rad, scale, m) below these, or below BY_CHANCE σ, count as none.
-NO_ANGLE, NO_SCALE, NO_ARM_M, BY_CHANCE = math.radians(0.35), 0.005, 0.2, 3.0
+# Corrections (rad, scale, m) below these, or below `BY_CHANCE` σ, count as none.
+NO_ANGLE, NO_SCALE, NO_ARM_M = math.radians(0.35), 0.005, 0.2
 # Smallest share of DVL noise for references from positions, whose windows hold motion on both sides, which looks
 # similar.
 FOLLOWED_BY_POSITIONS = 0.1
@@ -285,7 +279,7 @@ def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None
     if found is None:
         return None
     size = float(np.linalg.norm(found.over_ground))
-    if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < SURELY * found.over_ground_std).all():
+    if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < SURE_AT_SEA * found.over_ground_std).all():
         return None
     own = [estimate.state_of(name) for name in OFFSETS]
     is_held = float(np.linalg.norm(found.over_ground - own)) < 0.5 * size
@@ -312,15 +306,14 @@ def residual_warnings(
     least = FOLLOWED_BY_POSITIONS if of_positions else 0.0
     seconds = math.sqrt(2.0 * abs(found.smoothed))
     lags_so = lag_s > max(LEAST_LAG_S, seconds / LAGS_WITHIN) and lag_s < LAGS_WITHIN * seconds
-    filter_from = FILTER_SHOWN_LAGGING if lags_so else FILTER_SHOWN
-    is_filter = not of_positions and found.smoothed > filter_from * found.smoothed_std
-    surely = FOLLOWED_BY_FILTER if is_filter else FOLLOWED_SURELY
-    if found.circular > max(surely * found.circular_std, least):
+    # a filter both smooths and passes noise on: each may be less sure
+    is_filter = not of_positions and found.smoothed > COVERED * found.smoothed_std
+    if found.circular > max((BY_CHANCE if is_filter else SURE) * found.circular_std, least):
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
-    if is_filter and lags_so and is_nil and found.smoothed > FILTER_SHOWN * found.smoothed_std:
+    if is_filter and lags_so and is_nil:
         return [finding("FILTER_FINDS_NOTHING", late=lag_s).weighed(Severity.REJECT)]
     is_ours = of_positions and found.smoothed > 0.0
-    is_smoothed = abs(found.smoothed) > SURELY_SMOOTHED * found.smoothed_std
+    is_smoothed = abs(found.smoothed) > SURE * found.smoothed_std
     if is_smoothed and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
         word = Severity.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Severity.MARGINAL
         # smoothing causes any other signal
@@ -328,7 +321,7 @@ def residual_warnings(
     said = []
     for axis, name in enumerate(("roll", "pitch")):
         share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
-        if abs(share) > max(SURELY * std, NOT_FOLLOWED):
+        if abs(share) > max(SURE_AT_SEA * std, NOT_FOLLOWED):
             off = abs(share * float(found.lean[axis]))
             word = Severity.REJECT if off > WRONG_FROM or abs(share) > WRONG_SIGN_FROM else Severity.MARGINAL
             found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))
@@ -337,14 +330,14 @@ def residual_warnings(
             said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
     # the heading at either end, relative to its mean
     off = 0.5 * abs(found.turned)
-    if off > SAID_FROM and off > 0.5 * SURELY * found.turned_std:
-        word = Severity.MARGINAL if off > max(WRONG_FROM, WITHIN * along[1]) else Severity.WARNING
+    if off > SAID_FROM and off > BY_CHANCE * found.turned_std:
+        word = Severity.MARGINAL if off > max(WRONG_FROM, COVERED * along[1]) else Severity.WARNING
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
         said.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(word))
     if all(each.severity is Severity.WARNING for each in said):  # a wrong tilt or heading looks like a beam
         said += beam_warning(beam)
     size = np.abs(found.bias)
-    shown = (size > NAMED_FROM * found.bias_std) & (size > SAID_FROM * found.speed)
+    shown = (size > FOUND * found.bias_std) & (size > SAID_FROM * found.speed)
     if shown.any():
         axes = ", ".join(
             f"{axis} {1000.0 * found.bias[i]:+.0f} ± {1000.0 * found.bias_std[i]:.0f}"
@@ -352,9 +345,8 @@ def residual_warnings(
             if shown[i]
         )
         turned = float(size[shown].max()) / found.speed
-        is_sure = size > SURELY_WRONG * found.bias_std
-        is_wrong = size - found.bias_std > np.maximum(WRONG_FROM, WITHIN * np.asarray(along)) * found.speed
-        word = Severity.REJECT if (shown & is_wrong).any() and (shown & is_sure).any() else Severity.MARGINAL
+        is_wrong = size - found.bias_std > np.maximum(WRONG_FROM, COVERED * np.asarray(along)) * found.speed
+        word = Severity.REJECT if (shown & is_wrong).any() else Severity.MARGINAL
         said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))
     elif float(found.bias_std[:2].max()) > BIAS_OPEN:
         share = SEEN_BIAS / found.speed

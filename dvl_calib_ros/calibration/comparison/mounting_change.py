@@ -23,7 +23,7 @@ from ...verdict.answering import Answering
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array, near_angles
-from ..numerics.tests import chi2_sf, holm, smallest_found
+from ..numerics.tests import CHANCE, COVERED, FOUND, chance_of, chi2_sf, holm, smallest_found
 from ..results.extrinsics import (
     ANGLES,
     COMPONENTS,
@@ -40,9 +40,9 @@ from ..results.extrinsics import (
 )
 from ..results.mounting_quantities import date
 
-# False-alarm rates of one comparison, for any numbers of quantities and instants: a mounting has moved at the two-sided
-# 4 σ of a normal error and is suspicious at 2 σ; scale and delay have changed at 1 %.
-MOVED, SUSPICIOUS, CHANCE = chi2_sf(16.0, 1), chi2_sf(4.0, 1), 0.01
+# False-alarm rates of one comparison, for any numbers of quantities and instants: of a mounting that has moved, and of
+# one that is suspicious. `CHANCE` is that of scale and delay.
+MOVED, SUSPICIOUS = chance_of(FOUND), chance_of(COVERED)
 # Standard deviation of a lever arm between recordings without a movement, m: the phase centre of a GNSS antenna wanders
 # by one to two centimetres with the satellites in view (IGS antenna calibrations)
 ARM_WANDERS_M = 0.015
@@ -150,7 +150,7 @@ class Comparison(Answering):
     pairs
         All pairs.
     moved, suspicious
-        Changes of angles or lever arm at 4 σ, and at 2 to 4 σ.
+        Changes of angles or lever arm beyond `FOUND` σ, and beyond `COVERED` σ.
     suspected
         Rejected calibrations that differ from the accepted one next to them.
     scale_changed, clock_changed

@@ -1,7 +1,10 @@
-"""Significance of one test (chi-square) and of many (Holm), without SciPy.
+"""Levels of significance, each once, and significance of one test (chi-square) and of many (Holm), without SciPy.
 
-A calibration needs few of these numbers; importing `scipy.special` (`distributions`) takes a quarter of a second of
-CPU.
+A level is in σ of a normal error, two-sided, and allows for the number of tests of its kind (Bonferroni); where one
+decision tests several quantities, `holm` corrects for these. Significance decides whether an effect is there; its cost
+in m per km of dead reckoning decides the severity.
+
+A calibration needs few probabilities; importing `scipy.special` (`distributions`) takes a quarter of a second of CPU.
 """
 
 from __future__ import annotations
@@ -13,6 +16,27 @@ from functools import lru_cache
 import numpy as np
 
 from .frames import Array
+
+# Within the answer's own interval (95 %).
+COVERED = 2.0
+# Not by chance, where a recording is tested once: 0.3 %.
+BY_CHANCE = 3.0
+# Found by one of the fifty tests of a recording: 1 % for all, 2e-4 each.
+FOUND = 3.7
+# Sure where tests are repeated with every block for hours: 6e-7 each.
+SURE = 5.0
+# Sure next to the slow errors of references, attitudes and clocks at sea, which no model holds entirely.
+SURE_AT_SEA = 6.0
+
+# False-alarm rate of a comparison of two recordings, or of held-out errors with their prediction.
+CHANCE = 0.01
+# Chi-square by which an explanation must be worse to be ruled out: a likelihood ratio of e⁴, 55 to 1.
+RULED_OUT = 8.0
+
+
+def chance_of(sigmas: float) -> float:
+    """Return the two-sided probability of a normal error beyond this many σ."""
+    return chi2_sf(sigmas * sigmas, 1.0)
 
 
 def holm(p_values: Sequence[float]) -> Array:

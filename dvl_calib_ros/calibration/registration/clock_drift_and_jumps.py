@@ -16,6 +16,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.samples import Index, Mask
+from ..numerics.tests import RULED_OUT, SURE_AT_SEA
 from ..streams.interpolation import DvlColumns, ImuColumns, TurnRates
 from .gauss_newton import APART, ARM, LATE, Fitted, MotionFit, N
 from .motion_streams import MotionStreams
@@ -24,9 +25,9 @@ from .motion_streams import MotionStreams
 DIRECTIONS: Mapping[str, tuple[float, float]] = {"dvl": (1.0, 0.0), "reference": (-1.0, 1.0), "imu": (0.0, -1.0)}
 # σ of the changes of interpolation and filter delays between stretches, s.
 LAGS_S = 0.03
-# Thresholds of a clock change from end to end: seconds, σ, chi-square gain, chi-square margin to the next clock, and
-# largest residual chi-square per degree of freedom.
-SHOWN_FROM_S, SIGMAS, GAIN, TOLD_APART, LEFT = 0.1, 6.0, 18.0, 8.0, 4.0
+# Thresholds of a clock change from end to end: seconds, chi-square gain, and largest residual chi-square per degree of
+# freedom.
+SHOWN_FROM_S, GAIN, LEFT = 0.1, 18.0, 4.0
 # Smallest gap in the stamps as a share of the forward step that caused it.
 HOLE = 0.8
 # Limits of the parameters `dvl_clock_drift`, s/s, and `dvl_time_jump`, s.
@@ -185,11 +186,11 @@ def unsteady(
     # noise as long as a stretch adds scatter, so all evidence is scaled down
     scatter = max(1.0, left / (seen.size - len(states) - 1.0))
     std *= math.sqrt(scatter)
-    is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > SIGMAS * std
+    is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > SURE_AT_SEA * std
     if not is_shown or left > min(but_one) + ANYTHING * scatter or scatter > LEFT:
         return None
     others = min((each[0] for each in found if each[3] != name), default=np.inf)
-    whose = name if is_turned and others - left > TOLD_APART * scatter else ""
+    whose = name if is_turned and others - left > RULED_OUT * scatter else ""
     return ClockChange(whose, value, std=std) if course.at is None else ClockChange(whose, 0.0, value, course.at, std)
 
 

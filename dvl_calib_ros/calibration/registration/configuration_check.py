@@ -16,6 +16,7 @@ from ...verdict.reasons import Reason, finding
 from ..models.parameters import FLU, FRD
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
+from ..numerics.tests import BY_CHANCE, SURE
 from ..streams.interpolation import attitude_at
 from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion_streams import GAP_S, Curves, MotionStreams
@@ -90,13 +91,10 @@ SIGNS: Sequence[Array] = [np.array([1.0, y, z]) for y in (1.0, -1.0) for z in (1
 SIGNS_OF_X: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
 # Largest residual of an explanation as a multiple of the registered one, and an extra factor for few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
-# σ from which an axis factor is significant (two-sided p = 6e-7: eight tests per check, a check every few blocks), and
-# the smallest excess factor of one axis, above any error of the speed of sound.
-SIGNIFICANT, SCALED_ALONE = 5.0, 0.2
+# Smallest excess factor of one axis, above any error of the speed of sound.
+SCALED_ALONE = 0.2
 # Largest misalignment (rad) and scale error of a right configuration.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
-# Rotations below this multiple of σ are insignificant.
-BY_CHANCE = 3.0
 # Initial DVL delays, s: the range of a calibration, in steps that are short compared to waves.
 LATE_S = (-2.4, -1.2, 0.0, 1.2, 2.4)
 # Constraints of alternative configurations: synchronised reference, configured lever arm.
@@ -236,7 +234,7 @@ def wrong_axes(
     if fitted is None or fitted.level > most:
         return None
     factors, std = fit.axis_factors(fitted, nominal)
-    is_shown, is_turned = factors > SIGNIFICANT * std, signs < 0.0
+    is_shown, is_turned = factors > SURE * std, signs < 0.0
     ahead = int(np.argmin(std))  # the axis along which the vehicle moves most
     if is_turned[ahead]:  # a mounting unless all signs are observable
         axis = "each of x, y and z" if is_turned.all() else "xyz"[ahead]
@@ -248,7 +246,7 @@ def wrong_axes(
             alike = f" (read as {dvl_axes}; read as {instead}, {other} does)" if instead else ""
             return finding("DVL_LEFT_HANDED", axis=axis, alike=alike)
         return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
-    too_small = np.where(is_shown, (factors - SIGNIFICANT * std) / factors[ahead] - SCALED_ALONE, 0.0)
+    too_small = np.where(is_shown, (factors - SURE * std) / factors[ahead] - SCALED_ALONE, 0.0)
     if not is_turned.any() and too_small.max() > 1.0:
         at = int(np.argmax(too_small))
         factor = float(factors[ahead] / factors[at])

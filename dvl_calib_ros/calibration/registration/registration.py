@@ -16,6 +16,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
+from ..numerics.tests import FOUND, RULED_OUT
 from .clock_drift_and_jumps import MOST_STRETCHES, STRETCH_S, ClockChange, stamps, unsteady
 from .delay_search import LONGEST_S, places
 from .gauss_newton import (  # fmt: skip
@@ -39,9 +40,8 @@ from .motion_streams import Curves, MotionStreams
 # Smallest delay that is reported, s. It shifts a lever arm by a tenth of a second times the speed. Interpolated
 # attitudes and the filters of an INS have smaller delays (five real recordings: 0.03 to 0.07 s).
 SAID_FROM_S = 0.1
-# Delay in σ from which it is reported; chi-square that each additional delayed clock must gain; chi-square by which the
-# next explanation must be worse to be ruled out.
-SIGMAS, ONE_MORE, TOLD_APART = 4.0, 12.0, 8.0
+# Chi-square that each additional delayed clock must gain.
+ONE_MORE = 12.0
 # Chi-square by which the next explanation must be worse for a refusal, if the σ of the calibration cover the delay. The
 # chi-square of the same streams varies this much with the selected samples.
 REFUSED_FROM = 16.0
@@ -285,7 +285,7 @@ def _explained(fit: MotionFit, free: Fitted, rotation: Array | None, lever_arm: 
     next_worse = min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost
     if best is None or cost > 2.0 * ONE_MORE:
         likeliest, best, next_worse = _Off.BOTH, free, math.inf
-    is_told_apart = next_worse > TOLD_APART
+    is_told_apart = next_worse > RULED_OUT
     x, p = best.x, best.p
     # an insignificant delay is set to zero, and σ must cover it
     stays = likeliest in (_Off.NONE, _Off.DVL) or not (is_told_apart and _is_off(best, LATE))
@@ -366,7 +366,7 @@ def _is_off(fitted: Fitted, index: int) -> bool:
 def is_beyond_doubt(seconds: float, std: float) -> bool:
     """Return whether a delay (s) with this σ (s) is significant and large enough to report."""
     is_known = std < min(max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds)), KNOWN_AT_MOST_S)
-    return is_known and abs(seconds) > max(SAID_FROM_S, SIGMAS * std)
+    return is_known and abs(seconds) > max(SAID_FROM_S, FOUND * std)
 
 
 def _is_possible(fitted: Fitted) -> bool:

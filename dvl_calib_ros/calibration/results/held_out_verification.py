@@ -20,27 +20,22 @@ from ..models import Model
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
-from ..numerics.tests import chi2_isf
+from ..numerics.tests import BY_CHANCE, CHANCE, chi2_isf
 from .results import Verification
 
 # Drift that an accepted calibration may leave open, in `target_drift`: 1 % of distance by default, which a mounting by
 # hand (0.5°) has.
 ACCEPTED_DRIFT = 5.0
-# Significant growth of the squared error in variances of the estimate: above 99 % of chi-square per degree of freedom,
-# with three and more.
-WORSE_FROM = 4.0
+# Significant growth of the squared error in variances of the estimate, for the three angles at least.
+WORSE_FROM = chi2_isf(CHANCE, 3) / 3.0
 # Held-out error in predicted errors that slightly small claims of noise do not explain.
 SEVERAL = 3.0
 # Smallest plausible held-out error as a share of the claimed noise: below, reference and DVL share their noise.
 IMPLAUSIBLE = 0.2
 # Largest share of gated samples: above, the estimate is that of a minority.
 MOST_GATED = 0.5
-# σ from which an error is significant even if it is not observable.
-SURELY = 3.0
 # Largest error without outliers in predicted errors; smallest error with outliers in errors without.
 AS_PREDICTED, MADE_BY_OUTLIERS = 1.25, 1.5
-# False-alarm rate of a held-out error above the prediction of a true covariance.
-CHANCE = 0.01
 
 
 def verify(
@@ -116,7 +111,7 @@ def shown_misalignment(model: Model, state: GaussianState, parameters: Parameter
     t = parameters.rotation_dvl_from_body
     about = t.T @ (model.error_terms_from_state @ state.x)[:3]
     std = body_angle_std(state.p, parameters)
-    shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > SURELY * std)
+    shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > BY_CHANCE * std)
     return np.where(shown, about, 0.0)
 
 
@@ -139,7 +134,7 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
     variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
     std = np.sqrt(variance)
     known = (variance > 0.0) & (
-        (std <= OBSERVED_SHARE * parameters.initial_std_scale) | (np.abs(errors[3:]) > SURELY * std)
+        (std <= OBSERVED_SHARE * parameters.initial_std_scale) | (np.abs(errors[3:]) > BY_CHANCE * std)
     )
     scale = float(np.abs(errors[3:][known]).max(initial=0.0))
     if scale > parameters.max_scale_error:

@@ -19,6 +19,7 @@ from ..numerics.error_model import correct, corrected_mounting, correction_jacob
 from ..numerics.frames import FLU_FROM_FRD, Array, near_angles, rpy_from_rotation
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Mask
+from ..numerics.tests import SURE
 
 _SCALE_FIRST = [3, 4, 5, 0, 1, 2]
 NOT_ESTIMATED = -1.0  # variance of a component that the model does not estimate
@@ -435,9 +436,8 @@ def scale_and_delay(model: Model, state: GaussianState, parameters: Parameters) 
 
 OFFSETS = "reference_east", "reference_north"
 ARM = ("lever_arm_x", "lever_arm_y", "lever_arm_z")
-# Difference that contradicts the configured lever arm: in σ (two-sided p = 6e-7), and at least the error of a tape
-# measure, m.
-SIGMAS, MEASURED_TO = 5.0, 0.05
+# Smallest difference that contradicts the configured lever arm: the error of a tape measure, m.
+MEASURED_TO = 0.05
 # σ of the estimate, in errors of a tape measure, above which the configured lever arm is kept.
 WORSE_THAN_TOLD = 2.0
 
@@ -461,4 +461,4 @@ def contradicts_configured_arm(model: Model, state: GaussianState, parameters: P
         return np.zeros(3, dtype=bool)
     at = [model.state_names.index(name) for name in ARM]
     away, std = np.abs(state.x[at]), np.sqrt(np.diag(state.p)[at])
-    return np.asarray(away > np.maximum(SIGMAS * std, MEASURED_TO))
+    return np.asarray(away > np.maximum(SURE * std, MEASURED_TO))

@@ -325,7 +325,7 @@ def test_a_clock_that_is_not_told_apart_stays_in_time_and_is_open_by_what_the_da
     """An IMU 0.15 s late made an arm of 0.60 m ± 0.06 of one of 0.80, accepted: which clock was off was not told apart,
     and σ was that of a clock that had been taken off."""
     assert registered("free", 5.0, imu=0.3).open_late < 0.1
-    monkeypatch.setattr(registration, "TOLD_APART", 1e9)
+    monkeypatch.setattr(registration, "RULED_OUT", 1e9)
     found = registered("free", 5.0, imu=0.3)
     assert found.offsets == {} and found.open_late == pytest.approx(0.3, abs=0.1)
     assert np.sqrt(found.left_open[3, 3]) == pytest.approx(abs(found.open_by[3]) * 0.25, rel=0.3)
