@@ -29,11 +29,13 @@ from ..checks.residual_tests import (
     residual_warnings,
     std_along,
 )
+from ..filters.observability import KM
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.robust import median
 from ..numerics.samples import Index
+from ..results.held_out_verification import ACCEPTED_DRIFT
 from ..results.results import Estimate
 from ..results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
 from ..streams.position_velocities import are_positions
@@ -400,4 +402,5 @@ def doubts(
         is_insignificant(estimate),
         std_along(estimate, parameters),
         None if is_large else navigation.beam,
+        ACCEPTED_DRIFT * parameters.target_drift / KM,
     )

@@ -22,9 +22,6 @@ from ..numerics.tests import COVERED, FOUND
 
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
-# Error of the velocity ahead (share of the speed) from which a beam is reported, even if it is better by `COVERED` σ:
-# 10 m per km, the limit of acceptance.
-SAID_FROM = 0.01
 # Prior σ of the nuisances: the scale of z, and the DVL's bias (m/s), which at one speed looks like a beam.
 Z_SCALE_STD, BIAS_STD = 1.0, 0.1
 
@@ -105,9 +102,12 @@ def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean
     return BeamFault(abs(share), std, (AZIMUTHS_DEG[number - 1] + 180.0 * (share < 0.0)) % 360.0, off)
 
 
-def beam_warning(found: BeamFault | None) -> list[Reason]:
-    """Return the reason against a calibration by a faulty beam; its roll and yaw are wrong by several σ."""
-    if found is None or found.share < FOUND * found.std or found.least < SAID_FROM:
+def beam_warning(found: BeamFault | None, accepted: float) -> list[Reason]:
+    """Return the reason against a calibration by a faulty beam; its roll and yaw are wrong by several σ.
+
+    accepted: error of the velocity ahead, as a share of the speed, up to which a beam is not reported.
+    """
+    if found is None or found.share < FOUND * found.std or found.least < accepted:
         return []
     percent, std = 100.0 * found.share, 100.0 * found.std
     return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.REJECT)]

@@ -63,9 +63,8 @@ TILT_SHOWN = 0.2
 SEEN_BIAS, BIAS_OPEN = 0.02, 0.008
 # Share of tilt from which a sign is wrong, instead of a levelled velocity.
 WRONG_SIGN_FROM = 1.6
-# Mounting error (rad) from which it is reported, and from which the calibration is rejected. It is not rejected if
-# the calibration's own σ cover the error.
-SAID_FROM, WRONG_FROM = math.radians(0.2), math.radians(0.5)
+# Mounting error (rad) from which it is reported.
+SAID_FROM = math.radians(0.2)
 # Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 # Residual, relative to the median, beyond which it is an outlier; number of iterations.
@@ -295,11 +294,13 @@ def residual_warnings(
     is_nil: bool = False,
     along: Sequence[float] | Array = (0.0, 0.0, 0.0),
     beam: BeamFault | None = None,
+    accepted: float = 0.01,
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
     of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, is_nil, along:
-    see `reference_lag_s`, `is_insignificant` and `std_along`.
+    see `reference_lag_s`, `is_insignificant` and `std_along`. accepted: error of the mounting (rad, or share of the
+    distance) up to which a calibration is accepted; one that its own σ cover does not reject it either.
     """
     if found is None:
         return []
@@ -323,19 +324,19 @@ def residual_warnings(
         share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
         if abs(share) > max(SURE_AT_SEA * std, NOT_FOLLOWED):
             off = abs(share * float(found.lean[axis]))
-            word = Severity.REJECT if off > WRONG_FROM or abs(share) > WRONG_SIGN_FROM else Severity.MARGINAL
+            word = Severity.REJECT if off > accepted or abs(share) > WRONG_SIGN_FROM else Severity.MARGINAL
             found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))
             said.append(found_tilt.weighed(word))
-        elif std > TILT_SHOWN and abs(float(found.lean[axis])) > WRONG_FROM:
+        elif std > TILT_SHOWN and abs(float(found.lean[axis])) > accepted:
             said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
     # the heading at either end, relative to its mean
     off = 0.5 * abs(found.turned)
     if off > SAID_FROM and off > BY_CHANCE * found.turned_std:
-        word = Severity.MARGINAL if off > max(WRONG_FROM, COVERED * along[1]) else Severity.WARNING
+        word = Severity.MARGINAL if off > max(accepted, COVERED * along[1]) else Severity.WARNING
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
         said.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(word))
     if all(each.severity is Severity.WARNING for each in said):  # a wrong tilt or heading looks like a beam
-        said += beam_warning(beam)
+        said += beam_warning(beam, accepted)
     size = np.abs(found.bias)
     shown = (size > FOUND * found.bias_std) & (size > SAID_FROM * found.speed)
     if shown.any():
@@ -345,7 +346,7 @@ def residual_warnings(
             if shown[i]
         )
         turned = float(size[shown].max()) / found.speed
-        is_wrong = size - found.bias_std > np.maximum(WRONG_FROM, COVERED * np.asarray(along)) * found.speed
+        is_wrong = size - found.bias_std > np.maximum(accepted, COVERED * np.asarray(along)) * found.speed
         word = Severity.REJECT if (shown & is_wrong).any() else Severity.MARGINAL
         said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))
     elif float(found.bias_std[:2].max()) > BIAS_OPEN:

@@ -16,7 +16,7 @@ from dvl_calib_ros.verdict.kinds import Severity
 )
 def test_a_significant_beam_whose_error_matters_rejects_the_calibration(share, off, severities):
     """Eight of twelve recordings with a beam that reads 6 % too much were accepted."""
-    found = beam_warning(BeamFault(share, 0.01, 135.0, off))
+    found = beam_warning(BeamFault(share, 0.01, 135.0, off), 0.01)
     assert [each.severity for each in found] == severities
 
 
