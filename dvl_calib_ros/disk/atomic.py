@@ -24,6 +24,8 @@ from ..errors import InputError
 PATIENCE_S = 5.0
 _PREFIX = ".dvl_calib."
 _TEMPORARY, _STRANDED = ".tmp", ".bak"
+# Longest name of a file, bytes: a file system holds 255, and backups are named `.bak` to `.bak.9999`.
+LONGEST_NAME = 246
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 Keep = Callable[[Sequence[Path]], Sequence[Path]]
@@ -164,7 +166,7 @@ def _write_stream(handle: int, content: bytes) -> None:
 
 
 def _target(path: Path) -> Path:
-    """Resolve links to the file to replace. Raises InputError for a folder, a device or another user's link."""
+    """Resolve links to the file to replace. Raises InputError for a folder, a device, a long name or a foreign link."""
     if path.is_symlink() and path.lstat().st_uid not in (0, os.geteuid()):
         raise InputError(f"{path}: is a link that another user has made; name another file")
     target = Path(os.path.realpath(path))
@@ -174,6 +176,8 @@ def _target(path: Path) -> Path:
             raise InputError(f"{path}: is a folder; name a file in it, such as {path / 'calibration.yaml'}")
         if not stat.S_ISREG(mode):
             raise InputError(f"{path}: is a device, a pipe or a socket, which a file would replace; name a file")
+    if len(os.fsencode(target.name)) > LONGEST_NAME:
+        raise InputError(f"{path}: longer than {LONGEST_NAME} bytes, which leaves no room for .bak; name another")
     return target
 
 
