@@ -8,13 +8,13 @@ from ..calibration.checks.data_warnings import STREAMS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import Stream
+from ..calibration.streams.clock_correction import SECOND_NS
 from ..calibration.streams.stream_order import strays
 from ..messages.drivers import VELOCITY_TYPES
 from ..recordings.topic_messages import Recorded
 from ..verdict.kinds import Severity
 from ..verdict.reasons import Reason, finding
 
-SECOND_NS = 1_000_000_000
 # with fewer messages, rates and jitter are not evaluated
 ENOUGH = 20
 # smallest shares of faulty messages that are reported

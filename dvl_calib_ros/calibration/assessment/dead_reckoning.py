@@ -33,7 +33,7 @@ from ..filters.observability import KM
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
-from ..numerics.robust import median
+from ..numerics.robust import MEDIAN_SQUARE, median
 from ..numerics.samples import Index
 from ..results.held_out_verification import ACCEPTED_DRIFT
 from ..results.results import Estimate
@@ -55,8 +55,6 @@ FITS_BETTER = 0.5
 COMPARED_AT_ONCE = 2048
 # Points of a track that are kept for a map.
 POINTS = 1500
-# Median of chi-square with one degree of freedom.
-MEDIAN_SQUARE = 0.4549
 
 
 @dataclass(frozen=True)

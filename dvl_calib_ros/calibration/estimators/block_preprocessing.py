@@ -13,7 +13,7 @@ import numpy as np
 from ..models.parameters import Parameters
 from ..numerics.frames import ENU_FROM_NED, Array
 from ..numerics.robust import median, steps
-from ..numerics.samples import FRAME_CODES, Codes, Index, Mask, Stamps, VelocityFrame
+from ..numerics.samples import AXIS_BITS, FRAME_CODES, Codes, Index, Mask, Stamps, VelocityFrame
 from ..results.thinned_recording import NOT_MEASURED, thinned
 from ..streams.interpolation import MARGIN_S, DvlColumns, ImuColumns, ReferenceColumns, binned
 from ..streams.outliers import without_spikes
@@ -22,7 +22,6 @@ from ..streams.position_velocities import are_positions, of_moments
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
 # Largest turn rate of a vehicle with a DVL, rad/s.
 FASTEST_TURN = 20.0
-_BITS = np.array([1, 2, 4], dtype=np.uint8)
 # Smallest scatter about interpolation, m/s, assumed of a stream. SLOW_S: interval (s) from which the larger value
 # applies, because a vehicle turns between samples.
 LEAST_SCATTER_MPS, SLOW_S, LEAST_SCATTER_SLOW_MPS = 0.01, 0.45, 0.1
@@ -123,7 +122,7 @@ def _reference(
     around = block.reference
     velocity = around.values[:, :3]
     if around.unmeasured.any():
-        velocity = np.where((around.unmeasured[:, None] & _BITS) == 0, velocity, 0.0)
+        velocity = np.where((around.unmeasured[:, None] & AXIS_BITS) == 0, velocity, 0.0)
     good = _good(around.stamps_ns, velocity)[own]
     stamps_ns, values, frames, unmeasured = raw if good.all() else raw.part(np.flatnonzero(good))
     noise = values[:, 3:12].reshape(-1, 3, 3)
@@ -131,7 +130,7 @@ def _reference(
     noise = np.where(given[:, None, None], noise, np.eye(3) * p.gnss_aided_std**2)
     velocity, ned = values[:, :3], frames == _NED
     if unmeasured.any():
-        axes = (unmeasured[:, None] & _BITS) != 0
+        axes = (unmeasured[:, None] & AXIS_BITS) != 0
         velocity = np.where(axes, 0.0, velocity)
         noise = np.where(axes[:, :, None] | axes[:, None, :], 0.0, noise) + np.eye(3) * np.where(
             axes[:, :, None], NOT_MEASURED, 0.0

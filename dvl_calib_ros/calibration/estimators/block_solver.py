@@ -21,11 +21,11 @@ from ..models.parameters import Parameters
 from ..numerics.kalman import GaussianState
 from ..registration.registration import Registration
 from ..results.thinned_recording import MEASURED_BELOW, ThinnedBlock, mean_around
-from ..streams.interpolation import DvlColumns, ImuColumns, InBody, attitude_at, in_body
+from ..streams.interpolation import LONGEST_DELAY_S, DvlColumns, ImuColumns, InBody, attitude_at, in_body
 from .block_preprocessing import Block, Cleaned, cleaned, seconds
 from .estimator import Rest
 from .full_fit import JointFit
-from .full_forward_model import LONGEST_DELAY_S, FitBlock, spline_slopes
+from .full_forward_model import FitBlock, spline_slopes
 from .registration_schedule import KeptClocks, Looked, ToldSoFar
 
 # DVL and IMU are kept this far beyond a block, s: the longest delay, and the end of a spline.

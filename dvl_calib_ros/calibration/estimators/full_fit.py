@@ -23,6 +23,7 @@ from ..models.parameters import Parameters
 from ..numerics.block_covariance import TimeBlocks
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState, covariance_of
+from ..numerics.robust import MEDIAN_DISTANCE
 from ..numerics.samples import Index
 from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
@@ -61,8 +62,6 @@ LEAST_GAIN, SHARE_LEFT = 50.0, 0.5
 # A section is rejected if its median differs from the others' by GROSS of their σ and by GROSS_MPS (m/s): no slow error
 # is so large.
 GROSS, GROSS_MPS = 10.0, 0.5
-# Median of the absolute value of a standard normal variable.
-MEDIAN_ABSOLUTE = 0.6745
 _UNIT_POINTS: Array = normal_points(5, POINTS)
 
 
@@ -385,7 +384,7 @@ class JointFit:
             return
         levels = np.array([part.level for part in parts if part.rows is not None])
         day.level = masked_median(levels)
-        day.level_std = np.maximum(masked_median(np.abs(levels - day.level)) / MEDIAN_ABSOLUTE, GROSS_MPS / GROSS)
+        day.level_std = np.maximum(masked_median(np.abs(levels - day.level)) / MEDIAN_DISTANCE, GROSS_MPS / GROSS)
         day.single = np.maximum(usual_square(np.concatenate(left)), LEAST_NOISE_MPS**2)
         each = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
         total, freedom = (np.sum(sums, axis=0) for sums in zip(*each, strict=True))

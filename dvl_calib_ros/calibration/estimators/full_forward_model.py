@@ -28,15 +28,13 @@ from ..models.own import (
 from ..models.parameters import Parameters
 from ..numerics.frames import Array, cross, rotation_from_quaternion, skew, squared
 from ..numerics.kalman import GaussianState
-from ..numerics.robust import robust_std
+from ..numerics.robust import MEDIAN_SQUARE, robust_std
 from ..numerics.samples import Index, Mask
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 from ..streams.outliers import deviation_from_neighbours, neighbours
 
 # Slow errors: reference velocity east, north, up (m/s); attitude about east, north, up (rad).
 SLOW = 6
-# Longest delay of the DVL that is searched, s.
-LONGEST_DELAY_S = 3.2
 # Half-width of the difference for angular acceleration, s.
 TURNING_S = 0.1
 # At sample intervals below this, s, slopes come from parabolas instead of a spline.
@@ -46,8 +44,6 @@ DENSE_S = 0.15
 FEWEST_DVL, SLOW_S, SUSPICIOUS, LEAST_SCATTER_MPS = 8, 0.45, 6.0, 0.03
 # Half-width of the difference for the DVL's acceleration: s, and intervals of the DVL.
 SLOPE_REACH_S, SLOPE_INTERVALS = 0.5, 2.0
-# Median of chi-square with one degree of freedom.
-MEDIAN_SQUARE = 0.4549
 # Longest gap of the DVL that is interpolated: the larger of this number of its usual intervals and this time, s.
 GAP_INTERVALS, GAP_S = 3.0, 1.2
 

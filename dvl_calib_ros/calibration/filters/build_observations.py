@@ -11,11 +11,10 @@ from ..models import Needs
 from ..models.base import Assumptions, Observations, Unmeasured
 from ..models.parameters import Parameters
 from ..numerics.frames import ENU_FROM_NED, Array, rotation_from_quaternion, skew
-from ..numerics.samples import FRAME_CODES, AlignedBlock, Codes, Mask, VelocityFrame
+from ..numerics.samples import AXIS_BITS, FRAME_CODES, AlignedBlock, Codes, Mask, VelocityFrame
 from .state_history import Numbers
 
 _BODY, _NED = FRAME_CODES[VelocityFrame.BODY], FRAME_CODES[VelocityFrame.NED]
-_BITS = np.array([1, 2, 4], dtype=np.uint8)
 # Attitude (4) and angular velocity (3) of rows that have none
 _UNKNOWN = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 # Mask of the rows of a block that meet each need
@@ -63,7 +62,7 @@ class Observer:
         reference = block.reference[:, :3]
         unmeasured = None
         if block.unmeasured.any():
-            axes = (block.unmeasured[:, None] & _BITS) != 0
+            axes = (block.unmeasured[:, None] & AXIS_BITS) != 0
             turned = np.broadcast_to(np.eye(3), (len(block), 3, 3)) if rotation is None else rotation.swapaxes(1, 2)
             unmeasured = Unmeasured(axes, turned)
             expected = block.velocity_dvl @ rotation_dvl_from_body

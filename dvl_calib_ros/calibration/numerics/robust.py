@@ -9,7 +9,8 @@ import numpy as np
 from .frames import Array
 
 # Median absolute deviation of a normal variable, in standard deviations.
-_MEDIAN_DISTANCE = NormalDist().inv_cdf(0.75)
+MEDIAN_DISTANCE = NormalDist().inv_cdf(0.75)
+MEDIAN_SQUARE = MEDIAN_DISTANCE**2
 
 
 def median(values: Array) -> Array:
@@ -28,4 +29,4 @@ def robust_std(values: Array) -> Array:
     """Return the standard deviation (...) of normal values (N, ...) by the median absolute deviation; nan for none."""
     if not len(values):
         return np.full(values.shape[1:], np.nan)
-    return median(np.abs(values - median(values))) / _MEDIAN_DISTANCE
+    return median(np.abs(values - median(values))) / MEDIAN_DISTANCE

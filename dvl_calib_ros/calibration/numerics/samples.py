@@ -83,6 +83,8 @@ class Stream(Enum):
     IMU = "imu"
 
 
+# Bits of the axes x, y, z.
+AXIS_BITS = np.array([1, 2, 4], dtype=np.uint8)
 # Number of value columns: velocity (m/s); for the IMU quaternion (x, y, z, w) and angular velocity (rad/s).
 WIDTH = {Stream.DVL: 3, Stream.REFERENCE: 3, Stream.IMU: 7}
 

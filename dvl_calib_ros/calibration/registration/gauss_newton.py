@@ -18,8 +18,9 @@ import numpy as np
 
 from ..numerics.block_covariance import TimeBlocks
 from ..numerics.frames import Array, cross, nearest_rotation, rotation_of, skew, squared, turn_between
-from ..numerics.robust import median
+from ..numerics.robust import MEDIAN_SQUARE, median
 from ..numerics.samples import Index, Mask
+from ..numerics.tests import chi2_isf
 from ..streams.interpolation import attitude_at
 from .motion_streams import GAP_S, Curves, MotionStreams
 
@@ -54,8 +55,6 @@ MOST_OF_NOISE = 0.95
 # Time blocks that σ is estimated from, and the threshold for correlated noise (`block_covariance.LASTS`): high, so that
 # the residual of a clock change does not count as noise.
 BLOCKS, LASTS_BEYOND_DOUBT = 48, 2.5
-# Median of chi-square with 1, 2, 3 degrees of freedom.
-_MEDIAN_CHI2 = (0.455, 1.386, 2.366)
 _Compared = tuple[Index, tuple[Array, ...]]
 
 
@@ -351,7 +350,7 @@ class MotionFit:
         """
         axes = rows.residual.shape[1]
         squares = squared(rows.residual)
-        level2 = max(float(median(squares)) / _MEDIAN_CHI2[axes - 1], 1e-8)
+        level2 = max(float(median(squares)) / chi2_isf(0.5, axes), 1e-8)
         weight = 1.0 / (1.0 + squares / (HALF_AT**2 * axes * level2))
         h = rows.jacobian.reshape(-1, N)
         w = np.repeat(weight, axes) / level2
@@ -393,7 +392,7 @@ def white_noise(velocity: Array) -> float:
     """Return the white-noise variance (m/s)² of a stream (N, 3) from its second differences."""
     if len(velocity) < 3:
         return 0.0
-    bent = median(np.diff(velocity, 2, axis=0) ** 2) / (6.0 * _MEDIAN_CHI2[0])
+    bent = median(np.diff(velocity, 2, axis=0) ** 2) / (6.0 * MEDIAN_SQUARE)
     return float(bent.mean())
 
 

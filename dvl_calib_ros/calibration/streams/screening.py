@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..numerics.frames import Array, Quaternion, Vector
-from ..numerics.samples import Codes, Covariances, Mask
+from ..numerics.samples import AXIS_BITS, Codes, Covariances, Mask
 
 # Smaller variances, (1 µm/s)², are implausible for a velocity sensor and count as not given, like zero.
 SMALLEST_VARIANCE = 1e-12
@@ -21,7 +21,6 @@ NOT_MEASURED_VARIANCE = 1e3
 # rad/s, three times the range of gyroscopes; limits overflow
 LARGEST_RATE = 100.0
 _NOT_MEASURED_FLAG = -1.0
-_BITS = np.array([1, 2, 4], dtype=np.uint8)
 ALL_AXES, VERTICAL = 7, 4
 
 
@@ -98,7 +97,7 @@ def screened_covariances(covariance: Array, believed: bool = True) -> tuple[Mask
         determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
         definite = (xx * yy - xy * xy > 0.0) & (determinant > 0.0)
     valid = finite & (least >= 0.0) & (definite | ~given)
-    return valid, given, found, (unmeasured * _BITS).sum(axis=1).astype(np.uint8)
+    return valid, given, found, (unmeasured * AXIS_BITS).sum(axis=1).astype(np.uint8)
 
 
 def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[bool, bool, bool]:
@@ -107,7 +106,7 @@ def measured_axes(velocity: Array, unmeasured: Codes, gnss_axes: str) -> tuple[b
     velocity: (N, 3) m/s. unmeasured: (N,) as in `Screened`. gnss_axes: the parameter.
     """
     unmeasured = np.where(unmeasured == ALL_AXES, 0, unmeasured)  # all unmeasured: no evidence per axis
-    measured = [2 * np.count_nonzero(unmeasured & bit) < len(unmeasured) for bit in _BITS]
+    measured = [2 * np.count_nonzero(unmeasured & bit) < len(unmeasured) for bit in AXIS_BITS]
     if gnss_axes != "auto":
         measured[2] = gnss_axes == "xyz"
     x, y, z = map(bool, measured)
