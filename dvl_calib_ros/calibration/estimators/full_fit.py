@@ -7,10 +7,10 @@ a power of two, or when the estimate has moved away from it. Both depend on the 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from ..filters.cross_validation import FOLDS, HeldOutError
 from ..models.own import DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, REFERENCE_ERROR, SCALE
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import TimeBlocks
-from ..numerics.frames import Array
+from ..numerics.frames import Array, product
 from ..numerics.kalman import GaussianState, covariance_of
 from ..numerics.samples import Index
 from .full_delay_search import better_delay
@@ -115,10 +115,10 @@ class _Climb(NamedTuple):
 
 
 class _Hypotheses(NamedTuple):
-    """A combinations of priors, at C points of the slow errors, over n states.
+    """A combinations of priors and B paths of the vehicle, at C points of the slow errors, over n states.
 
-    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C). log_odds: (A,).
-    climb_mps: (A,) m/s, σ of a day's mean climb.
+    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C). log_odds: (A, B).
+    climb_mps: (B,) m/s, σ of a day's mean climb.
     """
 
     information: Array
@@ -375,7 +375,7 @@ class JointFit:
         if rows is None:
             return [SectionRows(from_s, None, block) for from_s in starts]
         bounds = np.searchsorted(rows.times, [*starts, block.end_s + 1e-9]).tolist()
-        each = (rows.part(slice(a, b)) if b > a else None for a, b in pairwise(bounds))
+        each = (rows.part(slice(a, b)) if b > a else None for a, b in itertools.pairwise(bounds))
         return [SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
 
     def _measure_noise(self, day: _Day, parts: Sequence[SectionRows]) -> None:
@@ -522,33 +522,38 @@ class JointFit:
     def _mixture(self, ended: Sequence[Eliminated | None], points: slice, climbs: Sequence[_Climb]) -> JointEstimate:
         """Return mean and covariance over points of the slow errors and over the hypotheses of the priors."""
         known = self._hypotheses(points, bool(climbs))
-        information, vector, log_det = known.information.copy(), known.vector.copy(), known.log_det.copy()
-        square = np.zeros(information.shape[:2])
-        for climb in climbs:
-            variance = np.maximum(climb.std, known.climb_mps)[:, None] ** 2
-            h, at = climb.row[:-1], climb.at
-            information[:, :, at[:, None], at] += np.outer(h, h) / variance[:, :, None, None]
-            vector[:, :, at] -= climb.row[-1] * h / variance[:, :, None]
-            square += climb.row[-1] ** 2 / variance
-            log_det += np.log(variance)
+        information, vector = known.information.copy(), known.vector.copy()
+        left = known.log_det.copy()
         for number, each in enumerate(ended):
             if each is not None:
                 at = self._of_day(number)
                 information[:, :, at[:, None], at] += each.gram[:, :N_STATE, :N_STATE]
                 vector[:, :, at] += each.gram[:, :N_STATE, N_STATE]
-                square += each.gram[:, N_STATE, N_STATE]
-                log_det += each.log_determinant
+                left += each.gram[:, N_STATE, N_STATE] + each.log_determinant
         covariance = covariance_of(information, known.information)
-        x = (covariance @ vector[..., None])[..., 0]
-        left = square - (x * vector).sum(axis=-1)
-        odds = known.log_odds[:, None] + self._log_prior[points]
-        evidence = odds - 0.5 * (left + log_det + np.linalg.slogdet(information)[1])
+        x = product(covariance, vector)
+        left += np.linalg.slogdet(information)[1] - (x * vector).sum(axis=-1)
+        # a mean climb of zero is a measurement, with a variance by path
+        h = np.zeros((len(climbs), x.shape[-1]))
+        for row, climb in zip(h, climbs, strict=True):
+            row[climb.at] = climb.row[:-1]
+        climbing = x @ h.T + [climb.row[-1] for climb in climbs]
+        along = covariance @ h.T
+        std = np.maximum([climb.std for climb in climbs], known.climb_mps[:, None])
+        innovation = (h @ along)[:, None] + (std[:, None, :, None] ** 2 * np.eye(len(h)))
+        inverse = np.linalg.inv(innovation)
+        by_climb = product(inverse, climbing[:, None])
+        left = left[:, None] + (climbing[:, None] * by_climb).sum(axis=-1) + np.linalg.slogdet(innovation)[1]
+        x = x[:, None] - product(along[:, None], by_climb)
+        evidence = known.log_odds[:, :, None] + self._log_prior[points] - 0.5 * left
         weights = np.exp(evidence - evidence.max())
         weights /= weights.sum()
-        mean = np.tensordot(weights, x)
-        spread = x - mean
-        p = np.tensordot(weights, covariance) + np.einsum("ac,aci,acj->ij", weights, spread, spread)
-        return JointEstimate(GaussianState(mean, 0.5 * (p + p.T)), weights.sum(axis=0))
+        mean = np.tensordot(weights, x, 3)
+        spread = (x - mean).reshape(-1, len(mean))
+        p = np.tensordot(weights.sum(axis=1), covariance) + (spread.T * weights.ravel()) @ spread
+        of_climb = along @ (weights[..., None, None] * inverse).sum(axis=1)
+        p -= np.tensordot(of_climb, along, ((0, 1, 3), (0, 1, 3)))
+        return JointEstimate(GaussianState(mean, 0.5 * (p + p.T)), weights.sum(axis=(0, 1)))
 
     def _hypotheses(self, points: slice, seen_climbing: bool) -> _Hypotheses:
         """Return the hypotheses of the priors, computed once per set of points and number of days.
@@ -561,16 +566,11 @@ class JointFit:
             arms = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
             offsets = {0.0: 1.0 - OFFSET, OFFSET_MPS: OFFSET} if seen_climbing else {0.0: 1.0}
             paths = {0.0: 1.0 - SLOWLY - CLIMBS, SLOW_MPS: SLOWLY, CLIMB_MPS: CLIMBS} if seen_climbing else {0.0: 1.0}
-            cases = list(product(arms, offsets, paths))
-            priors = [self._by_prior(points, arm, offset) for arm, offset, _ in cases]
+            cases = list(itertools.product(arms, offsets))
+            priors = [self._by_prior(points, arm, offset) for arm, offset in cases]
             information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
-            self._known[key] = _Hypotheses(
-                information,
-                vector,
-                log_det,
-                np.log([arms[arm] * offsets[offset] * paths[path] for arm, offset, path in cases]),
-                np.array([path for *_, path in cases]),
-            )
+            odds = np.log([[arms[arm] * offsets[offset] * path for path in paths.values()] for arm, offset in cases])
+            self._known[key] = _Hypotheses(information, vector, log_det, odds, np.array([*paths]))
         return self._known[key]
 
     def _by_prior(self, points: slice, tape_std: float, offset_std: float) -> tuple[Array, Array, Array]:
