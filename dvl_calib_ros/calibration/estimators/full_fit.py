@@ -215,7 +215,7 @@ class JointFit:
             return
         x = self._linear[self._of_day(len(self._days) - 1)]
         day.blocks[-1] = block = self._without_contradicted(day, block, x)
-        self._add_parts(day, self._parts(block, x), x)
+        self._add_parts(day, self._parts([block], x), x)
         self._solve()
         if self._is_far():
             self._renew()
@@ -327,7 +327,7 @@ class JointFit:
         self._misfit = 0.0
         for number, day in enumerate(self._days):
             x = self._linear[self._of_day(number)]
-            parts = [part for block in day.blocks for part in self._parts(block, x)]
+            parts = self._parts(day.blocks, x)
             day.sections, day.chain = [], None if day.before is None else day.before[0]
             day.end_s = day.begin_s
             self._measure_noise(day, parts)
@@ -362,21 +362,22 @@ class JointFit:
 
     def _misfits(self, day: _Day, block: FitBlock, x: Array) -> tuple[Array, Array]:
         """Return times (J,) s and squared residuals (J,) of a block's references about a state (20,)."""
-        parts = [part for part in self._parts(block, x) if part.rows is not None]
+        parts = [part for part in self._parts([block], x) if part.rows is not None]
         if not parts:
             return np.zeros(0), np.zeros(0)
         times = np.concatenate([part.rows.times for part in parts if part.rows is not None])
         return times, np.concatenate([part.misfit(day.single) for part in parts])
 
-    def _parts(self, block: FitBlock, x: Array) -> list[SectionRows]:
-        """Return the sections of a block about a state (20,) of its day."""
-        rows = predicted(block, x, self._parameters)
-        starts = section_starts(block)
-        if rows is None:
-            return [SectionRows(from_s, None, block) for from_s in starts]
-        bounds = np.searchsorted(rows.times, [*starts, block.end_s + 1e-9]).tolist()
-        each = (rows.part(slice(a, b)) if b > a else None for a, b in itertools.pairwise(bounds))
-        return [SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
+    def _parts(self, blocks: Sequence[FitBlock], x: Array) -> list[SectionRows]:
+        """Return the sections of blocks about a state (20,) of their day."""
+        found = []
+        for block, rows in zip(blocks, predicted(blocks, x, self._parameters), strict=True):
+            starts = section_starts(block)
+            bounds = [*starts, block.end_s + 1e-9]
+            none = [None] * len(starts)
+            each = none if rows is None else rows.parts(np.searchsorted(rows.times, bounds).tolist())
+            found += [SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
+        return found
 
     def _measure_noise(self, day: _Day, parts: Sequence[SectionRows]) -> None:
         """Estimate the white noise of single rows and of bins from their scatter within sections."""
@@ -471,10 +472,9 @@ class JointFit:
                 published = state.x.copy()
                 published[NOT_TAKEN_OFF] = 0.0
                 nominal = np.zeros(N_STATE)
-                for block in day.blocks:
-                    if not (block.fold == fold).any():
-                        continue
-                    before, after = (predicted(block, x, self._parameters) for x in (nominal, published))
+                blocks = [block for block in day.blocks if (block.fold == fold).any()]
+                both = [predicted(blocks, x, self._parameters) for x in (nominal, published)]
+                for block, before, after in zip(blocks, *both, strict=True):
                     if before is None or after is None:
                         continue
                     sums.add(before, after, fold, state, day.single, slow_variance)
@@ -494,7 +494,7 @@ class JointFit:
                 continue
             x = self._x[self._of_day(number)]
             at = np.append(self._of_day(number), effects)
-            for part in (part for block in day.blocks for part in self._parts(block, x)):
+            for part in self._parts(day.blocks, x):
                 if part.rows is None:
                     continue
                 gram = effects_gram(part, effect_velocities, x, day.single, day.white, self._slow.part(points))
