@@ -157,6 +157,7 @@ class JointFit:
         self.used = self._gated = self._left_out = 0
         self._misfit = 0.0
         self._fitted: JointEstimate | None = None
+        self._without: tuple[JointEstimate | None, list[list[GaussianState]]] | None = None
 
     def _points(self) -> tuple[SlowErrors, Array, Array]:
         """Return slow errors (C, 6), scales of heading deviation (C,) and log importance weights (C,) of the points."""
@@ -282,7 +283,8 @@ class JointFit:
     def _renew(self) -> None:
         """Run Gauss-Newton from the newest estimate over all blocks whose streams are kept."""
         self._forget()
-        self._search_delay(self._days[-1])
+        place = self._of_day(len(self._days) - 1)[DELAY]
+        self._x[place] = better_delay(self._days[-1].blocks, float(self._x[place]), self._parameters)
         last = np.zeros_like(self._x)
         for _ in range(STEPS):
             self._linearise()
@@ -314,11 +316,6 @@ class JointFit:
                         for fold, each in enumerate(before, start=-1)
                     ]
                 day.before = before
-
-    def _search_delay(self, day: _Day) -> None:
-        """Start from another DVL delay if it fits significantly better than the current one."""
-        place = self._of_day(len(self._days) - 1)[DELAY]
-        self._x[place] = better_delay(day.blocks, float(self._x[place]), self._parameters)
 
     def _linearise(self) -> None:
         """Linearise all blocks about the newest estimate."""
@@ -436,22 +433,24 @@ class JointFit:
         return slice(likeliest, likeliest + 1)
 
     def without_folds(self) -> list[list[GaussianState]]:
-        """Return, per fold, the states (20,) of every day from all other folds."""
-        points = self._likeliest
-        slow = self._slow.part(points)
-        found = []
-        for fold in range(FOLDS):
+        """Return, per fold, the states (20,) of every day from all other folds, computed once per estimate."""
+        if self._without is None or self._without[0] is not self._fitted:
+            points, folds = self._likeliest, np.arange(FOLDS)
+            slow = SlowErrors(*(np.repeat(each[points], FOLDS, axis=0) for each in self._slow))
             ended: list[Eliminated | None] = []
             for day in self._days:
-                if day.chain is None:
-                    ended.append(None)
-                    continue
-                chain = Chain.begun(slow) if day.before is None else day.before[1 + fold].part(points)
+                chain = Chain.begun(slow)
+                if day.before is not None:
+                    each = (chain_of.part(points) for chain_of in day.before[1:])
+                    chain = Chain(*map(np.concatenate, zip(*each, strict=True)))
                 for section in day.sections:
-                    chain = chain.after(None if section.fold == fold else section.gram, section.seconds, slow)
-                ended.append(chain.ended())
-            found.append(self._by_day(self._mixture(ended, points, self._climbs(fold)).state))
-        return found
+                    gram = None if section.gram is None else section.gram * (folds != section.fold)[:, None, None]
+                    chain = chain.after(gram, section.seconds, slow)
+                ended.append(None if day.chain is None else chain.ended())
+            own = [[each and each.part(fold) for each in ended] for fold in range(FOLDS)]
+            found = [self._mixture(each, points, self._climbs(fold)) for fold, each in enumerate(own)]
+            self._without = self._fitted, [self._by_day(each.state) for each in found]
+        return self._without[1]
 
     def held_out_error(self) -> HeldOutError | None:
         """Return the velocity error on references, each by states fitted without its fold; None if too few.

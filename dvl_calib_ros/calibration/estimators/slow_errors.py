@@ -158,6 +158,10 @@ class Eliminated(NamedTuple):
     gram: Array
     log_determinant: Array
 
+    def part(self, point: int) -> Eliminated:
+        """Return those of one point."""
+        return Eliminated(self.gram[point : point + 1], self.log_determinant[point : point + 1])
+
 
 class Chain(NamedTuple):
     """Chain of sections up to a knot: Gram matrix (C, 27, 27) over [slow errors there, states, residual]."""
@@ -178,7 +182,10 @@ class Chain(NamedTuple):
         return Chain(self.gram[points], self.log_determinant[points])
 
     def after(self, gram: Array | None, seconds: float, slow: SlowErrors) -> Chain:
-        """Return the chain with one more section (WIDTH, WIDTH) of this length; None for a section without rows."""
+        """Return the chain with one more section of this length.
+
+        gram: (WIDTH, WIDTH), or (C, WIDTH, WIDTH) at each point; None for a section without rows.
+        """
         own = np.arange(SLOW)
         memory = np.exp(-seconds / slow.memory_s)
         driven = slow.std**2 * (1.0 - memory**2)
@@ -188,9 +195,9 @@ class Chain(NamedTuple):
         side[:, own, own] = -memory / driven
         rest[:, own, own] = 1.0 / driven
         if gram is not None:
-            head += gram[:SLOW, :SLOW]
-            side += gram[:SLOW, SLOW:]
-            rest += gram[SLOW:, SLOW:]
+            head += gram[..., :SLOW, :SLOW]
+            side += gram[..., :SLOW, SLOW:]
+            rest += gram[..., SLOW:, SLOW:]
         without, more = _without(head, side, rest)
         return Chain(without, self.log_determinant + np.log(driven).sum(axis=1) + more)
 
