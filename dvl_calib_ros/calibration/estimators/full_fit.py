@@ -211,6 +211,7 @@ class JointFit:
         """Add a block to its day, and renew the point of linearisation if due."""
         day.blocks.append(block)
         day.count += 1
+        self._forget()
         if day.count & (day.count - 1) == 0:
             self._renew()
             return
@@ -282,7 +283,6 @@ class JointFit:
 
     def _renew(self) -> None:
         """Run Gauss-Newton from the newest estimate over all blocks whose streams are kept."""
-        self._forget()
         place = self._of_day(len(self._days) - 1)[DELAY]
         self._x[place] = better_delay(self._days[-1].blocks, float(self._x[place]), self._parameters)
         last = np.zeros_like(self._x)
