@@ -10,7 +10,7 @@ import numpy as np
 
 from ..models.parameters import Parameters
 from ..numerics.frames import Array, product
-from .full_forward_model import FitBlock, attitude_of, dvl_at
+from .full_forward_model import FitBlock, JoinedBlocks, joined_blocks
 
 # Grid of delays, s, for up to SEARCHED_BLOCKS blocks. A delay is taken if its chi-square is smaller by CLEARLY, where
 # ALIKE_ROWS correlated rows count as one independent row. FEWEST_ROWS rows are needed.
@@ -23,7 +23,7 @@ def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameter
     """Return the DVL delay (s) that fits significantly better than the current one, or the current one."""
     if len(blocks) > SEARCHED_BLOCKS:
         return delay
-    rows = [own for block in blocks if (own := _beside(block, parameters)) is not None]
+    rows = [_beside(joined, parameters) for _, joined in joined_blocks(blocks)]
     squares = _left_by_delay(rows) if rows else None
     if squares is None:
         return delay
@@ -42,21 +42,16 @@ class _Beside(NamedTuple):
     rates: Array
 
 
-def _beside(block: FitBlock, parameters: Parameters) -> _Beside | None:
-    """Return a block's references with the DVL at every delay; None without a comparable reference."""
-    times = block.reference.times
-    if not len(times) or len(block.dvl.times) < 4 or len(block.imu.times) < 2:
-        return None
-    rotation, oriented, rates, turning_known = attitude_of(block, times, parameters.imu_timeout)
-    asked = (times + DELAYS_S[:, None]).ravel()
-    seen = dvl_at(block, asked)
-    known = seen.known.reshape(len(DELAYS_S), -1).all(axis=0) & (oriented | block.reference.in_body)
-    known &= turning_known & block.measured[:, :2].all(axis=1)
-    if not known.any():
-        return None
-    onto = np.where(block.reference.in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
-    body = product(onto, np.where(block.measured, block.reference.velocity, 0.0))
-    return _Beside(body[known], seen.value.reshape(len(DELAYS_S), -1, 3)[:, known], rates[known])
+def _beside(joined: JoinedBlocks, parameters: Parameters) -> _Beside:
+    """Return the comparable references of blocks with the DVL at every delay."""
+    reference = joined.reference
+    rotation, oriented, rates, _, turning_known = joined.attitude_at(reference.times, parameters.imu_timeout)
+    seen = joined.dvl_at(reference.times + DELAYS_S[:, None])
+    known = seen.known.all(axis=0) & (oriented | reference.in_body)
+    known &= turning_known & joined.measured[:, :2].all(axis=1)
+    onto = np.where(reference.in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
+    body = product(onto, np.where(joined.measured, reference.velocity, 0.0))
+    return _Beside(body[known], seen.value[:, known], rates[known])
 
 
 def _left_by_delay(each: Sequence[_Beside]) -> Array | None:

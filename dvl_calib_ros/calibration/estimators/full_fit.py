@@ -7,10 +7,10 @@ a power of two, or when the estimate has moved away from it. Both depend on the 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise, product
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from ..filters.cross_validation import FOLDS, HeldOutError
 from ..models.own import DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, REFERENCE_ERROR, SCALE
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import TimeBlocks
-from ..numerics.frames import Array
+from ..numerics.frames import Array, product
 from ..numerics.kalman import GaussianState, covariance_of
 from ..numerics.robust import MEDIAN_DISTANCE
 from ..numerics.samples import Index
@@ -114,10 +114,10 @@ class _Climb(NamedTuple):
 
 
 class _Hypotheses(NamedTuple):
-    """A combinations of priors, at C points of the slow errors, over n states.
+    """A combinations of priors and B paths of the vehicle, at C points of the slow errors, over n states.
 
-    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C). log_odds: (A,).
-    climb_mps: (A,) m/s, σ of a day's mean climb.
+    information: (A, C, n, n), its product with the state (A, C, n), and -log determinant (A, C). log_odds: (A, B).
+    climb_mps: (B,) m/s, σ of a day's mean climb.
     """
 
     information: Array
@@ -156,6 +156,7 @@ class JointFit:
         self.used = self._gated = self._left_out = 0
         self._misfit = 0.0
         self._fitted: JointEstimate | None = None
+        self._without: tuple[JointEstimate | None, list[list[GaussianState]]] | None = None
 
     def _points(self) -> tuple[SlowErrors, Array, Array]:
         """Return slow errors (C, 6), scales of heading deviation (C,) and log importance weights (C,) of the points."""
@@ -209,12 +210,13 @@ class JointFit:
         """Add a block to its day, and renew the point of linearisation if due."""
         day.blocks.append(block)
         day.count += 1
+        self._forget()
         if day.count & (day.count - 1) == 0:
             self._renew()
             return
         x = self._linear[self._of_day(len(self._days) - 1)]
         day.blocks[-1] = block = self._without_contradicted(day, block, x)
-        self._add_parts(day, self._parts(block, x), x)
+        self._add_parts(day, self._parts([block], x), x)
         self._solve()
         if self._is_far():
             self._renew()
@@ -280,8 +282,8 @@ class JointFit:
 
     def _renew(self) -> None:
         """Run Gauss-Newton from the newest estimate over all blocks whose streams are kept."""
-        self._forget()
-        self._search_delay(self._days[-1])
+        place = self._of_day(len(self._days) - 1)[DELAY]
+        self._x[place] = better_delay(self._days[-1].blocks, float(self._x[place]), self._parameters)
         last = np.zeros_like(self._x)
         for _ in range(STEPS):
             self._linearise()
@@ -314,11 +316,6 @@ class JointFit:
                     ]
                 day.before = before
 
-    def _search_delay(self, day: _Day) -> None:
-        """Start from another DVL delay if it fits significantly better than the current one."""
-        place = self._of_day(len(self._days) - 1)[DELAY]
-        self._x[place] = better_delay(day.blocks, float(self._x[place]), self._parameters)
-
     def _linearise(self) -> None:
         """Linearise all blocks about the newest estimate."""
         self._linear = self._x.copy()
@@ -326,7 +323,7 @@ class JointFit:
         self._misfit = 0.0
         for number, day in enumerate(self._days):
             x = self._linear[self._of_day(number)]
-            parts = [part for block in day.blocks for part in self._parts(block, x)]
+            parts = self._parts(day.blocks, x)
             day.sections, day.chain = [], None if day.before is None else day.before[0]
             day.end_s = day.begin_s
             self._measure_noise(day, parts)
@@ -361,21 +358,22 @@ class JointFit:
 
     def _misfits(self, day: _Day, block: FitBlock, x: Array) -> tuple[Array, Array]:
         """Return times (J,) s and squared residuals (J,) of a block's references about a state (20,)."""
-        parts = [part for part in self._parts(block, x) if part.rows is not None]
+        parts = [part for part in self._parts([block], x) if part.rows is not None]
         if not parts:
             return np.zeros(0), np.zeros(0)
         times = np.concatenate([part.rows.times for part in parts if part.rows is not None])
         return times, np.concatenate([part.misfit(day.single) for part in parts])
 
-    def _parts(self, block: FitBlock, x: Array) -> list[SectionRows]:
-        """Return the sections of a block about a state (20,) of its day."""
-        rows = predicted(block, x, self._parameters)
-        starts = section_starts(block)
-        if rows is None:
-            return [SectionRows(from_s, None, block) for from_s in starts]
-        bounds = np.searchsorted(rows.times, [*starts, block.end_s + 1e-9]).tolist()
-        each = (rows.part(slice(a, b)) if b > a else None for a, b in pairwise(bounds))
-        return [SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
+    def _parts(self, blocks: Sequence[FitBlock], x: Array) -> list[SectionRows]:
+        """Return the sections of blocks about a state (20,) of their day."""
+        found = []
+        for block, rows in zip(blocks, predicted(blocks, x, self._parameters), strict=True):
+            starts = section_starts(block)
+            bounds = [*starts, block.end_s + 1e-9]
+            none = [None] * len(starts)
+            each = none if rows is None else rows.parts(np.searchsorted(rows.times, bounds).tolist())
+            found += [SectionRows(from_s, part, block) for from_s, part in zip(starts, each, strict=True)]
+        return found
 
     def _measure_noise(self, day: _Day, parts: Sequence[SectionRows]) -> None:
         """Estimate the white noise of single rows and of bins from their scatter within sections."""
@@ -434,22 +432,24 @@ class JointFit:
         return slice(likeliest, likeliest + 1)
 
     def without_folds(self) -> list[list[GaussianState]]:
-        """Return, per fold, the states (20,) of every day from all other folds."""
-        points = self._likeliest
-        slow = self._slow.part(points)
-        found = []
-        for fold in range(FOLDS):
+        """Return, per fold, the states (20,) of every day from all other folds, computed once per estimate."""
+        if self._without is None or self._without[0] is not self._fitted:
+            points, folds = self._likeliest, np.arange(FOLDS)
+            slow = SlowErrors(*(np.repeat(each[points], FOLDS, axis=0) for each in self._slow))
             ended: list[Eliminated | None] = []
             for day in self._days:
-                if day.chain is None:
-                    ended.append(None)
-                    continue
-                chain = Chain.begun(slow) if day.before is None else day.before[1 + fold].part(points)
+                chain = Chain.begun(slow)
+                if day.before is not None:
+                    each = (chain_of.part(points) for chain_of in day.before[1:])
+                    chain = Chain(*map(np.concatenate, zip(*each, strict=True)))
                 for section in day.sections:
-                    chain = chain.after(None if section.fold == fold else section.gram, section.seconds, slow)
-                ended.append(chain.ended())
-            found.append(self._by_day(self._mixture(ended, points, self._climbs(fold)).state))
-        return found
+                    gram = None if section.gram is None else section.gram * (folds != section.fold)[:, None, None]
+                    chain = chain.after(gram, section.seconds, slow)
+                ended.append(None if day.chain is None else chain.ended())
+            own = [[each and each.part(fold) for each in ended] for fold in range(FOLDS)]
+            found = [self._mixture(each, points, self._climbs(fold)) for fold, each in enumerate(own)]
+            self._without = self._fitted, [self._by_day(each.state) for each in found]
+        return self._without[1]
 
     def held_out_error(self) -> HeldOutError | None:
         """Return the velocity error on references, each by states fitted without its fold; None if too few.
@@ -470,10 +470,9 @@ class JointFit:
                 published = state.x.copy()
                 published[NOT_TAKEN_OFF] = 0.0
                 nominal = np.zeros(N_STATE)
-                for block in day.blocks:
-                    if not (block.fold == fold).any():
-                        continue
-                    before, after = (predicted(block, x, self._parameters) for x in (nominal, published))
+                blocks = [block for block in day.blocks if (block.fold == fold).any()]
+                both = [predicted(blocks, x, self._parameters) for x in (nominal, published)]
+                for block, before, after in zip(blocks, *both, strict=True):
                     if before is None or after is None:
                         continue
                     sums.add(before, after, fold, state, day.single, slow_variance)
@@ -493,7 +492,7 @@ class JointFit:
                 continue
             x = self._x[self._of_day(number)]
             at = np.append(self._of_day(number), effects)
-            for part in (part for block in day.blocks for part in self._parts(block, x)):
+            for part in self._parts(day.blocks, x):
                 if part.rows is None:
                     continue
                 gram = effects_gram(part, effect_velocities, x, day.single, day.white, self._slow.part(points))
@@ -521,33 +520,38 @@ class JointFit:
     def _mixture(self, ended: Sequence[Eliminated | None], points: slice, climbs: Sequence[_Climb]) -> JointEstimate:
         """Return mean and covariance over points of the slow errors and over the hypotheses of the priors."""
         known = self._hypotheses(points, bool(climbs))
-        information, vector, log_det = known.information.copy(), known.vector.copy(), known.log_det.copy()
-        square = np.zeros(information.shape[:2])
-        for climb in climbs:
-            variance = np.maximum(climb.std, known.climb_mps)[:, None] ** 2
-            h, at = climb.row[:-1], climb.at
-            information[:, :, at[:, None], at] += np.outer(h, h) / variance[:, :, None, None]
-            vector[:, :, at] -= climb.row[-1] * h / variance[:, :, None]
-            square += climb.row[-1] ** 2 / variance
-            log_det += np.log(variance)
+        information, vector = known.information.copy(), known.vector.copy()
+        left = known.log_det.copy()
         for number, each in enumerate(ended):
             if each is not None:
                 at = self._of_day(number)
                 information[:, :, at[:, None], at] += each.gram[:, :N_STATE, :N_STATE]
                 vector[:, :, at] += each.gram[:, :N_STATE, N_STATE]
-                square += each.gram[:, N_STATE, N_STATE]
-                log_det += each.log_determinant
+                left += each.gram[:, N_STATE, N_STATE] + each.log_determinant
         covariance = covariance_of(information, known.information)
-        x = (covariance @ vector[..., None])[..., 0]
-        left = square - (x * vector).sum(axis=-1)
-        odds = known.log_odds[:, None] + self._log_prior[points]
-        evidence = odds - 0.5 * (left + log_det + np.linalg.slogdet(information)[1])
+        x = product(covariance, vector)
+        left += np.linalg.slogdet(information)[1] - (x * vector).sum(axis=-1)
+        # a mean climb of zero is a measurement, with a variance by path
+        h = np.zeros((len(climbs), x.shape[-1]))
+        for row, climb in zip(h, climbs, strict=True):
+            row[climb.at] = climb.row[:-1]
+        climbing = x @ h.T + [climb.row[-1] for climb in climbs]
+        along = covariance @ h.T
+        std = np.maximum([climb.std for climb in climbs], known.climb_mps[:, None])
+        innovation = (h @ along)[:, None] + (std[:, None, :, None] ** 2 * np.eye(len(h)))
+        inverse = np.linalg.inv(innovation)
+        by_climb = product(inverse, climbing[:, None])
+        left = left[:, None] + (climbing[:, None] * by_climb).sum(axis=-1) + np.linalg.slogdet(innovation)[1]
+        x = x[:, None] - product(along[:, None], by_climb)
+        evidence = known.log_odds[:, :, None] + self._log_prior[points] - 0.5 * left
         weights = np.exp(evidence - evidence.max())
         weights /= weights.sum()
-        mean = np.tensordot(weights, x)
-        spread = x - mean
-        p = np.tensordot(weights, covariance) + np.einsum("ac,aci,acj->ij", weights, spread, spread)
-        return JointEstimate(GaussianState(mean, 0.5 * (p + p.T)), weights.sum(axis=0))
+        mean = np.tensordot(weights, x, 3)
+        spread = (x - mean).reshape(-1, len(mean))
+        p = np.tensordot(weights.sum(axis=1), covariance) + (spread.T * weights.ravel()) @ spread
+        of_climb = along @ (weights[..., None, None] * inverse).sum(axis=1)
+        p -= np.tensordot(of_climb, along, ((0, 1, 3), (0, 1, 3)))
+        return JointEstimate(GaussianState(mean, 0.5 * (p + p.T)), weights.sum(axis=(0, 1)))
 
     def _hypotheses(self, points: slice, seen_climbing: bool) -> _Hypotheses:
         """Return the hypotheses of the priors, computed once per set of points and number of days.
@@ -560,16 +564,11 @@ class JointFit:
             arms = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
             offsets = {0.0: 1.0 - OFFSET, OFFSET_MPS: OFFSET} if seen_climbing else {0.0: 1.0}
             paths = {0.0: 1.0 - SLOWLY - CLIMBS, SLOW_MPS: SLOWLY, CLIMB_MPS: CLIMBS} if seen_climbing else {0.0: 1.0}
-            cases = list(product(arms, offsets, paths))
-            priors = [self._by_prior(points, arm, offset) for arm, offset, _ in cases]
+            cases = list(itertools.product(arms, offsets))
+            priors = [self._by_prior(points, arm, offset) for arm, offset in cases]
             information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))
-            self._known[key] = _Hypotheses(
-                information,
-                vector,
-                log_det,
-                np.log([arms[arm] * offsets[offset] * paths[path] for arm, offset, path in cases]),
-                np.array([path for *_, path in cases]),
-            )
+            odds = np.log([[arms[arm] * offsets[offset] * path for path in paths.values()] for arm, offset in cases])
+            self._known[key] = _Hypotheses(information, vector, log_det, odds, np.array([*paths]))
         return self._known[key]
 
     def _by_prior(self, points: slice, tape_std: float, offset_std: float) -> tuple[Array, Array, Array]:

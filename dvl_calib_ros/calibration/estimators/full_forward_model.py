@@ -6,9 +6,12 @@ alone. The DVL's velocity is interpolated by a cubic spline: a straight line los
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from itertools import accumulate, pairwise
+from types import EllipsisType
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +29,7 @@ from ..models.own import (
     heading_cycles,
 )
 from ..models.parameters import Parameters
-from ..numerics.frames import Array, cross, rotation_from_quaternion, skew, squared
+from ..numerics.frames import Array, cross, rotation_from_quaternion, skew, squared, turned_skew
 from ..numerics.kalman import GaussianState
 from ..numerics.robust import MEDIAN_SQUARE, robust_std
 from ..numerics.samples import Index, Mask
@@ -44,6 +47,8 @@ DENSE_S = 0.15
 FEWEST_DVL, SLOW_S, SUSPICIOUS, LEAST_SCATTER_MPS = 8, 0.45, 6.0, 0.03
 # Half-width of the difference for the DVL's acceleration: s, and intervals of the DVL.
 SLOPE_REACH_S, SLOPE_INTERVALS = 0.5, 2.0
+# Blocks that are predicted at once: more do not fit the processor's caches.
+AT_ONCE = 16
 # Longest gap of the DVL that is interpolated: the larger of this number of its usual intervals and this time, s.
 GAP_INTERVALS, GAP_S = 3.0, 1.2
 
@@ -86,9 +91,14 @@ class FitBlock:
         return replace(self, dvl=dvl, slope=spline_slopes(*dvl))
 
     @cached_property
-    def imu_values(self) -> Array:
-        """(M, 7) quaternion and angular velocity of the IMU, as in `imu_slope`."""
-        return np.hstack([self.imu.orientation, self.imu.angular_velocity])
+    def is_comparable(self) -> bool:
+        """Whether it has references, and enough samples to interpolate at."""
+        return len(self.dvl.times) >= 4 and len(self.imu.times) >= 2 and len(self.reference.times) > 0
+
+    @cached_property
+    def has_attitude(self) -> bool:
+        """Whether the IMU has an attitude."""
+        return not np.isnan(self.imu.orientation).any()
 
     @cached_property
     def slope_reach_s(self) -> float:
@@ -129,10 +139,12 @@ class PredictedRows(NamedTuple):
     oriented: Mask
     dvl: Array
 
-    def part(self, at: slice) -> PredictedRows:
-        """Return the rows of a slice."""
-        t, r, c, s, w, f, u, o, d = self
-        return PredictedRows(t[at], r[at], c[at], s[at], w[at], f[at], u[at], o[at], d[at])
+    def parts(self, bounds: Sequence[int]) -> list[PredictedRows | None]:
+        """Return the rows between each two bounds; None for no rows."""
+        return [
+            PredictedRows._make(column[first:last] for column in self) if last > first else None
+            for first, last in pairwise(bounds)
+        ]
 
 
 def spline_slopes(times: Array, values: Array) -> Array:
@@ -161,95 +173,149 @@ def spline_slopes(times: Array, values: Array) -> Array:
 
 
 class AtTimes(NamedTuple):
-    """Interpolated values (J, k), and whether they are known (J,)."""
+    """Interpolated values (..., J, k), and whether they are known (..., J)."""
 
     value: Array
     known: Mask
 
 
-def spline_at(stamps: Array, values: Array, slope: Array, times: Array, gap_s: float) -> AtTimes:
-    """Interpolate a cubic spline at times (J,) s; unknown outside the samples and across gaps longer than gap_s.
-
-    stamps: (N,) s. values, slope: (N, k), see `spline_slopes`.
-    """
-    after = np.minimum(np.maximum(stamps.searchsorted(times), 1), len(stamps) - 1)
-    before = after - 1
-    begin = stamps.take(before)
-    step = stamps.take(after) - begin
-    part = ((times - begin) / step)[:, None]
-    rest = 1.0 - part
-    value = (
-        values.take(before, axis=0) * (rest * rest * (1.0 + 2.0 * part))
-        + values.take(after, axis=0) * (part * part * (1.0 + 2.0 * rest))
-        + step[:, None] * part * rest * (slope.take(before, axis=0) * rest - slope.take(after, axis=0) * part)
-    )
-    return AtTimes(value, (times >= stamps[0]) & (times <= stamps[-1]) & (step <= gap_s))
-
-
-def dvl_at(block: FitBlock, times: Array) -> AtTimes:
-    """Interpolate the DVL's velocity (J, 3) m/s at times (J,) s."""
-    return spline_at(*block.dvl, block.slope, times, max(GAP_INTERVALS * block.interval_s, GAP_S))
-
-
 class Attitude(NamedTuple):
     """Attitude and angular velocity at J times.
 
-    rotation: (J, 3, 3) ``rotation_enu_from_body``, known where oriented (J,). rates: (J, 3) rad/s, known (J,).
+    rotation: (J, 3, 3) ``rotation_enu_from_body``, known where oriented (J,). rates: (J, 3) rad/s, and turning: (J, 3)
+    rad/s², known (J,).
     """
 
     rotation: Array
     oriented: Mask
     rates: Array
+    turning: Array
     known: Mask
 
 
-def attitude_of(block: FitBlock, times: Array, gap_s: float) -> Attitude:
-    """Interpolate attitude and angular velocity at times (J,) s.
+class JoinedBlocks:
+    """Streams of B blocks, interpolated at times of their J references.
 
-    A spline, because at 1 Hz linear interpolation of attitude is wrong by a degree at the start of a turn.
+    One call for many blocks is several times faster than one for each. rows: references of each block. reference,
+    measured: (J,) columns of all blocks, see `FitBlock`.
     """
-    imu, n = block.imu, len(times)
-    if np.isnan(imu.orientation).any():  # no attitude; references in body axes need none
-        rates = spline_at(imu.times, imu.angular_velocity, block.imu_slope[:, 4:], times, gap_s)
-        return Attitude(np.broadcast_to(np.eye(3), (n, 3, 3)), np.zeros(n, dtype=bool), *rates)
-    both, known = spline_at(imu.times, block.imu_values, block.imu_slope, times, gap_s)
-    q = both[:, :4] / np.sqrt(squared(both[:, :4]))[:, None]
-    return Attitude(rotation_from_quaternion(q), known, both[:, 4:], known)
+
+    def __init__(self, blocks: Sequence[FitBlock]) -> None:
+        self.blocks = blocks
+        self._counts = [len(block.reference.times) for block in blocks]
+        self.rows = [slice(end - n, end) for n, end in zip(self._counts, accumulate(self._counts), strict=True)]
+        self.reference = ReferenceColumns(
+            *map(np.concatenate, zip(*(block.reference for block in blocks), strict=True))
+        )
+        self.measured = np.concatenate([block.measured for block in blocks])
+
+    def by_row(self, of_blocks: Sequence[Any]) -> NDArray[Any]:
+        """Return values (J,) of the block of each reference."""
+        return np.repeat(of_blocks, self._counts)
+
+    def dvl_at(self, times: Array) -> AtTimes:
+        """Interpolate the DVL's velocity (..., J, 3) m/s at times (..., J) s."""
+        gap_s = self.by_row([max(GAP_INTERVALS * block.interval_s, GAP_S) for block in self.blocks])
+        spline = _Spline(self, [block.dvl.times for block in self.blocks], times, gap_s)
+        return AtTimes(spline.of([(block.dvl.velocity, block.slope) for block in self.blocks]), spline.known)
+
+    def attitude_at(self, times: Array, gap_s: float) -> Attitude:
+        """Interpolate attitude, angular velocity and acceleration at times (J,) s.
+
+        A spline, because at 1 Hz linear interpolation of attitude is wrong by a degree at the start of a turn.
+        """
+        around = times + np.array([[0.0], [-TURNING_S], [TURNING_S]])
+        spline = _Spline(self, [block.imu.times for block in self.blocks], around, gap_s)
+        rates, before, after = spline.of(
+            [(block.imu.angular_velocity, block.imu_slope[:, 4:]) for block in self.blocks]
+        )
+        q = spline.of([(block.imu.orientation, block.imu_slope[:, :4]) for block in self.blocks], 0)
+        rotation = rotation_from_quaternion(q / np.sqrt(squared(q))[:, None])
+        # references in body axes need no attitude
+        has = self.by_row([block.has_attitude for block in self.blocks])
+        rotation[~has] = np.eye(3)
+        known = spline.known[0]
+        return Attitude(rotation, known & has, rates, (after - before) / (2.0 * TURNING_S), known)
 
 
-def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRows | None:
-    """Return the rows of a block about a state x (20,); None without a comparable reference."""
-    reference = block.reference
+class _Spline:
+    """Cubic spline through samples of joined blocks; unknown outside the samples and across gaps longer than gap_s."""
+
+    def __init__(self, joined: JoinedBlocks, stamps: Sequence[Array], times: Array, gap_s: Array | float) -> None:
+        """Find the samples beside times (..., J) s. stamps: (N,) s of each block. gap_s: (J,)."""
+        lengths = [len(own) for own in stamps]
+        last = joined.by_row([*accumulate(lengths)]) - 1
+        first = last - joined.by_row(lengths) + 1
+        after = np.empty(times.shape, dtype=np.intp)
+        for own, at in zip(stamps, joined.rows, strict=True):
+            after[..., at] = own.searchsorted(times[..., at])
+        after = np.minimum(np.maximum(after, 1) + first, last)
+        every = np.concatenate(stamps)
+        begin = every.take(after - 1)
+        step = every.take(after) - begin
+        self._after, self._step, self._part = after, step[..., None], ((times - begin) / step)[..., None]
+        self.known = (times >= every.take(first)) & (times <= every.take(last)) & (step <= gap_s)
+
+    def of(self, columns: Sequence[tuple[Array, Array]], row: EllipsisType | int = ...) -> Array:
+        """Interpolate values (N, k) of each block with slopes (N, k), see `spline_slopes`, at one row of the times."""
+        values, slope = (np.concatenate(each) for each in zip(*columns, strict=True))
+        after, step, part = self._after[row], self._step[row], self._part[row]
+        before, rest = after - 1, 1.0 - part
+        found: Array = (
+            values.take(before, axis=0) * (rest * rest * (1.0 + 2.0 * part))
+            + values.take(after, axis=0) * (part * part * (1.0 + 2.0 * rest))
+            + step * part * rest * (slope.take(before, axis=0) * rest - slope.take(after, axis=0) * part)
+        )
+        return found
+
+
+def predicted(blocks: Sequence[FitBlock], x: Array, parameters: Parameters) -> list[PredictedRows | None]:
+    """Return the rows of each block about a state x (20,); None without a comparable reference."""
+    found: list[PredictedRows | None] = [None] * len(blocks)
+    for numbers, joined in joined_blocks(blocks):
+        for number, rows in zip(numbers, _predicted(joined, x, parameters), strict=True):
+            found[number] = rows
+    return found
+
+
+def joined_blocks(blocks: Sequence[FitBlock]) -> Iterator[tuple[list[int], JoinedBlocks]]:
+    """Yield the numbers of comparable blocks and these blocks, up to AT_ONCE together."""
+    comparable = [number for number, block in enumerate(blocks) if block.is_comparable]
+    for at in range(0, len(comparable), AT_ONCE):
+        numbers = comparable[at : at + AT_ONCE]
+        yield numbers, JoinedBlocks([blocks[number] for number in numbers])
+
+
+def _predicted(joined: JoinedBlocks, x: Array, parameters: Parameters) -> list[PredictedRows | None]:
+    """Return the rows of each of the joined blocks, see `predicted`."""
+    reference = joined.reference
     at = reference.times - x[REFERENCE_DELAY]
-    if len(block.dvl.times) < 4 or len(block.imu.times) < 2 or not len(at):
-        return None
-    rotation, oriented, rates, turning_known = attitude_of(block, at, parameters.imu_timeout)
-    n_all, reach, stamps = len(at), block.slope_reach_s, at + x[DELAY]
-    velocity, known = dvl_at(block, np.concatenate([stamps, stamps - reach, stamps + reach]))
-    use = known[:n_all] & (oriented | reference.in_body) & turning_known
+    rotation, oriented, rates, turning, turning_known = joined.attitude_at(at, parameters.imu_timeout)
+    reach, stamps = joined.by_row([block.slope_reach_s for block in joined.blocks]), at + x[DELAY]
+    velocity, known = joined.dvl_at(np.stack([stamps, stamps - reach, stamps + reach]))
+    use = known[0] & (oriented | reference.in_body) & turning_known
     # by the DVL, which is less noisy: selected by the reference, samples near the limit would bias the scale
-    use &= squared(velocity[:n_all]) >= parameters.min_speed**2
+    use &= squared(velocity[0]) >= parameters.min_speed**2
     if parameters.max_turn_rate > 0.0:
         use &= squared(rates) <= parameters.max_turn_rate**2
-    if not use.any():
-        return None
-    at, rotation, rates, in_body = at[use], rotation[use], rates[use], reference.in_body[use]
-    around = np.concatenate([at - TURNING_S, at + TURNING_S])
-    turns = spline_at(block.imu.times, block.imu.angular_velocity, block.imu_slope[:, 4:], around, np.inf).value
-    turning = (turns[len(at) :] - turns[: len(at)]) / (2.0 * TURNING_S)
+    used = np.flatnonzero(use)
+    bounds = np.searchsorted(used, [0, *(rows.stop for rows in joined.rows)]).tolist()
+    if not len(used):
+        return [None] * len(joined.blocks)
+    rotation, rates, turning, in_body = rotation[used], rates[used], turning[used], reference.in_body[used]
     t = parameters.rotation_dvl_from_body
     inverse = np.linalg.inv(np.eye(3) + skew(x[PHI]))
     gain = 1.0 / (1.0 + np.append(x[SCALE], 0.0))
     arm = np.array(parameters.lever_arm) + x[LEVER_ARM]
-    own_velocity, earlier, later = velocity.reshape(3, n_all, 3)[:, use]
+    own_velocity, earlier, later = velocity[:, used]
     scaled = (own_velocity - x[BIAS]) * gain
     in_dvl = scaled @ inverse.T
     through = t.T @ inverse * gain
-    accelerating = (later - earlier) / (2.0 * reach) @ through.T
+    accelerating = (later - earlier) / (2.0 * reach[used, None]) @ through.T
     body = in_dvl @ t - cross(rates, arm)
-    n = len(at)
+    n = len(used)
     own = np.zeros((n, 3, N_STATE))
-    own[:, :, PHI] = t.T @ inverse @ skew(in_dvl)
+    own[:, :, PHI] = turned_skew(t.T @ inverse, in_dvl.T).transpose(2, 0, 1)
     own[:, :, SCALE] = -(t.T @ inverse)[None, :, :2] * (scaled * gain)[:, None, :2]
     own[:, :, LEVER_ARM] = -skew(rates)
     own[:, :, BIAS] = -through
@@ -257,7 +323,7 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     own[:, :, REFERENCE_DELAY] = cross(turning, arm) - accelerating
     turn = np.where(in_body[:, None], 0.0, 1.0)
     own[:, :, REFERENCE_DELAY] -= turn * cross(rates, body)
-    upwards = rotation[:, 2] * oriented[use, None]
+    upwards = rotation[:, 2] * oriented[used, None]
     up = np.column_stack([np.einsum("ni,nik->nk", upwards, own), (upwards * body).sum(axis=1)])
     cycles = heading_cycles(rotation)
     off = np.where(in_body, 0.0, cycles @ x[HEADING])
@@ -270,11 +336,12 @@ def predicted(block: FitBlock, x: Array, parameters: Parameters) -> PredictedRow
     slow = np.zeros((n, 3, SLOW))
     slow[:, :, :3] = np.eye(3)
     slow[:, :, 3:] = -turn[:, :, None] * skew(predicted_velocity)
-    residual = reference.velocity[use] - predicted_velocity - turn * x[REFERENCE_ERROR]
-    weight = block.measured[use].astype(float)
-    times, fold = reference.times[use], block.fold[use]
+    residual = reference.velocity[used] - predicted_velocity - turn * x[REFERENCE_ERROR]
+    fold = np.concatenate([block.fold for block in joined.blocks])[used]
+    weight = joined.measured[used].astype(float)
     beside = 0.5 * (earlier + later)
-    return PredictedRows(times, residual, columns, slow, weight, fold, up, oriented[use], beside)
+    rows = PredictedRows(reference.times[used], residual, columns, slow, weight, fold, up, oriented[used], beside)
+    return rows.parts(bounds)
 
 
 def _about_up(angle: Array) -> Array:

@@ -158,6 +158,10 @@ class Eliminated(NamedTuple):
     gram: Array
     log_determinant: Array
 
+    def part(self, point: int) -> Eliminated:
+        """Return those of one point."""
+        return Eliminated(self.gram[point : point + 1], self.log_determinant[point : point + 1])
+
 
 class Chain(NamedTuple):
     """Chain of sections up to a knot: Gram matrix (C, 27, 27) over [slow errors there, states, residual]."""
@@ -178,32 +182,32 @@ class Chain(NamedTuple):
         return Chain(self.gram[points], self.log_determinant[points])
 
     def after(self, gram: Array | None, seconds: float, slow: SlowErrors) -> Chain:
-        """Return the chain with one more section (WIDTH, WIDTH) of this length; None for a section without rows."""
-        width = self.gram.shape[1] + SLOW
-        own, first, rest = np.arange(SLOW), slice(SLOW), slice(2 * SLOW, width)
+        """Return the chain with one more section of this length.
+
+        gram: (WIDTH, WIDTH), or (C, WIDTH, WIDTH) at each point; None for a section without rows.
+        """
+        own = np.arange(SLOW)
         memory = np.exp(-seconds / slow.memory_s)
         driven = slow.std**2 * (1.0 - memory**2)
-        joint = np.zeros((len(self.gram), width, width))
+        head, side, rest = self.gram[:, :SLOW, :SLOW].copy(), self.gram[:, :SLOW].copy(), self.gram.copy()
+        side[:, :, :SLOW] = rest[:, :SLOW] = rest[:, :, :SLOW] = 0.0
+        head[:, own, own] += memory**2 / driven
+        side[:, own, own] = -memory / driven
+        rest[:, own, own] = 1.0 / driven
         if gram is not None:
-            joint += gram
-        joint[:, first, first] += self.gram[:, :SLOW, :SLOW]
-        joint[:, first, rest] += self.gram[:, :SLOW, SLOW:]
-        joint[:, rest, first] += self.gram[:, SLOW:, :SLOW]
-        joint[:, rest, rest] += self.gram[:, SLOW:, SLOW:]
-        joint[:, own, own] += memory**2 / driven
-        joint[:, own + SLOW, own + SLOW] += 1.0 / driven
-        joint[:, own, own + SLOW] -= memory / driven
-        joint[:, own + SLOW, own] -= memory / driven
-        without, more = _without_first(joint)
+            head += gram[..., :SLOW, :SLOW]
+            side += gram[..., :SLOW, SLOW:]
+            rest += gram[..., SLOW:, SLOW:]
+        without, more = _without(head, side, rest)
         return Chain(without, self.log_determinant + np.log(driven).sum(axis=1) + more)
 
     def ended(self) -> Eliminated:
         """Eliminate the slow errors at the end."""
-        rest, more = _without_first(self.gram)
+        side = self.gram[:, :SLOW]
+        rest, more = _without(side[:, :, :SLOW], side[:, :, SLOW:], self.gram[:, SLOW:, SLOW:])
         return Eliminated(rest, self.log_determinant + more)
 
 
-def _without_first(gram: Array) -> tuple[Array, Array]:
-    """Return the Schur complement after the first six variables, and the log determinant of their part."""
-    head, side = gram[:, :SLOW, :SLOW], gram[:, :SLOW, SLOW:]
-    return gram[:, SLOW:, SLOW:] - side.transpose(0, 2, 1) @ np.linalg.solve(head, side), np.linalg.slogdet(head)[1]
+def _without(head: Array, side: Array, rest: Array) -> tuple[Array, Array]:
+    """Return the Schur complement of [[head, side], [sideᵀ, rest]] after its head, and log determinant of the head."""
+    return rest - side.transpose(0, 2, 1) @ np.linalg.solve(head, side), np.linalg.slogdet(head)[1]

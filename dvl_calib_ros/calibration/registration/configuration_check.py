@@ -96,7 +96,9 @@ SCALED_ALONE = 0.2
 # Largest misalignment (rad) and scale error of a right configuration.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
 # Initial DVL delays, s: the range of a calibration, in steps that are short compared to waves.
-LATE_S = (-2.4, -1.2, 0.0, 1.2, 2.4)
+LATE_S = (0.0, -1.2, 1.2, -2.4, 2.4)
+# A fit that hardly improves is given up above this multiple of the largest useful residual.
+FAR_ABOVE = 2.0
 # Constraints of alternative configurations: synchronised reference, configured lever arm.
 WITHOUT_ARM: Sequence[Array] = (REFERENCE, *np.eye(N)[ARM])
 _OTHER_AXES = {FRD: FLU, FLU: FRD}
@@ -143,7 +145,7 @@ def fitting_configuration(
         fit = MotionFit(_as_if(motion, declared, frame), lever_arm, curves, FEW_ROWS)
         # mountings with a name, and a free one
         likely = nominal, FLU_FROM_FRD @ nominal, nominal @ FLU_FROM_FRD, None
-        of_use = FITS_BELOW * fit.speed / math.sqrt(3.0)
+        of_use = FAR_ABOVE * FITS_BELOW * fit.speed / math.sqrt(3.0)
         each = [nearest(fit, rotation, most=of_use) for rotation in likely]
         if (turned := each[1]) is not None and misfit(turned, FLU_FROM_FRD @ nominal) < FITS_BELOW:
             also_turned.add(frame)
@@ -169,11 +171,14 @@ def nearest(
 ) -> Fitted | None:
     """Return the best fit over the DVL delays that a calibration covers, or None.
 
-    held: rows of states held at zero. most: largest useful residual, m/s.
+    held: rows of states held at zero. most: residual (m/s) above which a fit that hardly improves is given up.
     """
-    each = (fit(0.0, late, rotation_body_from_dvl, held, most=most) for late in LATE_S)
-    found = [one for one in each if one is not None and np.isfinite(one.x).all()]
-    return min(found, key=lambda one: one.level, default=None)
+    best: Fitted | None = None
+    for late in LATE_S:
+        one = fit(0.0, late, rotation_body_from_dvl, held, most=most if best is None else min(most, best.level))
+        if one is not None and np.isfinite(one.x).all() and (best is None or one.level < best.level):
+            best = one
+    return best
 
 
 def misfit(one: Fitted, nominal: Array, left: float | None = None) -> float:
@@ -219,16 +224,19 @@ def wrong_axes(
     Each sign pattern has its own delay, because in waves a delay of half a period looks like a sign. The axis factors
     of the best pattern decide. most: largest residual, m/s per axis.
     """
-    found: list[tuple[float, Array, Fitted]] = []
-    for signs in patterns:
-        quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FEW_ROWS)
-        near = nearest(quick, nominal, (REFERENCE,), FAR_WORSE * most)
+    found: tuple[Array, Fitted] | None = None
+    given_up = FAR_ABOVE * FAR_WORSE * most
+    for each in patterns:
+        quick = MotionFit(_signed(motion, each), lever_arm, curves.signed(each), FEW_ROWS)
+        one = nearest(quick, nominal, (REFERENCE,), given_up)
         # a fit that rotates the axes back is the configured pattern
-        if near is not None and _shown_turn(near.rotation_body_from_dvl, nominal, near.std[TURN]) < MISALIGNED:
-            found.append((near.level, signs, near))
-    if not found:
+        is_turned_back = one is None or _shown_turn(one.rotation_body_from_dvl, nominal, one.std[TURN]) >= MISALIGNED
+        if one is not None and not is_turned_back and (found is None or one.level < found[1].level):
+            found = each, one
+            given_up = min(given_up, one.level)
+    if found is None:
         return None
-    _, signs, near = min(found, key=lambda each: each[0])
+    signs, near = found
     fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), MOST_ROWS)
     fitted = fit(0.0, near.dvl_late, nominal, (REFERENCE,))
     if fitted is None or fitted.level > most:

@@ -42,8 +42,8 @@ MOST_ROWS, FEW_ROWS = 4000, 800
 ROUNDS, SETTLED_S = 12, 5e-4
 # Largest delay step per round, s: the slopes are valid this far.
 FARTHEST_S = 0.7
-# Round from which a fit is given up if its residual exceeds this multiple of `most` and this share of the last one.
-ROUNDS_TO_FALL, FAR_ABOVE, HARDLY_LESS = 3, 2.0, 0.9
+# Round from which a fit is given up if its residual exceeds `most` and this share of the last one.
+ROUNDS_TO_FALL, HARDLY_LESS = 3, 0.9
 # Residual in σ at which a sample has half the weight.
 HALF_AT = 3.0
 # Lowest compared reference speed, m/s, and fewest rows of a fit.
@@ -182,7 +182,7 @@ class MotionFit:
         among: Fitted | None = None,
         most: float = math.inf,
     ) -> Fitted | None:
-        """Fit from initial delays ρ and δ (s). Return None if too little overlaps or the residual exceeds `most`.
+        """Fit from initial delays ρ and δ (s). Return None if too little overlaps or it is given up.
 
         Parameters
         ----------
@@ -190,7 +190,7 @@ class MotionFit:
         rotation_body_from_dvl: (3, 3) prior mounting; None to estimate it.
         in_time: Rows of synchronised clocks (`DVL`, `REFERENCE`, `BOTH_ALIKE`); REFERENCE is added without an attitude.
         among: Another fit, to compare only its references, DVL samples and attitudes.
-        most: Largest useful residual per axis, m/s.
+        most: Residual per axis (m/s) above which a fit that hardly improves is given up.
         """
         rotation = self._best_rotation(reference, apart) if rotation_body_from_dvl is None else rotation_body_from_dvl
         if rotation is None:
@@ -208,7 +208,7 @@ class MotionFit:
                 return None
             solved = self._solved(x, rows, nominal, rotation, in_time)
             step, _, level, _ = solved
-            if number >= ROUNDS_TO_FALL and level > max(FAR_ABOVE * most, HARDLY_LESS * left):
+            if number >= ROUNDS_TO_FALL and level > max(most, HARDLY_LESS * left):
                 return None
             left = level
             far = float(np.abs(step[[APART, LATE]]).max())
