@@ -38,7 +38,7 @@ def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
         drop = reduced.fit.deviance - fit.deviance
         if drop > SETTINGS.instead_of:
             continue
-        other = unexplained(fitter, reduced.fit, asked=0.0)
+        other = unexplained(fitter, reduced.fit)
         if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
             continue
         gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop

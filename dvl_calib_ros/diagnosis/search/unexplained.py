@@ -48,17 +48,15 @@ OF_GROUP = 0.02
 class Unexplained:
     """Result of the score tests. log_p: of the best entry or of all jointly, adjusted for multiple tests.
 
-    energy: excess over the null, in noise variances. about: name of the regressor, or a period (s). columns: (M, A, f),
-    the dictionary; empty if insignificant. clearest: (M, A, c), the most significant columns. clear_energy: explained
-    by these. price: quantile of the best test under the null at `SETTINGS.robust_level`.
+    about: name of the regressor, or a period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest:
+    (M, A, c), the most significant columns. price: quantile of the best test under the null at
+    `SETTINGS.robust_level`.
     """
 
     log_p: float
-    energy: float
     about: str | float
     columns: Array
     clearest: Array
-    clear_energy: float = 0.0
     price: float = 0.0
 
     @property
@@ -74,11 +72,10 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
-def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
+def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     """Test the residual of a fit against the dictionary.
 
-    The null distribution is from recordings simulated from the fit (parametric bootstrap). asked: required excess over
-    the price; return early without a finding if no test can reach it.
+    The null distribution is from recordings simulated from the fit (parametric bootstrap).
     """
     problem, noise = fitter.problem, fit.noise
     looks, white, raw, basis = _looked(fitter, fit, problem, fit.seen, fit.residual)
@@ -98,15 +95,6 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
             for each in happened
             if _is_predictive(problem, fit, each.columns, least + _price(tested + each.tried, each.columns.shape[2]))
         ]
-    if asked > -np.inf and not happened:
-        most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
-        for line in followed:
-            waves = _along_axes(line.waves, problem.axes)
-            energy = explained(basis[: left.size, :0], noise.whiten(waves), left, 1.0)[1]
-            most.append((energy + waves.shape[2], waves.shape[2]))
-        prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
-        if max(each - prices[columns] for each, columns in most) < asked:
-            return Unexplained(0.0, 0.0, "", nothing, nothing)
     looked_at = float(np.log(tested))
     nominal = [
         *(each.log_p for each in happened),
@@ -114,9 +102,8 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
         *(line.log_p for line in followed),
     ]
     if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
-        return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
+        return Unexplained(min(min(nominal) + looked_at, 0.0), "", nothing, nothing)
     grown = _grown(fitter, fit, looks)
-    of_group = {look.name: by for look, by in zip(looks, grown, strict=True) if look.is_whole}
     tests: list[tuple[float, str | float, Array]]
     tests = [(look.log_p(by), look.name, raw[look.name][:, :, look.at]) for look, by in zip(looks, grown, strict=True)]
     tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
@@ -124,21 +111,11 @@ def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained
     best = min(tests, key=_first)
     about = _plainest(tests, best[0])
     log_p = best[0] + looked_at
-    whole = [(look.energy / by, look.dof) for look, by in zip(looks, grown, strict=True) if look.is_whole]
-    energy = max(*(each - dof for each, dof in whole), 0.0)
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
-    clearest = noise.whiten(best[2])
     tested = next((tested + each.tried for each in happened if each.about == best[1]), tested)
-    held_against = (basis[: left.size, :0], clearest, left)
-    if not isinstance(best[1], float):
-        held_against = (basis, clearest, white)
-    clear_energy = explained(*held_against, 1.0)[1]
-    clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
-    energy = max(energy, clear_energy - best[2].shape[2])  # a period is of no group
-    cost = _price(tested, best[2].shape[2])
-    found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)
+    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _price(tested, best[2].shape[2]))
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
 
 
@@ -160,11 +137,10 @@ def _first(each: tuple[float, str | float, Array]) -> float:
 
 @dataclass(frozen=True)
 class FollowTest:
-    """Score test. name: of the group; at: columns under test; energy: chi-square of dof; is_whole: all columns."""
+    """Score test. name: of the group; at: columns under test; energy: chi-square of dof."""
 
     name: str
     at: NDArray[np.intp]
-    is_whole: bool
     energy: float
     dof: int
 
@@ -193,8 +169,8 @@ def _looked(
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions * sound, problem.axes)
         told = ScoreTest.of(q, noise.whiten(raw[name]), white)
-        for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
-            looks.append(FollowTest(name, at, number == 0, *told.energy(at)))
+        for at in _looks(name, functions.shape[1], problem.axes):
+            looks.append(FollowTest(name, at, *told.energy(at)))
     return looks, white, raw, q
 
 
@@ -273,13 +249,10 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
 
 
 def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:
-    return holds_out(problem, fit, columns) > least - columns.shape[2]
-
-
-def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
-    """Return the held-out deviance gain of columns (M, A, c) beside a fit's."""
+    """Return whether columns (M, A, c), added to a fit, gain more than the least in held-out deviance."""
     slow = SlowNoiseOfFit.of_fit(problem, fit)
-    return predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
+    gain = predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
+    return gain > least - columns.shape[2]
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
@@ -322,10 +295,3 @@ def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
         return looks
     together = ALTERNATIVES[name]
     return [*looks, *(index[:, at : at + together].ravel() for at in range(0, c, together))]
-
-
-def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
-    """Return log p of the energy of a whitened series in some columns, and its excess over the null."""
-    energy, dof = ScoreTest.of(q, white_columns, white).energy(np.arange(white_columns.shape[1]))
-    energy /= variance
-    return (float(chi2_logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)

@@ -56,7 +56,7 @@ def test_nine_of_ten_true_closures_are_inside_the_interval(memory_s, times):
     rng, effect = np.random.default_rng(5), EFFECTS["velocity_bias"]
     clean = Fitter(_problem(np.zeros((300, 3)), times * BIAS))
     start = no_effect().with_effects([effect], 1, {effect.name: (effect.defaults,)})
-    nothing = Unexplained(0.0, 0.0, "", np.zeros((1, 3, 0)), np.zeros((1, 3, 0)))
+    nothing = Unexplained(0.0, "", np.zeros((1, 3, 0)), np.zeros((1, 3, 0)))
     inside, widths = 0, []
     for _ in range(DRAWS):
         problem = _problem(_noise(rng, memory_s), times * BIAS)

@@ -1083,7 +1083,7 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
 ):
     """A step of a bias that a drift, a lag and an offset stood in for: 85 mm/s became 51, over noise of 14."""
     selection: Any = SimpleNamespace(selected=[SimpleNamespace(equivalent=())], fit=None, fitter=Mock())
-    nothing_left = Unexplained(0.0, 0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
+    nothing_left = Unexplained(0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
     after = float(np.hypot(0.014, not_explained))
     gap = Gap(0.085, after, 0.014, closure, (closure - 0.1, closure + 0.1), not_explained)
     found = _verdict(selection, nothing_left, gap, 1.0)
@@ -1099,7 +1099,7 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
 def test_what_exceeds_the_noise_by_as_much_is_unknown_and_no_sound_bag():
     """94.4 mm/s were not explained beside `no_gap`."""
     selection: Any = SimpleNamespace(selected=[], fit=None, fitter=Mock())
-    nothing_left = Unexplained(0.0, 0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
+    nothing_left = Unexplained(0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
     for not_explained, verdict in ((0.99, DiagnosisVerdict.NO_GAP), (1.01, DiagnosisVerdict.UNKNOWN)):
         after = float(np.hypot(1.0, not_explained))
         gap = Gap(after, after, 1.0, np.nan, (np.nan, np.nan), not_explained)
