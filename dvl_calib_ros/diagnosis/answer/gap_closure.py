@@ -34,8 +34,7 @@ class Gap:
     not_explained: noise-free error that is not closed; without effects, the part of `after` above the noise. reported:
     noise reported by the messages, None if missing. by_recording: before and after per recording, if several.
     left_open: predicted part of `after` above the noise, in stretches that alone determine parts of the effects.
-    falls_from: lower 95 per cent bound of the held-out fall, as a share of the gap; shown_from: the same without
-    left_open. drift: of straight dead reckoning with errors before and after, None for a vehicle at rest.
+    drift: of straight dead reckoning with errors before and after, None for a vehicle at rest.
     """
 
     before: float
@@ -47,8 +46,6 @@ class Gap:
     reported: float | None = None
     by_recording: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     left_open: float = 0.0
-    falls_from: float = np.nan
-    shown_from: float = np.nan
     drift: tuple[Drift, Drift] | None = None
 
     @property
@@ -154,18 +151,10 @@ def only(problem: Problem, recording: int) -> Problem:
 
 
 def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
-    """Return held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
+    """Return held-out errors before and after the effects of a selection."""
     before, after, floor = residuals.squares()
     left_open, n = residuals.open_of_blocks(), len(residuals.before)
-    drawn = np.random.default_rng(0).integers(0, len(before), (RESAMPLES, len(before)))
-
-    def falls_from(left: Array) -> float:
-        gap = np.maximum((before - floor)[drawn].sum(axis=-1), 1e-300)
-        share = 1.0 - np.maximum((left - floor)[drawn].sum(axis=-1), 0.0) / gap
-        return float(np.percentile(np.clip(share, -1.0, 1.0), 2.5))
-
     squares = [float(part.sum()) / n for part in (before, after, floor)]
-    is_gap = bool(selection.fit.effects) and squares[0] > squares[2]
     return Gap(
         before=float(np.sqrt(squares[0])),
         after=float(np.sqrt(squares[1])),
@@ -176,8 +165,6 @@ def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
         reported=_reported(selection.fitter.problem),
         by_recording=_by_recording(selection.fitter.problem, residuals),
         left_open=float(np.sqrt(left_open.sum() / n)),
-        falls_from=falls_from(after) if is_gap else np.nan,
-        shown_from=falls_from(after - left_open) if is_gap else np.nan,
         drift=_drift(selection, residuals),
     )
 

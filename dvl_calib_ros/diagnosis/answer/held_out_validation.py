@@ -1,10 +1,8 @@
-"""Validation of selected effects, on held-out data and against an unknown cause."""
+"""Validation of selected effects against an unknown cause."""
 
 from __future__ import annotations
 
 import itertools
-
-import numpy as np
 
 from ...effects.base import Effect
 from ..fit.cross_validation import surprise_elsewhere
@@ -13,7 +11,6 @@ from ..fit.selection_criteria import NuisanceFit
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
 from ..search.effect_selection import EffectSelection
-from ..search.event_scan import EVENTS
 from ..search.unexplained import (
     INEXACT,
     Unexplained,
@@ -21,7 +18,6 @@ from ..search.unexplained import (
     matters,
     unexplained,
 )
-from .gap_closure import Gap
 
 
 def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
@@ -58,19 +54,3 @@ def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplain
 def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     effects = selection.fit.effects
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
-
-
-def confirmed(selection: EffectSelection, rest: Unexplained, gap: Gap) -> tuple[EffectSelection, Unexplained]:
-    """Return a selection and its residual's cause, or without any effect if the selection may enlarge the error.
-
-    An effect that one stretch alone determines, as a clock jump by one turn, is kept if no unknown cause replaces it.
-    """
-    shrinks = gap.falls_from > 0.0 or (np.isnan(gap.falls_from) and gap.after < gap.before)
-    if not selection.selected or shrinks:
-        return selection, rest
-    none = selection.withdrawn()
-    left = unexplained(none.fitter, none.fit)
-    is_event = left.about in EVENTS  # such as the only turn after a clock jump
-    if gap.shown_from > 0.0 and (is_event or not matters(none.fitter.problem, none.fit, left)):
-        return selection, rest
-    return none, left

@@ -81,10 +81,6 @@ class EffectSelection:
         selected = tuple(each for each in self.selected if each.effect.name not in names)
         return replace(self, selected=selected, fit=self.fitter.fit(hypothesis, self.fit.noise))
 
-    def withdrawn(self) -> EffectSelection:
-        """Return the selection without any effect."""
-        return replace(self, selected=(), fit=self.base, opened=None, moved={})
-
 
 class TooFewBinsError(Exception):
     """Error for streams that overlap too briefly, with their number of samples."""

@@ -17,10 +17,9 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.numerics.tests import holm
 from dvl_calib_ros.cli import common
-from dvl_calib_ros.diagnosis.answer import confidence_intervals, held_out_validation
+from dvl_calib_ros.diagnosis.answer import confidence_intervals
 from dvl_calib_ros.diagnosis.answer.compensation import compensated, verified_corrections
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
-from dvl_calib_ros.diagnosis.answer.held_out_validation import confirmed
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fit import gauss_newton
@@ -1114,23 +1113,6 @@ def test_what_the_very_stretch_that_is_held_out_tells_is_no_unknown_cause():
     assert diagnosis.gap.after > 2.0 * diagnosis.gap.noise_floor
     assert diagnosis.gap.not_expected < 0.3 * diagnosis.gap.noise_floor
     assert diagnosis.verdict is DiagnosisVerdict.KNOWN
-
-
-def test_what_explains_much_may_be_told_by_one_stretch_alone(monkeypatch):
-    """A leap of 0.6 s before a straight leg: without its only turn it came out at 1.2 s, and no gap was left to say."""
-    gap = Gap(0.0417, 0.0419, 0.0350, 0.37, (0.1, 1.0), 0.0230, left_open=0.0142, shown_from=0.05)
-    for low, shown_from, is_there, about, stands in (
-        (-0.08, 0.05, False, "", True), (-0.08, 0.05, True, "speed", False), (-0.08, -0.1, False, "", False),
-        (-0.08, 0.05, True, "a stretch of time", True), (0.01, 0.05, True, "speed", True),
-    ):  # fmt: skip
-        cause = SimpleNamespace(about=about)
-        fit, base = Mock(spec=Fit), Mock(spec=Fit)
-        none = SimpleNamespace(fit=base, fitter=Mock())
-        selection: Any = SimpleNamespace(fit=fit, selected=[None], withdrawn=lambda none=none: none)
-        monkeypatch.setattr(held_out_validation, "unexplained", lambda *_, cause=cause: cause)
-        monkeypatch.setattr(held_out_validation, "matters", lambda *_, is_there=is_there: is_there)
-        found = confirmed(selection, "nothing", replace(gap, shown_from=shown_from, falls_from=low))
-        assert found == ((selection, "nothing") if stands else (none, cause))
 
 
 def test_a_stretch_is_left_open_by_no_more_than_what_it_has_beyond_the_noise():
