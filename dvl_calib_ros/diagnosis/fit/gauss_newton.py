@@ -25,8 +25,6 @@ MAX_STEPS, GAINS_NOTHING = 30, 1e-3
 HALVINGS = 5
 # The last step is rejected if it increases the misfit by this factor
 ASTRAY = 30.0
-# Squared cosine between successive steps from which they are extrapolated
-ALIKE = 0.9
 # Standard deviations of the chance gain from other noise that are subtracted
 BY_CHANCE = 1.5
 # Prior σ of an effect's parameters, in typical sizes: wide, to act only on unobservable parameters
@@ -208,17 +206,15 @@ class Fitter:
             evaluated = looked.seen, looked.residual
         seen, residual = evaluated or self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)
-        length, before = 1.0, np.zeros(len(kept))
         for _ in range(max_steps):
             looked = looked or self._looked(hypothesis, noise, seen, residual)
             system = looked.system
             free = np.flatnonzero(~kept)
-            step, std = np.zeros(len(kept)), np.sqrt(np.diag(system.covariance()))
+            step = np.zeros(len(kept))
             step[free] = system.part(free).solution() if len(free) else 0.0
             if misfit - system.misfit(step) < GAINS_NOTHING:
                 break
-            length = _length(step / std, before, length)
-            moved, tried, before = False, length * step, step / std
+            moved, tried = False, step
             for _ in range(HALVINGS):
                 trial = hypothesis.moved(tried)
                 trial_seen, trial_residual = self.evaluated(trial)
@@ -413,18 +409,6 @@ def _with_time(fit: Fit, effect: Effect, name: str, recording: int, at: float) -
     per = fit.values[effect.name]
     moved = tuple({**each, name: at} if index == recording else each for index, each in enumerate(per))
     return replace(fit.hypothesis, values={**fit.values, effect.name: moved})
-
-
-def _length(step: Array, before: Array, length: float) -> float:
-    """Return the length of a Gauss-Newton step (n,), given the previous step (n,) and length; steps are whitened.
-
-    Far from the optimum (an effect is missing), second derivatives matter: each step is nearly the previous one times a
-    factor, possibly negative. This length then leads to the limit (Aitken, Δ²).
-    """
-    before_square, along = float(before @ before), float(step @ before)
-    if along**2 < ALIKE * before_square * float(step @ step) or before_square == 0.0:
-        return 1.0
-    return float(np.clip(length / max(1.0 - along / before_square, 0.1), 0.3, 5.0))
 
 
 def n_amplitudes(effect: Effect, n_recordings: int) -> int:
