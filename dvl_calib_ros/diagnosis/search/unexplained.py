@@ -24,7 +24,6 @@ from ..fit.selection_criteria import NuisanceFit, SlowNoiseOfFit
 from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
-from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import ScoreTest, orthonormal
 from .alternative_regressors import ALTERNATIVES, dictionary
 from .event_scan import events
@@ -155,9 +154,8 @@ def _looked(
     white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unshown))
     looks: list[FollowTest] = []
     raw: dict[str, Array] = {}
-    sound = ~_upset(fitter, noise)[:, None]
     for name, functions in dictionary(problem, seen).items():
-        raw[name] = _along_axes(functions * sound, problem.axes)
+        raw[name] = _along_axes(functions, problem.axes)
         told = ScoreTest.of(q, noise.whiten(raw[name]), white)
         for at in _looks(name, functions.shape[1], problem.axes):
             looks.append(FollowTest(name, at, *told.energy(at)))
@@ -171,14 +169,6 @@ def _beside_prior(known: NuisanceFit, columns: Array, white: Array) -> tuple[Arr
     """
     basis = orthonormal(np.concatenate([columns, np.diag(1.0 / known.std)]))
     return basis, np.concatenate([white, known.centre / known.std])
-
-
-def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
-    """Return (M,) bins with an outlier in or next to them: it affects the motion regressors as well."""
-    if not isinstance(fitter.outliers, np.ndarray):
-        return np.zeros(len(noise.level), dtype=bool)
-    far = np.abs(noise.whiten(fitter.outliers)).reshape(noise.level.shape).max(axis=1) > SETTINGS.outlying
-    return np.asarray(far | np.append(far[1:], False) | np.append(False, far[:-1]))
 
 
 def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]:
