@@ -155,6 +155,7 @@ def diagnose_recordings(
         twins=twins(selection),
         dvl=dvl_seen(selection, parameters),
         selection=selection,
+        covariance=covariance,
     )
 
 
