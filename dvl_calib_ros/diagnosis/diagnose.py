@@ -21,7 +21,6 @@ from .answer.confidence_intervals import Times, Triple, covariance_of
 from .answer.dvl_description import dvl_seen
 from .answer.gap_closure import Gap, closure_alone, held_out, measure_gap, with_closure
 from .answer.gap_location import places
-from .answer.held_out_validation import settled
 from .answer.noise_findings import noise_findings
 from .answer.plotted_series import collect_series
 from .answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
@@ -45,7 +44,7 @@ from .search.effect_selection import EffectSelection, TooFewBinsError, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
 from .search.observable_parameters import somewhere, with_observable
-from .search.unexplained import Unexplained, matters, moved_by, unexplained
+from .search.unexplained import Unexplained, matters, moved_by, settled, unexplained
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 

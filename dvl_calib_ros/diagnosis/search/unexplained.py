@@ -6,6 +6,7 @@ of the vehicle's motion, so a residual that follows the motion is systematic.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,7 +18,7 @@ from ...calibration.numerics.frames import Array
 from ...calibration.streams.interpolation import shortened
 from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
-from ..fit.cross_validation import predictive_gain
+from ..fit.cross_validation import predictive_gain, surprise_elsewhere
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..fit.selection_criteria import NuisanceFit, SlowNoiseOfFit
@@ -26,6 +27,7 @@ from ..model.seen import Seen
 from ..model.settings import SETTINGS
 from ..noise.whitened_least_squares import ScoreTest, orthonormal
 from .alternative_regressors import ALTERNATIVES, dictionary
+from .effect_selection import EffectSelection
 from .event_scan import events
 
 # Spectral lines: longer than wave periods; more periods than the time dictionary resolves
@@ -233,6 +235,42 @@ def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> 
     slow = SlowNoiseOfFit.of_fit(problem, fit)
     gain = predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
     return gain > least - columns.shape[2]
+
+
+def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
+    """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
+
+    Better means better prediction of held-out stretches. A group of functions that contains the effects includes their
+    cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
+    """
+    fitter, fit = selection.fitter, selection.fit
+    problem, rest = fitter.problem, unexplained(fitter, fit)
+    best: tuple[float, EffectSelection, Unexplained] | None = None
+    for out in _subsets(selection):
+        reduced = selection.without({effect.name for effect in out})
+        drop = reduced.fit.deviance - fit.deviance
+        if drop > SETTINGS.instead_of:
+            continue
+        other = unexplained(fitter, reduced.fit)
+        if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
+            continue
+        gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop
+        if gain > 0.0 and (best is None or gain > best[0]):
+            best = gain, reduced, other
+    return (selection, rest) if best is None else best[1:]
+
+
+def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
+    """Return the held-out deviance gain of an unmodelled regressor over the removed effects."""
+    whole, rest = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
+    rest = rest.and_rest(other.clearest, reduced.residual)
+    effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
+    return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
+
+
+def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
+    effects = selection.fit.effects
+    return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:

@@ -10,9 +10,7 @@ import pytest
 from test_diagnosis import LEVER, fitted, recording_of, scenario, with_added
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
-from dvl_calib_ros.diagnosis.answer import held_out_validation
 from dvl_calib_ros.diagnosis.answer.gap_location import places
-from dvl_calib_ros.diagnosis.answer.held_out_validation import settled
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fit.cross_validation import surprise_elsewhere
@@ -29,6 +27,7 @@ from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import (
     is_of_group,
     matters,
+    settled,
     unexplained,
 )
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -201,9 +200,9 @@ def test_an_unknown_cause_takes_the_place_of_effects_only_where_it_predicts_bett
     nothing = fit.columns[:, :, :0]
     told = fit.deviance - fitted_with.deviance
     cause = looking.Unexplained(-50.0, "speed", nothing, nothing, told)
-    monkeypatch.setattr(held_out_validation, "unexplained", lambda *_, **__: cause)
-    monkeypatch.setattr(held_out_validation, "matters", lambda _, of, __: of.effects == ())
-    monkeypatch.setattr(held_out_validation, "_better_elsewhere", lambda *_: better)
+    monkeypatch.setattr(looking, "unexplained", lambda *_, **__: cause)
+    monkeypatch.setattr(looking, "matters", lambda _, of, __: of.effects == ())
+    monkeypatch.setattr(looking, "_better_elsewhere", lambda *_: better)
     selected = (Selected(drift, -50.0, ()),)
     left, _ = settled(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS))
     assert bool(left.selected) == kept
@@ -237,9 +236,9 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
     none = fitter.fit(fit.hypothesis.with_effects([], 1, {}), fit.noise)
     nothing, told = fit.columns[:, :, :0], 0.82 * (none.deviance - fit.deviance)
     cause = looking.Unexplained(-50.0, about, nothing, nothing, told)
-    monkeypatch.setattr(held_out_validation, "unexplained", lambda *_, **__: cause)
-    monkeypatch.setattr(held_out_validation, "matters", lambda _, of, __: of.effects == ())
-    monkeypatch.setattr(held_out_validation, "_better_elsewhere", lambda *_: 1000.0)
+    monkeypatch.setattr(looking, "unexplained", lambda *_, **__: cause)
+    monkeypatch.setattr(looking, "matters", lambda _, of, __: of.effects == ())
+    monkeypatch.setattr(looking, "_better_elsewhere", lambda *_: 1000.0)
     left, _ = settled(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
     assert bool(left.selected) == is_some
 
