@@ -38,6 +38,9 @@ STEPS_OF_A_BIN = 16
 PRIOR_DOF = 4.0
 # Share of the effects' explained deviance that inexact interpolation may leave
 INEXACT = 0.005
+# Among candidates within this log p of the best (a factor of 400), the simplest is named: one speed rather than
+# fifteen functions of the turn rate.
+AS_LIKELY = 6.0
 # A column belongs to a group whose functions leave less than this share of its squares
 OF_GROUP = 0.02
 
@@ -107,12 +110,13 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
     tests += [(each.log_p, each.about, each.columns) for each in happened]
     best = min(tests, key=_first)
+    about = _plainest(tests, best[0])
     log_p = best[0] + looked_at
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     tested = next((tested + each.tried for each in happened if each.about == best[1]), tested)
-    found = Unexplained(min(log_p, 0.0), best[1], columns, best[2], _price(tested, best[2].shape[2]))
+    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _price(tested, best[2].shape[2]))
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
 
 
@@ -120,6 +124,12 @@ def _price(tested: int, columns: int) -> float:
     """Return the energy that the best of `tested` tests exceeds under the null with probability
     `SETTINGS.robust_level`."""
     return float(chi2_isf(SETTINGS.robust_level / tested, columns))
+
+
+def _plainest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
+    """Return the candidate with the fewest columns among those within `AS_LIKELY` of log_p."""
+    likely = (each for each in tests if each[0] <= log_p + AS_LIKELY)
+    return min(likely, key=lambda each: (each[2].shape[2], each[0]))
 
 
 def _first(each: tuple[float, str | float, Array]) -> float:
