@@ -42,13 +42,16 @@ def covariates(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
 
 def fit_level(problem: Problem, seen: Sequence[Seen], innovations: Array) -> Level | None:
     """Fit log squared innovations (M, A) to the covariates, robustly. Return None without covariates."""
-    clipped = {name: _common(values) for name, values in covariates(problem, seen).items()}
-    found = {name: values for name, values in clipped.items() if np.ptp(values) > 0.0}
+    found = covariates(problem, seen)
     if not found:
         return None
     log_square = np.log(np.maximum((innovations**2).mean(axis=1), 1e-12))
     slopes, covariance, wald = _sloped(list(found.values()), log_square)
     p, p_of = float(chi2_sf(wald, len(slopes))), chi2_sf(slopes**2 / np.diag(covariance), 1)
+    if p < SETTINGS.robust_level:
+        common = [each for values in found.values() if np.ptp(each := _common(values)) > 0.0]
+        p_common = float(chi2_sf(_sloped(common, log_square)[2], len(common))) if common else 1.0
+        p = p if p_common < SETTINGS.robust_level else p_common
     x = np.column_stack([values - values.mean() for values in found.values()])
     level = np.exp(np.clip(0.5 * x @ slopes, -2.0, 2.0))
     return Level(tuple(found), 0.5 * slopes, p, p_of, level)
