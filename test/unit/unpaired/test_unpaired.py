@@ -29,6 +29,7 @@ from dvl_calib_ros.simulation.injection import injection
 from dvl_calib_ros.simulation.scenario import Scenario, write_bag
 from dvl_calib_ros.simulation.sensors import DvlErrors
 from dvl_calib_ros.simulator_export.dvl_description import load_description
+from dvl_calib_ros.unpaired import simulator_rounds
 from dvl_calib_ros.unpaired.both_sides import Log, RecordedSide, facts_of, is_copied, read_log
 from dvl_calib_ros.unpaired.comparison import Scatter, at_one_motion, block_levels, compare_logs, slopes_of
 from dvl_calib_ros.unpaired.effect_comparison import Size, compared_names, is_there, p_alike, smallest_difference
@@ -324,6 +325,22 @@ def test_a_simulator_with_another_frame_is_told_so_in_the_answer(bags, tmp_path,
     turned = bag(tmp_path / "turned", trajectory="lawnmower", gnss_std=0.0, mounting_rpy=(0.0, 0.0, np.pi / 2.0))
     assert main(["diagnose", str(bags["vehicle"]), "--simulator", str(turned)]) == 0
     assert "Its DVL is mounted 0° 0° 90°" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.slow
+def test_the_log_times_of_a_round_are_not_compared(bags, tmp_path, monkeypatch):
+    """Every vehicle whose driver takes 0.1 s had a latency that no round took away."""
+
+    def with_latency(side, *arguments):
+        log = read_log(side, *arguments)
+        if side.opened.paths != (bags["vehicle"],):
+            return log
+        taken = 0.1 + 0.001 * np.random.default_rng(0).standard_normal(len(log.recordings[0].dvl.time))
+        return replace(log, facts=(replace(log.facts[0], latency=taken),))
+
+    monkeypatch.setattr(simulator_rounds, "read_log", with_latency)
+    found = close_gap(source(bags["vehicle"]), source(bags["simulator"]), 1, tmp_path)
+    assert "latency" in found.rounds[0].claims and "latency" not in found.rounds[1].claims
 
 
 def test_what_no_round_corrects_is_told_with_what_was_found(compared):
