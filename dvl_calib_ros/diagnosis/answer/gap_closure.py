@@ -20,8 +20,6 @@ from ..search.effect_selection import EffectSelection
 from ..search.unexplained import Unexplained, matters
 
 RESAMPLES = 1000
-# Noise above this multiple of the reported noise is an error of the instruments, not noise
-WORSE_THAN_CLAIMED = 3.0
 Integers = NDArray[np.intp]
 
 
@@ -264,9 +262,8 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
     The residual is the noise, per sample: before and after share it, and their difference has the precision of the gap
-    rather than of the noise. Three parts of it are not: what an unknown cause explains, what exceeds the fitted noise,
-    since it is slower, and what exceeds by far the reported noise and is not white. The part that the parameters have
-    absorbed is added.
+    rather than of the noise. Two parts of it are not: what an unknown cause explains, and what exceeds the fitted
+    noise, since it is slower. The part that the parameters have absorbed is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
@@ -275,7 +272,7 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     if matters(problem, fit, rest):
         *_, noise, without = slow.with_rest(problem, slow.noise, rest.clearest)
         followed, unfollowed = (unfollowed**2 - without**2).sum(axis=1), without
-    usual, claimed = noise.energy, claimed_std(problem)
+    usual = noise.energy
     slower = (unfollowed**2).sum(axis=1) - usual
     floor, of_sample = left**2, problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
@@ -286,11 +283,7 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
         if excess > SETTINGS.noise_tolerance * error * float(usual[of_bin].mean()):
             systematic += excess
         energy = float(floor[at].sum(axis=1).mean())
-        most = np.inf
-        if claimed is not None:
-            white = float(np.nansum(high_frequency_variance(problem.sample_time[at], left[at])[0]))
-            most = max(WORSE_THAN_CLAIMED**2 * float((claimed[recording] ** 2).sum()), white)
-        floor[at] *= max(0.0, min(energy - systematic, most)) / max(energy, 1e-300)
+        floor[at] *= max(0.0, energy - systematic) / max(energy, 1e-300)
     floor[:, measured] += _error_variance(fit, np.arange(fit.columns.shape[2]))[problem.bin_of]
     return floor
 
