@@ -44,7 +44,7 @@ from .search.effect_selection import EffectSelection, TooFewBinsError, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
 from .search.observable_parameters import somewhere, with_observable
-from .search.unexplained import Unexplained, matters, moved_by, settled, unexplained
+from .search.unexplained import Unexplained, matters, moved_by, unexplained, without_replaceable
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 
@@ -108,7 +108,7 @@ def diagnose_recordings(
         return _nothing_to_say(_too_short(error.samples, sum(each.seconds for each in recordings)), notes)
     testable = selection.testable
     _check_bounds(selection)
-    selection, rest = settled(selection)
+    selection, rest = without_replaceable(selection)
     residuals = held_out(selection, rest)
     gap = measure_gap(selection, residuals)
     if selection.selected and gap.fails_elsewhere:

@@ -121,7 +121,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class _Looked:
+class _Linearisation:
     """Linearisation of a hypothesis under a noise: seen, residual and columns as in `Fit`; system of its step."""
 
     seen: tuple[Seen, ...]
@@ -163,14 +163,14 @@ class Fitter:
         """Return derivatives of the residual, (M, A, 6 + p)."""
         return self.problem.all_columns(hypothesis, seen)
 
-    def _looked(
+    def _linearised(
         self, hypothesis: Hypothesis, noise: Noise, seen: tuple[Seen, ...] | None = None, residual: Array | None = None
-    ) -> _Looked:
+    ) -> _Linearisation:
         """Linearise a hypothesis. seen, residual: its evaluation, if known."""
         if seen is None or residual is None:
             seen, residual = self.evaluated(hypothesis)
         columns = self.columns(hypothesis, seen)
-        return _Looked(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
+        return _Linearisation(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
 
     def _white(self, noise: Noise, values: Array) -> Array:
         white = noise.whiten(values)
@@ -189,24 +189,24 @@ class Fitter:
         max_steps: int = MAX_STEPS,
         only_of_the_day: bool = False,
         fixed: frozenset[str] = frozenset(),
-        looked: _Looked | None = None,
+        linearised: _Linearisation | None = None,
         evaluated: Evaluated | None = None,
     ) -> Fit:
         """Fit a hypothesis under a noise. only_of_the_day: fit parameters per recording only.
 
-        fixed: names of effects whose values are fixed. looked, evaluated: linearisation or evaluation of the start, if
-        known.
+        fixed: names of effects whose values are fixed. linearised, evaluated: linearisation or evaluation of the
+        start, if known.
         """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
         kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
         hypothesis = start
-        if looked is not None:
-            evaluated = looked.seen, looked.residual
+        if linearised is not None:
+            evaluated = linearised.seen, linearised.residual
         seen, residual = evaluated or self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)
         for _ in range(max_steps):
-            looked = looked or self._looked(hypothesis, noise, seen, residual)
-            system = looked.system
+            linearised = linearised or self._linearised(hypothesis, noise, seen, residual)
+            system = linearised.system
             free = np.flatnonzero(~kept)
             step = np.zeros(len(kept))
             step[free] = system.part(free).solution() if len(free) else 0.0
@@ -223,10 +223,10 @@ class Fitter:
                 tried = 0.4 * tried
             if not moved:
                 break
-            looked = None
+            linearised = None
             hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
-        looked = looked or self._looked(hypothesis, noise, seen, residual)
-        columns, plain = looked.columns, looked.system
+        linearised = linearised or self._linearised(hypothesis, noise, seen, residual)
+        columns, plain = linearised.columns, linearised.system
         made: Callable[[], Array] = partial(np.asarray, columns)
         system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
         free = np.flatnonzero(~kept)
@@ -331,12 +331,12 @@ class Fitter:
                 continue
             moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
             hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
-            looked = self._looked(hypothesis, fit.noise)
+            linearised = self._linearised(hypothesis, fit.noise)
             if at_rest is None or at_rest[0] is not fit:
                 at_rest = fit, self._promised(fit)
-            if self._is_surely_worse(hypothesis, looked, fit.noise, fit.deviance, at_rest[1]):
+            if self._is_surely_worse(hypothesis, linearised, fit.noise, fit.deviance, at_rest[1]):
                 continue
-            trial = self.fit(hypothesis, fit.noise, 3, looked=looked)
+            trial = self.fit(hypothesis, fit.noise, 3, linearised=linearised)
             if trial.deviance < fit.deviance:
                 fit = trial
         return fit
@@ -347,16 +347,16 @@ class Fitter:
         return self._misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
 
     def _is_surely_worse(
-        self, hypothesis: Hypothesis, looked: _Looked, noise: Noise, deviance: float, promised: float = 0.0
+        self, hypothesis: Hypothesis, linearised: _Linearisation, noise: Noise, deviance: float, promised: float = 0.0
     ) -> bool:
         """Return whether a hypothesis, fitted, would have a larger deviance, by one linear step.
 
         The step's predicted deviance is the minimum except for nonlinearity. promised: predicted gain from a nearby
         converged fit of this deviance, subtracted as unattainable (`_promised`).
         """
-        own_noise = self._own_noise(hypothesis, noise, looked.residual + self.outliers)
-        least = looked.system.misfit(looked.system.solution())
-        gained = self._misfit(noise, looked.residual, hypothesis) - least
+        own_noise = self._own_noise(hypothesis, noise, linearised.residual + self.outliers)
+        least = linearised.system.misfit(linearised.system.solution())
+        gained = self._misfit(noise, linearised.residual, hypothesis) - least
         least -= float(own_noise @ own_noise)
         if least > deviance + SURELY + BENT * gained:
             return True
@@ -384,10 +384,10 @@ class Fitter:
 
     def _worse_at(self, moved: Hypothesis, fit: Fit) -> float:
         """Return the deviance increase of a fit at another time, infinite if it is certainly too large."""
-        looked = self._looked(moved, fit.noise)
-        if self._is_surely_worse(moved, looked, fit.noise, fit.deviance + SETTINGS.conclusive):
+        linearised = self._linearised(moved, fit.noise)
+        if self._is_surely_worse(moved, linearised, fit.noise, fit.deviance + SETTINGS.conclusive):
             return np.inf
-        return self.fit(moved, fit.noise, 2, looked=looked).deviance - fit.deviance
+        return self.fit(moved, fit.noise, 2, linearised=linearised).deviance - fit.deviance
 
     def moved_by_time(self, fit: Fit, effect: Effect, name: str, recording: int, ends: Sequence[float]) -> Array:
         """Return the covariance (6 + p, 6 + p) due to a time's uncertainty. ends: of its 95 per cent interval, s."""

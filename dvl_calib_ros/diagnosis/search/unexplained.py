@@ -79,43 +79,45 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     The null distribution is from recordings simulated from the fit (parametric bootstrap).
     """
     problem, noise = fitter.problem, fit.noise
-    looks, white, raw, basis = _looked(fitter, fit, problem, fit.seen, fit.residual)
+    score_tests, white, raw, basis = _score_tests(fitter, fit, problem, fit.seen, fit.residual)
     nothing = raw["time"][:, :, :0]
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
     left = noise.whiten(fit.residual)
     left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
-    tested = len(looks) + len(followed)
-    happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
-    if happened:  # slow noise explains a step as well, unless the step predicts better
+    tested = len(score_tests) + len(followed)
+    found_events = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
+    if found_events:  # slow noise explains a step as well, unless the step predicts better
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
         least = INEXACT * (base.deviance - fit.deviance)
-        happened = [
+        found_events = [
             each
-            for each in happened
+            for each in found_events
             if _is_predictive(problem, fit, each.columns, least + _price(tested + each.tried, each.columns.shape[2]))
         ]
     looked_at = float(np.log(tested))
     nominal = [
-        *(each.log_p for each in happened),
-        *(look.log_p() for look in looks),
+        *(each.log_p for each in found_events),
+        *(test.log_p() for test in score_tests),
         *(line.log_p for line in followed),
     ]
     if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
         return Unexplained(min(min(nominal) + looked_at, 0.0), "", nothing, nothing)
-    grown = _grown(fitter, fit, looks)
+    grown = _inflation_under_null(fitter, fit, score_tests)
     tests: list[tuple[float, str | float, Array]]
-    tests = [(look.log_p(by), look.name, raw[look.name][:, :, look.at]) for look, by in zip(looks, grown, strict=True)]
+    tests = [
+        (test.log_p(by), test.name, raw[test.name][:, :, test.at]) for test, by in zip(score_tests, grown, strict=True)
+    ]
     tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
-    tests += [(each.log_p, each.about, each.columns) for each in happened]
+    tests += [(each.log_p, each.about, each.columns) for each in found_events]
     best = min(tests, key=_first)
     about = _plainest(tests, best[0])
     log_p = best[0] + looked_at
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
-    tested = next((tested + each.tried for each in happened if each.about == best[1]), tested)
+    tested = next((tested + each.tried for each in found_events if each.about == best[1]), tested)
     found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _price(tested, best[2].shape[2]))
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
 
@@ -150,7 +152,7 @@ class FollowTest:
         return float(chi2_logsf(self.energy / grown, max(self.dof, 1))) if self.dof else 0.0
 
 
-def _looked(
+def _score_tests(
     fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
 ) -> tuple[list[FollowTest], Array, dict[str, Array], Array]:
     """Return tests of a residual (M, A), the whitened residual, each group's columns and the basis.
@@ -164,14 +166,14 @@ def _looked(
     white = white - q @ (q.T @ white)
     unshown = known.columns.shape[2] - own.shape[2]
     white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unshown))
-    looks: list[FollowTest] = []
+    score_tests: list[FollowTest] = []
     raw: dict[str, Array] = {}
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions, problem.axes)
         told = ScoreTest.of(q, noise.whiten(raw[name]), white)
-        for at in _looks(name, functions.shape[1], problem.axes):
-            looks.append(FollowTest(name, at, *told.energy(at)))
-    return looks, white, raw, q
+        for at in _columns_of_tests(name, functions.shape[1], problem.axes):
+            score_tests.append(FollowTest(name, at, *told.energy(at)))
+    return score_tests, white, raw, q
 
 
 def _beside_prior(known: NuisanceFit, columns: Array, white: Array) -> tuple[Array, Array]:
@@ -183,13 +185,13 @@ def _beside_prior(known: NuisanceFit, columns: Array, white: Array) -> tuple[Arr
     return basis, np.concatenate([white, known.centre / known.std])
 
 
-def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]:
+def _inflation_under_null(fitter: Fitter, fit: Fit, score_tests: Sequence[FollowTest]) -> list[float]:
     """Return the inflation of each test's energy over chi-square in simulated recordings, at least 1."""
-    energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
+    energy, dof = np.full(len(score_tests), PRIOR_DOF), np.full(len(score_tests), PRIOR_DOF)
     for other, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
-        found, *_ = _looked(fitter, fit, other, seen, residual)
-        energy += [look.energy for look in found]
-        dof += [look.dof for look in found]
+        found, *_ = _score_tests(fitter, fit, other, seen, residual)
+        energy += [test.energy for test in found]
+        dof += [test.dof for test in found]
     return np.maximum(energy / dof, 1.0).tolist()
 
 
@@ -247,7 +249,7 @@ def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> 
     return gain > least - columns.shape[2]
 
 
-def settled(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
+def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
     """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
 
     Better means better prediction of held-out stretches. A group of functions that contains the effects includes their
@@ -315,11 +317,11 @@ def _along_axes(functions: Array, axes: int) -> Array:
     return np.einsum("mc,ij->mijc", functions, np.eye(axes)).reshape(m, axes, axes * c)
 
 
-def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
+def _columns_of_tests(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
     """Return columns of `_along_axes` per test: the group, each axis and each alternative."""
     index = np.arange(axes * c).reshape(axes, c)
-    looks = [index.ravel(), *index]
+    parts = [index.ravel(), *index]
     if name not in ALTERNATIVES:
-        return looks
+        return parts
     together = ALTERNATIVES[name]
-    return [*looks, *(index[:, at : at + together].ravel() for at in range(0, c, together))]
+    return [*parts, *(index[:, at : at + together].ravel() for at in range(0, c, together))]

@@ -44,13 +44,13 @@ from dvl_calib_ros.diagnosis.search.clock_jumps import (
     PARTS,
     Delays,
     gaps,
-    in_gaps,
     time_by_stamps,
+    with_jumps_in_gaps,
 )
 from dvl_calib_ros.diagnosis.search.clock_jumps import _found as _delays
 from dvl_calib_ros.diagnosis.search.effect_selection import (
-    _about,
     started,
+    with_noise_reestimated,
 )
 from dvl_calib_ros.diagnosis.search.identifiability import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.search.observable_parameters import (
@@ -163,7 +163,7 @@ def test_a_current_that_was_taken_for_noise_is_proposed_when_it_came_and_went():
     given = scenario(effects=["water_lock:east_mps=0.2,north_mps=-0.34,from_s=120,to_s=241"], gnss_std=0.02)
     fitter, fit, _ = fitted(given, {})
     assert not intermittent_effects(fitter, fit, EFFECTS)
-    fitter, fit = _about(fitter, fit, {})
+    fitter, fit = with_noise_reestimated(fitter, fit, {})
     assert max(arma.ratio for arma in fit.noise.axes) > 2.0
     effects = {name: EFFECTS[name].once for name in ("water_lock", "heading_error", "velocity_bias", "scale_drift")}
     (best, *_) = intermittent_effects(fitter, fit, effects)
@@ -360,7 +360,7 @@ def about(given: Scenario, run: Run, offsets: Offsets, effects: list, values: di
     problem = make_problem([recording_of(run, given.gnss_frame)], np.eye(3), np.zeros(3), [offsets])
     start, fitter = no_effect().with_effects(effects, 1, values), Fitter(problem)
     noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-    return _about(fitter, fitter.fit(start, noise), EFFECTS)
+    return with_noise_reestimated(fitter, fitter.fit(start, noise), EFFECTS)
 
 
 LAGGING = "reference_lag:time_constant_s=1.3"
@@ -427,10 +427,10 @@ def test_leaps_ahead_are_put_where_the_stamps_have_a_gap_as_large():
     fit = fitter.fit(start, white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval))
     at = pytest.approx(201.3 - 0.5, abs=0.3)  # since the first stamp, which was late
     assert [gap for _, gap in gaps(fitter, fit)] == pytest.approx([2.0, 1.8]) and gaps(fitter, fit)[1][0] == at
-    assert in_gaps(fitter, fit).values["time_offset_jump"][0]["at_s"] == at
+    assert with_jumps_in_gaps(fitter, fit).values["time_offset_jump"][0]["at_s"] == at
     back = {**fit.values, "time_offset_jump": ({"seconds": -1.8, "at_s": 199.0},)}
     back = replace(fit, hypothesis=replace(fit.hypothesis, values=back))
-    assert in_gaps(fitter, back) is back
+    assert with_jumps_in_gaps(fitter, back) is back
 
 
 def two_leaps(fit: Fit, values) -> Hypothesis:
@@ -453,12 +453,12 @@ def test_a_leap_back_is_put_where_the_stamps_go_back_and_its_time_is_known_to_a_
     start = no_effect().with_effects(effects, 1, values)
     fitter = Fitter(problem)
     noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-    fit = in_gaps(fitter, fitter.fit(start, noise))
+    fit = with_jumps_in_gaps(fitter, fitter.fit(start, noise))
     time, low, high = time_by_stamps(fitter, fit, "at_s")
     assert low < 201.3 - 0.5 < high and high - low == pytest.approx(0.8, abs=0.01)  # since the first stamp
     assert time == pytest.approx(201.3 - 0.5, abs=0.3)
     twice = {"seconds": -0.5, "at_s": 120.0, "again_seconds": -0.8, "again_at_s": 200.0}  # one of two has left it
-    (twice,) = in_gaps(fitter, replace(fit, hypothesis=two_leaps(fit, twice))).values["time_offset_jump"]
+    (twice,) = with_jumps_in_gaps(fitter, replace(fit, hypothesis=two_leaps(fit, twice))).values["time_offset_jump"]
     assert twice["at_s"] == 120.0
     ahead = replace(fit.hypothesis, values={**fit.values, "time_offset_jump": ({"seconds": 1.3, "at_s": time},)})
     assert time_by_stamps(fitter, replace(fit, hypothesis=ahead), "at_s") is None
@@ -897,7 +897,7 @@ def test_noise_is_no_slower_for_what_columns_explain_of_it_by_their_own():
     problem, start, _, _ = started([recording], np.eye(3), np.zeros(3), every)
     fitter = Fitter(problem)
     noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-    _, fit = _about(fitter, fitter.fit(start, noise), every)
+    _, fit = with_noise_reestimated(fitter, fitter.fit(start, noise), every)
     left = np.sqrt(np.mean(fit.residual**2, axis=0))
     loud = [axis.std * axis.ratio for axis in fit.noise.axes]
     np.testing.assert_allclose(loud, left, rtol=0.1)

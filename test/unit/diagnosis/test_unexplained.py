@@ -27,8 +27,8 @@ from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import (
     is_of_group,
     matters,
-    settled,
     unexplained,
+    without_replaceable,
 )
 from dvl_calib_ros.effects.registry import EFFECTS
 from dvl_calib_ros.simulation.scenario import simulate
@@ -52,7 +52,7 @@ def without_effects(recording):
 
 def test_a_fit_from_what_was_looked_at_already_is_the_same():
     fitter, fit, start = fitted(scenario("lawnmower", seconds=120.0), {"lever_arm": {}, "dvl_time_offset": {}})
-    again = fitter.fit(start, fit.noise, looked=fitter._looked(start, fit.noise))
+    again = fitter.fit(start, fit.noise, linearised=fitter._linearised(start, fit.noise))
     whole = fitter.fit(start, fit.noise)
     assert again.deviance == whole.deviance
     np.testing.assert_array_equal(again.hypothesis.vector(), whole.hypothesis.vector())
@@ -80,7 +80,7 @@ def test_what_a_step_from_a_fit_at_rest_promises_is_promised_of_no_hypothesis_ne
     given = scenario("lawnmower", seconds=300.0, errors=errors, dvl_rate=1.0, gnss_rate=5.0, gnss_std=0.02)
     effects = {"lever_arm": {}, "dvl_time_offset": {}, "reference_time_offset": {}}
     fitter, fit, _ = fitted(given, effects)
-    promised, looked = fitter._promised(fit), fitter._looked(fit.hypothesis, fit.noise)
+    promised, looked = fitter._promised(fit), fitter._linearised(fit.hypothesis, fit.noise)
 
     def is_surely_worse(by: float, promised: float) -> bool:
         return fitter._is_surely_worse(fit.hypothesis, looked, fit.noise, fit.deviance - by, promised)
@@ -171,7 +171,7 @@ def test_effects_that_an_unknown_cause_may_be_a_part_of_are_not_named_beside_it(
     base, fit = fitter.fit(no_effect(), noise), fitter.fit(start, noise)
     assert unexplained(fitter, fit).found
     selected = tuple(Selected(effect, -50.0, ()) for effect in effects)
-    left, rest = settled(EffectSelection(selected, base, fit, fitter, (), EFFECTS))
+    left, rest = without_replaceable(EffectSelection(selected, base, fit, fitter, (), EFFECTS))
     assert rest.about == "a step in time"
     assert [each.effect.name for each in left.selected] == ["lever_arm"] == [each.name for each in left.fit.effects]
 
@@ -204,7 +204,7 @@ def test_an_unknown_cause_takes_the_place_of_effects_only_where_it_predicts_bett
     monkeypatch.setattr(looking, "matters", lambda _, of, __: of.effects == ())
     monkeypatch.setattr(looking, "_better_elsewhere", lambda *_: better)
     selected = (Selected(drift, -50.0, ()),)
-    left, _ = settled(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS))
+    left, _ = without_replaceable(EffectSelection(selected, fit, fitted_with, fitter, (), EFFECTS))
     assert bool(left.selected) == kept
 
 
@@ -239,7 +239,7 @@ def test_a_group_of_which_an_effect_is_some_is_not_in_its_place_for_what_it_pred
     monkeypatch.setattr(looking, "unexplained", lambda *_, **__: cause)
     monkeypatch.setattr(looking, "matters", lambda _, of, __: of.effects == ())
     monkeypatch.setattr(looking, "_better_elsewhere", lambda *_: 1000.0)
-    left, _ = settled(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
+    left, _ = without_replaceable(EffectSelection((Selected(shear, -50.0, ()),), none, fit, fitter, (), EFFECTS))
     assert bool(left.selected) == is_some
 
 
