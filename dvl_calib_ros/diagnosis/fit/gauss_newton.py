@@ -22,6 +22,8 @@ from ..noise.whitened_least_squares import WhitenedLeastSquares
 # Largest number of steps; converged if a step would reduce the deviance by less than this; differences of 1 matter
 MAX_STEPS, GAINS_NOTHING = 30, 1e-3
 HALVINGS = 5
+# The last step is rejected if it increases the misfit by this factor
+ASTRAY = 30.0
 # Standard deviations of the chance gain from other noise that are subtracted
 BY_CHANCE = 1.5
 # Prior σ of an effect's parameters, in typical sizes: wide, to act only on unobservable parameters
@@ -219,10 +221,12 @@ class Fitter:
         if len(free):
             step = np.zeros(len(kept))
             step[free] = system.part(free).solution()
-            hypothesis = hypothesis.moved(step)
-            seen, residual = self.evaluated(hypothesis)
-            misfit = self._misfit(noise, residual, hypothesis)
-            made = partial(self.problem.all_columns, hypothesis, seen)
+            last = hypothesis.moved(step)
+            last_seen, last_residual = self.evaluated(last)
+            last_misfit = self._misfit(noise, last_residual, last)
+            if last_misfit < ASTRAY * misfit:
+                hypothesis, seen, residual, misfit = last, last_seen, last_residual, last_misfit
+                made = partial(self.problem.all_columns, hypothesis, seen)
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
         of_each = own_noise.reshape(len(self.problem.shaken), -1)
