@@ -179,7 +179,7 @@ def diagnosis(**changes: Any) -> Diagnosis:
         ("first", "<b>$second$</b>"), np.repeat([0, 1], n // 2), time, (slice(0, n // 2), slice(n // 2, n)), held_out,
         {"turning": turning, "straight": ~turning}, traces, np.deg2rad([1.0, -2.0, 3.0]), np.array([0.01, 0.0, -0.02]),
         np.array([*np.deg2rad([0.1, 0.2, 0.3]), 0.001, 0.002, 0.03]),
-        Unexplained(-1.0, 0.0, "turn rate", np.zeros((n, 3, 1)), np.zeros((n, 3, 0))),
+        Unexplained(-1.0, "turn rate", np.zeros((n, 3, 1)), np.zeros((n, 3, 0))),
         followed=Followed("turn rate, °/s (to port)", "y", 5.0 * np.sin(time / 8.0), noise[:, 1]),
     )  # fmt: skip
     values: dict[str, Any] = {

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 # at rest a bias is observable that looks like scale at speed
 DEFAULTS = {"min_speed": 0.0}
+# a file of more is larger than `export` reads
+MOST_SAMPLES = 5000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,6 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--twin", type=Path, metavar="FOLDER",
         help="write bags with a simulated DVL on the recorded motion: NAME_without and NAME_with the effects found",
     )  # fmt: skip
+    parser.add_argument(
+        "--samples", nargs=2, metavar=("N", "FILE"),
+        help="write the diagnosis with N draws of calibration and effects from their posterior, for export --sample",
+    )  # fmt: skip
     parser.add_argument("-v", "--verbose", action="store_true", help="print all tables as well")
     add_report_option(parser)
     common.add_discovery_options(parser)
@@ -51,6 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         return run_against_simulator(arguments, DEFAULTS)
     check_without(arguments)
     from ..diagnosis.answer.compensation import parameter_file, verified_corrections
+    from ..diagnosis.answer.posterior_samples import with_samples
     from ..diagnosis.answer.results import DiagnosisVerdict, diagnosis_document
     from ..diagnosis.answer.simulated_twin import write_twins
     from ..diagnosis.diagnose import diagnose
@@ -63,13 +70,15 @@ def run(arguments: argparse.Namespace) -> int:
     parameters = common.load(arguments)
     names = recording_names(arguments.bags)
     of_each = _apply_paths(arguments.apply, names)
+    count, sampled = _samples(arguments.samples)
     common.check_outputs(
         arguments,
         "json",
         "apply",
         "report",
         folders=["twin"],
-        also_written={f"--apply of {name}": path for name, path in of_each.items()},
+        also_written={f"--apply of {name}": path for name, path in of_each.items()}
+        | ({} if sampled is None else {"--samples": sampled}),
     )
     _check_twins(arguments.twin, names)
     write_report = report_writer(arguments)
@@ -117,6 +126,7 @@ def run(arguments: argparse.Namespace) -> int:
     common.deliver(
         answer,
         (arguments.json, lambda path: common.write_json(path, diagnosis_document(diagnosis))),
+        (sampled, lambda path: common.write_json(path, with_samples(diagnosis, count))),
         (arguments.apply, apply),
         (arguments.twin, write_all_twins),
         (arguments.report, lambda path: write_report(path, diagnosis)),
@@ -136,6 +146,15 @@ def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
     return {name: path.with_name(f"{path.stem}.{name}{path.suffix}") for name in names}
 
 
+def _samples(words: Sequence[str] | None) -> tuple[int, Path | None]:
+    """Return number and file of --samples, 0 and None without. Raises InputError."""
+    if words is None:
+        return 0, None
+    if not words[0].isdecimal() or not 1 <= int(words[0]) <= MOST_SAMPLES:
+        raise InputError(f"--samples {words[0]}: give a number from 1 to {MOST_SAMPLES}, and a file")
+    return int(words[0]), Path(words[1])
+
+
 def _check_twins(folder: Path | None, names: Sequence[str]) -> None:
     """Raise InputError if a twin exists already, before work is done."""
     from ..diagnosis.answer.simulated_twin import twin_paths
@@ -147,7 +166,7 @@ def _check_twins(folder: Path | None, names: Sequence[str]) -> None:
             raise InputError(f"{path}: exists already; give another folder, or remove it first")
 
 
-NOT_WITH = ("apply", "twin")
+NOT_WITH = ("apply", "twin", "samples")
 NEEDS_SIMULATOR = ("simulator_params", "rounds", "keep")
 
 

@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", type=Path, metavar="DIAGNOSIS", help="what diagnose --json wrote; or a result or parameter file"
     )
+    parser.add_argument("--sample", type=int, metavar="N", help="take a draw of diagnose --samples, from 0")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="settings to write")
 
 
@@ -35,7 +36,7 @@ def run(arguments: argparse.Namespace) -> None:
     missing = missing_beside(arguments.output)
     also_written = {} if missing is None else {"--output, for missing effects,": missing}
     common.check_outputs(arguments, "output", also_written=also_written)
-    exported = write_settings(arguments.simulator, arguments.source, arguments.output)
+    exported = write_settings(arguments.simulator, arguments.source, arguments.output, arguments.sample)
     if missing is not None:
         _print(exported, arguments)
 

@@ -21,7 +21,6 @@ from .answer.confidence_intervals import Times, Triple, covariance_of
 from .answer.dvl_description import dvl_seen
 from .answer.gap_closure import Gap, closure_alone, held_out, measure_gap, with_closure
 from .answer.gap_location import places
-from .answer.held_out_validation import confirmed, settled
 from .answer.noise_findings import noise_findings
 from .answer.plotted_series import collect_series
 from .answer.results import Diagnosis, DiagnosisVerdict, FoundEffect, diagnosis_document
@@ -45,7 +44,7 @@ from .search.effect_selection import EffectSelection, TooFewBinsError, select
 from .search.identifiability import Selected
 from .search.initial_guess import check_clocks
 from .search.observable_parameters import somewhere, with_observable
-from .search.unexplained import Unexplained, matters, moved_by
+from .search.unexplained import Unexplained, matters, moved_by, unexplained, without_replaceable
 
 __all__ = ["diagnose", "diagnose_recordings", "diagnosis_document"]
 
@@ -109,12 +108,12 @@ def diagnose_recordings(
         return _nothing_to_say(_too_short(error.samples, sum(each.seconds for each in recordings)), notes)
     testable = selection.testable
     _check_bounds(selection)
-    selection, rest = settled(selection)
+    selection, rest = without_replaceable(selection)
     residuals = held_out(selection, rest)
     gap = measure_gap(selection, residuals)
-    stands, rest = confirmed(selection, rest, gap)
-    if stands is not selection:
-        selection = stands
+    if selection.selected and gap.fails_elsewhere:
+        selection = selection.without(selection.fit.values)
+        rest = unexplained(selection.fitter, selection.fit)
         residuals = held_out(selection, rest)
         gap = measure_gap(selection, residuals)
     covariance, times = covariance_of(selection)
@@ -155,6 +154,7 @@ def diagnose_recordings(
         twins=twins(selection),
         dvl=dvl_seen(selection, parameters),
         selection=selection,
+        covariance=covariance,
     )
 
 
@@ -234,7 +234,6 @@ CODES = {
 def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
     if matters(selection.fitter.problem, selection.fit, rest):
         return DiagnosisVerdict.UNKNOWN
-    # effects that leave more than the noise on held-out data explain it no better than their equivalents
     if gap.fails_elsewhere:
         return DiagnosisVerdict.UNKNOWN
     if selection.selected and gap.closure < MATERIAL:

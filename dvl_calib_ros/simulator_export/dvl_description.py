@@ -81,9 +81,17 @@ class DvlDescription:
             raise InputError(f"{self.source}: a standard deviation is negative, which cannot be; diagnose again")
 
 
-def load_description(path: Path) -> DvlDescription:
-    """Load from a diagnosis (JSON), a result file or a parameter file (YAML). Raises InputError."""
+def load_description(path: Path, sample: int | None = None) -> DvlDescription:
+    """Load from a diagnosis (JSON), a result file or a parameter file (YAML). Raises InputError.
+
+    sample: number of the draw of `diagnose --samples` to take, from 0; None: the estimate.
+    """
     document = _document(path)
+    if sample is not None:
+        samples = document.get("samples", []) if isinstance(document, dict) else []
+        if not 0 <= sample < len(samples):
+            raise InputError(f"{path}: has {len(samples)} samples, so none of number {sample}; see diagnose --samples")
+        document |= samples[sample]
     if isinstance(document, str):
         return _of_result(path) if document == RESULT else _of_parameters(path)
     if not isinstance(document, dict) or "effects" not in document or "calibration" not in document:

@@ -26,15 +26,15 @@ def missing_beside(output: Path) -> Path | None:
     return None if own_stream(output) is not None else output.with_name(f"{output.name}.missing.json")
 
 
-def write_settings(simulator: str, source: Path, output: Path) -> Export:
+def write_settings(simulator: str, source: Path, output: Path, sample: int | None = None) -> Export:
     """Write a source's DVL as the settings of a simulator, and next to it the list of missing effects.
 
-    source: a diagnosis (JSON), a result or a parameter file (YAML). Either both files are written or none. Raises
-    InputError.
+    source: a diagnosis (JSON), a result or a parameter file (YAML). sample: number of a draw of
+    `diagnose --samples`. Either both files are written or none. Raises InputError.
     """
     if simulator not in SIMULATORS:
         raise InputError(f"{simulator!r} is none of {', '.join(SIMULATORS)}")
-    description = load_description(source)
+    description = load_description(source, sample)
     exported = export(simulator, SIMULATORS[simulator], description)
     files = {output: exported.settings.text.encode()}
     missing = missing_beside(output)

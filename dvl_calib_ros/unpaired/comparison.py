@@ -338,7 +338,16 @@ def compare(
     made = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
     comparison = compare_logs(real, made, effects)
     on_progress(1.0)
-    return comparison
+    return replace(comparison, reasons=(*comparison.reasons, *other_frame(vehicle, simulator)))
+
+
+def other_frame(vehicle: RecordedSide, simulator: RecordedSide) -> tuple[Reason, ...]:
+    """Return the reason for a simulator whose DVL has other axes or another mounting, as configured or discovered."""
+    frames = []
+    for side in (vehicle, simulator):
+        roll, pitch, yaw = np.rad2deg(side.parameters.mounting_rpy).round().astype(int).tolist()
+        frames.append(f"{roll}° {pitch}° {yaw}° (dvl_axes {side.parameters.dvl_axes})")
+    return () if frames[0] == frames[1] else (finding("SIMULATOR_FRAME", vehicle=frames[0], simulator=frames[1]),)
 
 
 def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = EFFECTS) -> UnpairedComparison:
@@ -508,7 +517,7 @@ def _verdict(
     return SimulatorVerdict.NO_DIFFERENCE
 
 
-_CLAIMED = {
+CLAIMED = {
     ComparisonStatus.MISSING: "SIMULATOR_LACKS",
     ComparisonStatus.OTHER_SIZE: "SIMULATOR_OTHER_SIZE",
     ComparisonStatus.ONLY_SIMULATOR: "SIMULATOR_ALONE_HAS",
@@ -525,7 +534,7 @@ def _reasons(
 ) -> tuple[Reason, ...]:
     """Return the verdict's reasons, and the unexplained remainder."""
     reasons = []
-    for status, code in _CLAIMED.items():
+    for status, code in CLAIMED.items():
         named = [" or ".join((each.name, *each.equivalent_to)) for each in effects if each.status is status]
         if named:
             reasons.append(finding(code, names=" and ".join(named)))

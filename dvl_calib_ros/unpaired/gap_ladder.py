@@ -91,8 +91,9 @@ def _values(size: Size) -> Values:
 class Shrunk:
     """Result of the ladder.
 
-    rungs: of the ladder. floor: m/s. errors: (F, 3) m/s held out, DVL frame, by name of the model, nan if unknown.
-    time: (F,) s since the start of the recording recording_of (F,).
+    rungs: of the ladder. floor: m/s, error of the last rung without the vehicle's error beyond its noise, white and
+    slow. errors: (F, 3) m/s held out, DVL frame, by name of the model, nan if unknown. time: (F,) s since the start of
+    the recording recording_of (F,).
     """
 
     rungs: tuple[Rung, ...]
@@ -136,7 +137,10 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
         distance, null95, p = two_samples(recorded[known], made[known], windows[known], rng)
         errors[model.name] = off
         rungs.append(Rung(model.name, _rms(off[known]), distance, null95, p))
-    return Shrunk(tuple(rungs), _floor(errors[ladder[-1].name], recording_of), errors, time, recording_of)
+    gap = vehicle.diagnosis.gap
+    beyond_noise = max(0.0, gap.after**2 - gap.noise_floor**2)
+    floor = float(np.sqrt(max(0.0, rungs[-1].error_mps ** 2 - beyond_noise)))
+    return Shrunk(tuple(rungs), floor, errors, time, recording_of)
 
 
 def _rms(values: Array) -> float:
@@ -148,13 +152,6 @@ def _limited(values: Array) -> Array:
     """Limit values (N, 3) to FAR robust standard deviations."""
     far = FAR * np.maximum(robust_std(values), 1e-9)
     return np.clip(values, -far, far)
-
-
-def _floor(values: Array, recording_of: NDArray[np.intp]) -> float:
-    """Return the rms noise in values (N, 3) by differences between samples, which no simulator can remove."""
-    parts = [values[recording_of == index] for index in np.unique(recording_of)]
-    second = np.concatenate([part[2:] - 2.0 * part[1:-1] + part[:-2] for part in parts])
-    return _rms(second[np.isfinite(second).all(axis=1)]) / float(np.sqrt(6.0))
 
 
 def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:

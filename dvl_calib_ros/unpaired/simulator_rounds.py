@@ -10,9 +10,11 @@ import os
 import tempfile
 from collections.abc import Callable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from ..bags.writer import Compression, Storage
 from ..calibration.models.parameters import Parameters
@@ -31,7 +33,7 @@ from ..simulator_export.dvl_description import load_description
 from ..verdict.answering import Answering
 from ..verdict.reasons import Reason, finding
 from .both_sides import RecordedSide, read_log
-from .comparison import compare, compare_logs
+from .comparison import CLAIMED, compare, compare_logs, other_frame
 from .gap_ladder import is_of_every_run
 from .results import ComparedEffect, SimulatorVerdict, Triple, UnpairedComparison, unpaired_document
 
@@ -39,6 +41,8 @@ MOST_ROUNDS = 9
 # the simulator's velocity is exact: only the corners between its samples are smoothed
 SMOOTHING_S = 0.2
 TRUTH_HZ = 10.0
+# codes of a comparison's reasons that hold beside the differences in effects
+REMAINING = ("SIMULATOR_NOISE", "SIMULATOR_UNKNOWN_REST")
 
 
 @dataclass(frozen=True)
@@ -89,17 +93,21 @@ class ClosedGap(Answering):
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Return the reduction of the gap, and remaining differences of the best round."""
+        """Return the reduction of the gap, the differences found, and those that the best round still has."""
         first, best = self.rounds[0], self.rounds[self.best]
         if len(self.rounds) == 1:
             return (*first.comparison.reasons, finding("SIMULATOR_NO_ROUNDS"))
         floor = 1e3 * best.comparison.floor_mps
         before, after = 1e3 * first.error_mps, 1e3 * best.error_mps
-        outcome = finding("SIMULATOR_ROUNDS", round=self.best, before=before, after=after, floor=floor)
+        added = " and ".join(best.effects) or "the vehicle's noise"
+        outcome = finding("SIMULATOR_ROUNDS", round=self.best, names=added, before=before, after=after, floor=floor)
         if self.best == 0:
             outcome = finding("SIMULATOR_ROUNDS_IN_VAIN", before=before, floor=floor)
-        other_reasons = tuple(each for each in best.comparison.reasons if each.code != "SIMULATOR_PUT_RIGHT")
-        return (outcome, *other_reasons)
+        found = tuple(each for each in first.comparison.reasons if each.code in (*CLAIMED.values(), "SIMULATOR_FRAME"))
+        remaining = tuple(each for each in best.comparison.reasons if each.code in REMAINING)
+        names = ", ".join(each.name for each in best.comparison.effects if each.status.is_claim)
+        left = (finding("SIMULATOR_NOT_ADDED", names=names),) if names and self.best else ()
+        return (outcome, *found, *left, *remaining)
 
 
 def close_gap(
@@ -141,7 +149,8 @@ def close_gap(
         return lambda share: on_progress((number + share) / steps)
 
     real = read_log(vehicle, part(0), effects)
-    found = [Round(compare_logs(real, read_log(simulator, part(1), effects), effects))]
+    as_recorded = compare_logs(real, read_log(simulator, part(1), effects), effects)
+    found = [Round(replace(as_recorded, reasons=(*as_recorded.reasons, *other_frame(vehicle, simulator))))]
     document = None if real.diagnosis.dvl is None else diagnosis_document(real.diagnosis)
     while document is not None and found[-1].claims and len(found) <= rounds:
         if len(found) > 1:
@@ -150,8 +159,9 @@ def close_gap(
                 break
             document = corrected
         made = _simulated(document, len(found), simulator, folder, real.diagnosis)
-        comparison = compare_logs(real, read_log(made, part(1 + len(found)), effects), effects)
-        found.append(Round(comparison, document))
+        log = read_log(made, part(1 + len(found)), effects)
+        log = replace(log, facts=tuple(replace(each, latency=np.zeros(0)) for each in log.facts))  # no real log times
+        found.append(Round(compare_logs(real, log, effects), document))
     on_progress(1.0)
     return ClosedGap(tuple(found))
 

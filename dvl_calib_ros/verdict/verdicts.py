@@ -326,20 +326,26 @@ UNPAIRED = on_page(
     reject("SIMULATOR_LACKS", "the simulator lacks {names}"),
     reject("SIMULATOR_OTHER_SIZE", "the simulator has {names} of another size"),
     reject("SIMULATOR_ALONE_HAS", "the simulator has {names} which the vehicle has not"),
+    marginal("SIMULATOR_FRAME", "its DVL is mounted {simulator}, the vehicle's {vehicle}"),
     accept(
         "SIMULATOR_PUT_RIGHT",
         "put right, its error on the vehicle's own motion falls from {before:.1f} to {after:.1f} mm/s, held out",
     ),
     accept(
         "SIMULATOR_ROUNDS",
-        "after round {round} the simulator's error on the vehicle's own motion is {after:.1f} mm/s instead of "
-        "{before:.1f}, held out; noise alone makes {floor:.1f}",
+        "after round {round}, with {names}, the simulator's error on the vehicle's own motion is {after:.1f} mm/s "
+        "instead of {before:.1f}, held out; noise alone makes {floor:.1f}",
     ),
     marginal(
         "SIMULATOR_ROUNDS_IN_VAIN",
         "put right, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
         "held out; noise alone makes {floor:.1f}",
         means="No round is better than the simulator as recorded.",
+    ),
+    marginal(
+        "SIMULATOR_NOT_ADDED",
+        "no round corrects {names}",
+        means="It happens at a time of a run, differs between recordings, or is observable in one of both logs only.",
     ),
     accept(
         "SIMULATOR_NO_ROUNDS",

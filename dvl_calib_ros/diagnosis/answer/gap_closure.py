@@ -20,8 +20,6 @@ from ..search.effect_selection import EffectSelection
 from ..search.unexplained import Unexplained, matters
 
 RESAMPLES = 1000
-# Noise above this multiple of the reported noise is an error of the instruments, not noise
-WORSE_THAN_CLAIMED = 3.0
 Integers = NDArray[np.intp]
 
 
@@ -34,8 +32,7 @@ class Gap:
     not_explained: noise-free error that is not closed; without effects, the part of `after` above the noise. reported:
     noise reported by the messages, None if missing. by_recording: before and after per recording, if several.
     left_open: predicted part of `after` above the noise, in stretches that alone determine parts of the effects.
-    falls_from: lower 95 per cent bound of the held-out fall, as a share of the gap; shown_from: the same without
-    left_open. drift: of straight dead reckoning with errors before and after, None for a vehicle at rest.
+    drift: of straight dead reckoning with errors before and after, None for a vehicle at rest.
     """
 
     before: float
@@ -47,8 +44,6 @@ class Gap:
     reported: float | None = None
     by_recording: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     left_open: float = 0.0
-    falls_from: float = np.nan
-    shown_from: float = np.nan
     drift: tuple[Drift, Drift] | None = None
 
     @property
@@ -154,18 +149,10 @@ def only(problem: Problem, recording: int) -> Problem:
 
 
 def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
-    """Return held-out errors before and after the effects of a selection, with a bootstrap over blocks."""
+    """Return held-out errors before and after the effects of a selection."""
     before, after, floor = residuals.squares()
     left_open, n = residuals.open_of_blocks(), len(residuals.before)
-    drawn = np.random.default_rng(0).integers(0, len(before), (RESAMPLES, len(before)))
-
-    def falls_from(left: Array) -> float:
-        gap = np.maximum((before - floor)[drawn].sum(axis=-1), 1e-300)
-        share = 1.0 - np.maximum((left - floor)[drawn].sum(axis=-1), 0.0) / gap
-        return float(np.percentile(np.clip(share, -1.0, 1.0), 2.5))
-
     squares = [float(part.sum()) / n for part in (before, after, floor)]
-    is_gap = bool(selection.fit.effects) and squares[0] > squares[2]
     return Gap(
         before=float(np.sqrt(squares[0])),
         after=float(np.sqrt(squares[1])),
@@ -176,8 +163,6 @@ def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
         reported=_reported(selection.fitter.problem),
         by_recording=_by_recording(selection.fitter.problem, residuals),
         left_open=float(np.sqrt(left_open.sum() / n)),
-        falls_from=falls_from(after) if is_gap else np.nan,
-        shown_from=falls_from(after - left_open) if is_gap else np.nan,
         drift=_drift(selection, residuals),
     )
 
@@ -277,9 +262,8 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
     The residual is the noise, per sample: before and after share it, and their difference has the precision of the gap
-    rather than of the noise. Three parts of it are not: what an unknown cause explains, what exceeds the fitted noise,
-    since it is slower, and what exceeds by far the reported noise and is not white. The part that the parameters have
-    absorbed is added.
+    rather than of the noise. Two parts of it are not: what an unknown cause explains, and what exceeds the fitted
+    noise, since it is slower. The part that the parameters have absorbed is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
@@ -288,7 +272,7 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     if matters(problem, fit, rest):
         *_, noise, without = slow.with_rest(problem, slow.noise, rest.clearest)
         followed, unfollowed = (unfollowed**2 - without**2).sum(axis=1), without
-    usual, claimed = noise.energy, claimed_std(problem)
+    usual = noise.energy
     slower = (unfollowed**2).sum(axis=1) - usual
     floor, of_sample = left**2, problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
@@ -299,11 +283,7 @@ def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
         if excess > SETTINGS.noise_tolerance * error * float(usual[of_bin].mean()):
             systematic += excess
         energy = float(floor[at].sum(axis=1).mean())
-        most = np.inf
-        if claimed is not None:
-            white = float(np.nansum(high_frequency_variance(problem.sample_time[at], left[at])[0]))
-            most = max(WORSE_THAN_CLAIMED**2 * float((claimed[recording] ** 2).sum()), white)
-        floor[at] *= max(0.0, min(energy - systematic, most)) / max(energy, 1e-300)
+        floor[at] *= max(0.0, energy - systematic) / max(energy, 1e-300)
     floor[:, measured] += _error_variance(fit, np.arange(fit.columns.shape[2]))[problem.bin_of]
     return floor
 

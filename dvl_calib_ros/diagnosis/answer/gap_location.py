@@ -17,9 +17,8 @@ from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
-from ..noise.whitened_least_squares import WhitenedLeastSquares, orthonormal
+from ..noise.whitened_least_squares import ScoreTest, WhitenedLeastSquares, orthonormal
 from ..search.alternative_regressors import TURNING_RADPS
-from ..search.unexplained import explained
 
 ACCELERATING_MPS2 = 0.05
 STRETCHES = 6
@@ -126,7 +125,7 @@ def _log_p(noise: Noise, functions: Array, q: Array, white: Array, axis: int, ma
     """Return log p of functions of motion (M, c), restricted to a place, for the whitened residual."""
     columns = np.zeros((*noise.level.shape, functions.shape[1]))
     columns[mask, axis] = functions[mask]
-    return explained(q, noise.whiten(columns), white, 1.0)[0]
+    return ScoreTest.of(q, noise.whiten(columns), white).log_p(np.arange(functions.shape[1]))
 
 
 def _bands(gap: Array, nyquist: float) -> list[tuple[float, float, float]]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
 
+from ...calibration.numerics.frames import Array
 from ...effects.registry import EFFECTS
 from ...verdict.answering import Answering
 from ...verdict.reasons import Reason, is_cause
@@ -65,7 +66,7 @@ class Diagnosis(Answering):
     """Result of a diagnosis. reasons: the verdict first. notes: on the data. series: for pictures, if requested.
     calibration: value, low, high of φ (rad) and δk, three of each. compared_axes: in words. recordings: names and first
     stamps (ns). twins: of the recordings. dvl: description for another simulator. selection: the fits, None without
-    one."""
+    one. covariance: (6 + p, 6 + p) of the fit's parameters."""
 
     verdict: DiagnosisVerdict
     reasons: tuple[Reason, ...]
@@ -84,6 +85,7 @@ class Diagnosis(Answering):
     twins: tuple[Twin, ...] = ()
     dvl: DvlSeen | None = None
     selection: EffectSelection | None = field(default=None, repr=False, compare=False)
+    covariance: Array | None = field(default=None, repr=False, compare=False)
 
     def led_by(self, rejection: Reason | None) -> Diagnosis:
         """Return the diagnosis with the calibration's reason against the recording first.

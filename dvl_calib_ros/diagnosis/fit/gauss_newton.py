@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...calibration.numerics.frames import Array
-from ...calibration.numerics.robust import robust_std
 from ...effects.base import Effect
 from ..model.forward_model import Problem, SeenAgain
 from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, whose_parameters
@@ -25,16 +24,12 @@ MAX_STEPS, GAINS_NOTHING = 30, 1e-3
 HALVINGS = 5
 # The last step is rejected if it increases the misfit by this factor
 ASTRAY = 30.0
-# Squared cosine between successive steps from which they are extrapolated
-ALIKE = 0.9
 # Standard deviations of the chance gain from other noise that are subtracted
 BY_CHANCE = 1.5
 # Prior σ of an effect's parameters, in typical sizes: wide, to act only on unobservable parameters
 PRIOR_IN_TYPICAL = 50.0
 # Bounds below which a fit is skipped as worse: deviance, plus a share of its first step's gain for nonlinearity
 SURELY, BENT = 2.0, 0.2
-# A burst: outliers with neighbours beyond half of that, of at most this share of the recording
-RARE = 0.02
 # Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2)
 OF_A_TIME = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 # Half width, in standard deviations, of a 95 per cent interval
@@ -125,7 +120,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class _Looked:
+class _Linearisation:
     """Linearisation of a hypothesis under a noise: seen, residual and columns as in `Fit`; system of its step."""
 
     seen: tuple[Seen, ...]
@@ -147,17 +142,6 @@ class Fitter:
         """Return a fitter with some bins (M,) held out."""
         return replace(self, held=held, _fits={})
 
-    def bursts(self, fit: Fit) -> Mask:
-        """Return (M,) bins with large errors for some seconds, too few for an effect.
-
-        The residual is not whitened: bursts would determine the noise's colour.
-        """
-        raw = (fit.residual + self.outliers) / fit.noise.level
-        size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
-        run = np.cumsum(np.diff(size > 0.5 * SETTINGS.outlying, prepend=False))  # odd in the runs, even between them
-        far = np.isin(run, run[size > SETTINGS.outlying])
-        return far & (np.count_nonzero(far) <= RARE * len(far))
-
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
         """Evaluate a hypothesis; return the evaluation and the residual (M, A)."""
         seen = tuple(self.problem.all_seen(hypothesis))
@@ -167,14 +151,14 @@ class Fitter:
         """Return derivatives of the residual, (M, A, 6 + p)."""
         return self.problem.all_columns(hypothesis, seen)
 
-    def _looked(
+    def _linearised(
         self, hypothesis: Hypothesis, noise: Noise, seen: tuple[Seen, ...] | None = None, residual: Array | None = None
-    ) -> _Looked:
+    ) -> _Linearisation:
         """Linearise a hypothesis. seen, residual: its evaluation, if known."""
         if seen is None or residual is None:
             seen, residual = self.evaluated(hypothesis)
         columns = self.columns(hypothesis, seen)
-        return _Looked(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
+        return _Linearisation(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
 
     def _white(self, noise: Noise, values: Array) -> Array:
         white = noise.whiten(values)
@@ -193,32 +177,30 @@ class Fitter:
         max_steps: int = MAX_STEPS,
         only_of_the_day: bool = False,
         fixed: frozenset[str] = frozenset(),
-        looked: _Looked | None = None,
+        linearised: _Linearisation | None = None,
         evaluated: Evaluated | None = None,
     ) -> Fit:
         """Fit a hypothesis under a noise. only_of_the_day: fit parameters per recording only.
 
-        fixed: names of effects whose values are fixed. looked, evaluated: linearisation or evaluation of the start, if
-        known.
+        fixed: names of effects whose values are fixed. linearised, evaluated: linearisation or evaluation of the
+        start, if known.
         """
         kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
         kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
         hypothesis = start
-        if looked is not None:
-            evaluated = looked.seen, looked.residual
+        if linearised is not None:
+            evaluated = linearised.seen, linearised.residual
         seen, residual = evaluated or self.evaluated(hypothesis)
         misfit = self._misfit(noise, residual, hypothesis)
-        length, before = 1.0, np.zeros(len(kept))
         for _ in range(max_steps):
-            looked = looked or self._looked(hypothesis, noise, seen, residual)
-            system = looked.system
+            linearised = linearised or self._linearised(hypothesis, noise, seen, residual)
+            system = linearised.system
             free = np.flatnonzero(~kept)
-            step, std = np.zeros(len(kept)), np.sqrt(np.diag(system.covariance()))
+            step = np.zeros(len(kept))
             step[free] = system.part(free).solution() if len(free) else 0.0
             if misfit - system.misfit(step) < GAINS_NOTHING:
                 break
-            length = _length(step / std, before, length)
-            moved, tried, before = False, length * step, step / std
+            moved, tried = False, step
             for _ in range(HALVINGS):
                 trial = hypothesis.moved(tried)
                 trial_seen, trial_residual = self.evaluated(trial)
@@ -229,10 +211,10 @@ class Fitter:
                 tried = 0.4 * tried
             if not moved:
                 break
-            looked = None
+            linearised = None
             hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
-        looked = looked or self._looked(hypothesis, noise, seen, residual)
-        columns, plain = looked.columns, looked.system
+        linearised = linearised or self._linearised(hypothesis, noise, seen, residual)
+        columns, plain = linearised.columns, linearised.system
         made: Callable[[], Array] = partial(np.asarray, columns)
         system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
         free = np.flatnonzero(~kept)
@@ -339,12 +321,12 @@ class Fitter:
                 continue
             moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
             hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
-            looked = self._looked(hypothesis, fit.noise)
+            linearised = self._linearised(hypothesis, fit.noise)
             if at_rest is None or at_rest[0] is not fit:
                 at_rest = fit, self._promised(fit)
-            if self._is_surely_worse(hypothesis, looked, fit.noise, fit.deviance, at_rest[1]):
+            if self._is_surely_worse(hypothesis, linearised, fit.noise, fit.deviance, at_rest[1]):
                 continue
-            trial = self.fit(hypothesis, fit.noise, 3, looked=looked)
+            trial = self.fit(hypothesis, fit.noise, 3, linearised=linearised)
             if trial.deviance < fit.deviance:
                 fit = trial
         return fit
@@ -355,16 +337,16 @@ class Fitter:
         return self._misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
 
     def _is_surely_worse(
-        self, hypothesis: Hypothesis, looked: _Looked, noise: Noise, deviance: float, promised: float = 0.0
+        self, hypothesis: Hypothesis, linearised: _Linearisation, noise: Noise, deviance: float, promised: float = 0.0
     ) -> bool:
         """Return whether a hypothesis, fitted, would have a larger deviance, by one linear step.
 
         The step's predicted deviance is the minimum except for nonlinearity. promised: predicted gain from a nearby
         converged fit of this deviance, subtracted as unattainable (`_promised`).
         """
-        own_noise = self._own_noise(hypothesis, noise, looked.residual + self.outliers)
-        least = looked.system.misfit(looked.system.solution())
-        gained = self._misfit(noise, looked.residual, hypothesis) - least
+        own_noise = self._own_noise(hypothesis, noise, linearised.residual + self.outliers)
+        least = linearised.system.misfit(linearised.system.solution())
+        gained = self._misfit(noise, linearised.residual, hypothesis) - least
         least -= float(own_noise @ own_noise)
         if least > deviance + SURELY + BENT * gained:
             return True
@@ -392,10 +374,10 @@ class Fitter:
 
     def _worse_at(self, moved: Hypothesis, fit: Fit) -> float:
         """Return the deviance increase of a fit at another time, infinite if it is certainly too large."""
-        looked = self._looked(moved, fit.noise)
-        if self._is_surely_worse(moved, looked, fit.noise, fit.deviance + SETTINGS.conclusive):
+        linearised = self._linearised(moved, fit.noise)
+        if self._is_surely_worse(moved, linearised, fit.noise, fit.deviance + SETTINGS.conclusive):
             return np.inf
-        return self.fit(moved, fit.noise, 2, looked=looked).deviance - fit.deviance
+        return self.fit(moved, fit.noise, 2, linearised=linearised).deviance - fit.deviance
 
     def moved_by_time(self, fit: Fit, effect: Effect, name: str, recording: int, ends: Sequence[float]) -> Array:
         """Return the covariance (6 + p, 6 + p) due to a time's uncertainty. ends: of its 95 per cent interval, s."""
@@ -413,18 +395,6 @@ def _with_time(fit: Fit, effect: Effect, name: str, recording: int, at: float) -
     per = fit.values[effect.name]
     moved = tuple({**each, name: at} if index == recording else each for index, each in enumerate(per))
     return replace(fit.hypothesis, values={**fit.values, effect.name: moved})
-
-
-def _length(step: Array, before: Array, length: float) -> float:
-    """Return the length of a Gauss-Newton step (n,), given the previous step (n,) and length; steps are whitened.
-
-    Far from the optimum (an effect is missing), second derivatives matter: each step is nearly the previous one times a
-    factor, possibly negative. This length then leads to the limit (Aitken, Δ²).
-    """
-    before_square, along = float(before @ before), float(step @ before)
-    if along**2 < ALIKE * before_square * float(step @ step) or before_square == 0.0:
-        return 1.0
-    return float(np.clip(length / max(1.0 - along / before_square, 0.1), 0.3, 5.0))
 
 
 def n_amplitudes(effect: Effect, n_recordings: int) -> int:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...calibration.numerics.distributions import chi2_logsf
 from ...calibration.numerics.frames import Array
 
 # Share of noise in a direction's squares from which the direction is excluded
@@ -134,3 +135,8 @@ class ScoreTest:
         apart = squares > INDEPENDENT**2
         along = directions[:, apart].T @ self.along[at]
         return float(np.sum(along**2 / squares[apart])), int(np.count_nonzero(apart))
+
+    def log_p(self, at: NDArray[np.intp]) -> float:
+        """Return log p of the energy that columns `at` explain jointly."""
+        energy, dof = self.energy(at)
+        return float(chi2_logsf(energy, dof)) if dof else 0.0

@@ -73,7 +73,7 @@ def is_open(guesses: Sequence[FirstGuess]) -> bool:
     return any(each.registration is not None and bool(each.registration.left_open.any()) for each in guesses)
 
 
-def told_apart(guesses: Sequence[FirstGuess]) -> set[str]:
+def separable_clocks(guesses: Sequence[FirstGuess]) -> set[str]:
     """Return the clock offsets of recordings that leave less than `OPEN_M` of the lever arm open to a clock."""
     found = [each.registration for each in guesses if each.registration is not None]
     return {name for each in found if np.trace(each.left_open[3:6, 3:6]) < OPEN_M**2 for name in each.offsets}

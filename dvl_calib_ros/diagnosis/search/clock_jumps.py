@@ -44,7 +44,9 @@ class Delays:
     begins: tuple[int, ...]
 
 
-def leaping(fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]) -> list[Hypothesis]:
+def hypotheses_with_jumps(
+    fitter: Fitter, fit: Fit, once: Mapping[str, Effect], every: Mapping[str, Effect]
+) -> list[Hypothesis]:
     """Return hypotheses with clock jumps at the delay changes of one recording, replacing effects that resemble jumps.
 
     once, every: effects with one and with two jumps. Empty if the fit has no effect of time.
@@ -112,7 +114,7 @@ def _is_as_large(by: float, gap: float) -> bool:
     return gap - AS_LARGE_S < by < (0.0 if gap < 0.0 else gap + AS_LARGE_S)
 
 
-def in_gaps(fitter: Fitter, fit: Fit) -> Fit:
+def with_jumps_in_gaps(fitter: Fitter, fit: Fit) -> Fit:
     """Return a fit with its clock jumps moved to gaps of matching size, if the time is equally likely.
 
     Outliers near the gap are not corrected: a wrong jump time would have caused them.

@@ -43,7 +43,7 @@ from .backward_elimination import (
     repeated_effects,
 )
 from .candidates import intermittent_effects, proposed, variants_about
-from .clock_jumps import in_gaps, leaping
+from .clock_jumps import hypotheses_with_jumps, with_jumps_in_gaps
 from .identifiability import Selected, identify_effects
 from .initial_guess import FirstGuess, first_guess
 from .observable_parameters import observable_parts, unobservable_parts, without_insignificant
@@ -80,10 +80,6 @@ class EffectSelection:
         hypothesis = self.fit.hypothesis.with_effects(kept, len(self.fit.seen), {})
         selected = tuple(each for each in self.selected if each.effect.name not in names)
         return replace(self, selected=selected, fit=self.fitter.fit(hypothesis, self.fit.noise))
-
-    def withdrawn(self) -> EffectSelection:
-        """Return the selection without any effect."""
-        return replace(self, selected=(), fit=self.base, opened=None, moved={})
 
 
 class TooFewBinsError(Exception):
@@ -133,33 +129,29 @@ def select(
         problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
         problem = replace(problem, unshown=fitter.problem.unshown)
         fitter, fit = _first_fit(problem, fit.hypothesis)
-    fitter, fit = _about(fitter, fit, every)
-    far = fitter.bursts(fit)
-    if far.any():
-        problem = problem.without(far)
-        fitter, fit = _about(*_first_fit(problem, fit.hypothesis), every)
+    fitter, fit = with_noise_reestimated(fitter, fit, every)
     best = fit
     seen_before: set[frozenset[str]] = set()
     for _ in range(ROUNDS):
         candidates = [*proposed(fitter, fit, effects), *with_two_cycles(fitter, fit, heading)]
         fits = [fitter.fit_kept(hypothesis, fit.noise) for hypothesis in candidates]
-        fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in leaping(fitter, fit, effects, every)]
+        fits += [fitter.fit(hypothesis, fit.noise) for hypothesis in hypotheses_with_jumps(fitter, fit, effects, every)]
         fits += repeated_effects(fitter, fits, every, effects)
         finer = finer_steps(problem)
         for hypothesis in intermittent_effects(fitter, fit, effects):
             as_white = fitter.refined(fitter.fit(hypothesis, fit.noise.white), finer)
             fits.append(fitter.fit(as_white.hypothesis, fit.noise))
         fits = [fitter.refined(each, finer[:3]) for each in fits]  # a time of the run is coarse until then
-        best = in_gaps(fitter, fitter.refined(best_of(fits, effects), finer[3:]))
+        best = with_jumps_in_gaps(fitter, fitter.refined(best_of(fits, effects), finer[3:]))
         best = eliminate(fitter, best, len(effects))
-        fitter, fit = _about(fitter, best, every)
+        fitter, fit = with_noise_reestimated(fitter, best, every)
         names = frozenset(effect.name for effect in fit.effects)
         if names in seen_before:
             break
         seen_before.add(names)
     wider = eliminate(fitter, fit, len(effects))
     fit = only_predictive(fitter, wider, len(effects))
-    fitter, fit = _about(fitter, fit, every)
+    fitter, fit = with_noise_reestimated(fitter, fit, every)
     fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
     told = identify_effects(fitter, fit, guesses, effects, alike)
@@ -188,17 +180,17 @@ def _first_fit(problem: Problem, start: Hypothesis) -> tuple[Fitter, Fit]:
     return fitter, fit
 
 
-def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit]:
+def with_noise_reestimated(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fitter, Fit]:
     """Repeat a fit with noise and outliers re-estimated from the residual of all columns jointly."""
     problem = fitter.problem
-    columns = _always_there(fitter, fit, effects)
+    columns = _columns_of_all_effects(fitter, fit, effects)
     noise = fit.noise
     raw = fit.residual + fitter.outliers
     size = np.maximum(np.sqrt((columns**2).mean(axis=(0, 1))), 1e-12)
     columns = columns / size
     own = [
         np.concatenate([each / size - columns, (residual - raw)[:, :, None]], axis=2)
-        for each, residual in _shaken(fitter, fit, effects)
+        for each, residual in _with_simulated_noise(fitter, fit, effects)
     ]
     frames = _frames(problem)
     for _ in range(2):
@@ -212,18 +204,18 @@ def _about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> tuple[Fit
     return fitter, fitter.fit(fit.hypothesis, noise)
 
 
-def _always_there(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Array:
+def _columns_of_all_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Array:
     """Return columns (M, A, p) of a fit and of all effects without a time of the run."""
     others = {name: effect for name, effect in effects.items() if not any(map(is_time_of_run, effect.parameters))}
     return np.concatenate([fit.columns, *(each.columns for each in variants_about(fitter, fit, others))], axis=2)
 
 
-def _shaken(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator[tuple[Array, Array]]:
+def _with_simulated_noise(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator[tuple[Array, Array]]:
     """Yield the same columns (M, A, p) and residual (M, A) with simulated noise in each velocity in turn."""
     for problem in fitter.problem.shaken:
         other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
         again = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
-        yield _always_there(other, again, effects), problem.residual(seen)
+        yield _columns_of_all_effects(other, again, effects), problem.residual(seen)
 
 
 def _frames(problem: Problem) -> list[Array | None]:
@@ -255,7 +247,7 @@ def _with_what_is_shown_of_the_arm(
         effects, others = {**effects, ARM: arm}, [effect for effect in fit.effects if effect.name != ARM]
         values = tuple(dict(each) for each in fit.values[ARM])  # unobservable parts are held at their values
         hypothesis = fit.hypothesis.with_effects([arm, *others], len(values), {ARM: values})
-        fitter, fit = _about(fitter, fitter.fit(hypothesis, fit.noise), every)
+        fitter, fit = with_noise_reestimated(fitter, fitter.fit(hypothesis, fit.noise), every)
     return fitter, fit, effects
 
 
@@ -276,7 +268,7 @@ def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hy
     """
     if heading is None or len(fit.seen) < 2:
         return []
-    found = [_instead(fit, BY_YAW, each) for each in _two_cycles(heading)]
+    found = [_with_heading_in_place(fit, BY_YAW, each) for each in _two_cycles(heading)]
     if BY_YAW & fit.values.keys():
         return found
     straight = [fitter.straight_on(fit, each) for each in (fit.hypothesis, *found)]
@@ -291,13 +283,14 @@ def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit
     if DRIFT in fit.values:
         own = next((_names(each) for each in fit.effects if each.name == HEADING), frozenset())
         drifting = heading.without(_names(heading) - own - {OF_DRIFT})
-        found = fitter.fit_kept(_instead(fit, {DRIFT, HEADING}, drifting), fit.noise)
+        found = fitter.fit_kept(_with_heading_in_place(fit, {DRIFT, HEADING}, drifting), fit.noise)
         if found.deviance < fit.deviance + SETTINGS.indistinguishable:
             fit = found
             alike[HEADING] = DRIFT
     if MOVED in fit.values:
         of_vehicle, of_day = (
-            fitter.fit_kept(_instead(fit, {MOVED, HEADING}, each), fit.noise) for each in _two_cycles(heading)
+            fitter.fit_kept(_with_heading_in_place(fit, {MOVED, HEADING}, each), fit.noise)
+            for each in _two_cycles(heading)
         )
         if of_vehicle.deviance < fit.deviance + SETTINGS.indistinguishable:
             return of_vehicle, {HEADING: MOVED}
@@ -316,7 +309,7 @@ def _names(effect: Effect) -> frozenset[str]:
     return frozenset(spec.name for spec in effect.parameters)
 
 
-def _instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
+def _with_heading_in_place(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
     """Return the hypothesis of a fit with a heading error in place of the named effects."""
     n = len(fit.seen)
     none = {name: value for name, value in heading.defaults.items() if name in _names(heading)}

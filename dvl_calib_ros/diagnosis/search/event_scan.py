@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...calibration.numerics.distributions import chi2_logsf
 from ...calibration.numerics.frames import Array
 from ..fit.gauss_newton import Fit
 from ..model.forward_model import Problem
@@ -86,8 +85,7 @@ def _log_p(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) ->
     m, axes, k, c = columns.shape
     whitened = fit.noise.part(part).whiten(columns.reshape(m, axes, k * c))
     test = ScoreTest.of(basis, whitened, white, axes * part.start)
-    energies = (test.energy(at) for at in np.arange(k * c).reshape(k, c))
-    return [float(chi2_logsf(energy, dof)) if dof else 0.0 for energy, dof in energies]
+    return [test.log_p(at) for at in np.arange(k * c).reshape(k, c)]
 
 
 def _steps(time: Array) -> Array:

@@ -33,7 +33,7 @@ from .arm_clock_ambiguity import (
     moved_arm,
     moved_lag,
     opened_arm,
-    told_apart,
+    separable_clocks,
     with_arm,
     with_clocks,
 )
@@ -72,25 +72,27 @@ def identify_effects(
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
     opened = opened_arm(guesses) if ARM in fit.values else None
     if is_open(guesses):
-        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened, told_apart(guesses))
-    selected = [_or_else(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
+        selected = _clock_or_arm(fitter, fit, selected, len(effects), called_for, opened, separable_clocks(guesses))
+    selected = [_with_equivalents(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
     rivals = [one for each in selected if opened is not None and each.effect.name in CLOCKS for one in each.rivals]
     freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), opened)
     clocks = tuple(effect.name for effect in (freed or fit).effects if effect not in fit.effects)
     if freed is None:
         clocks = tuple(name for name in TWO_CLOCKS if name not in fit.values)
     if clocks:
-        selected = [_or_else(each, clocks) if each.effect.name == ARM else each for each in selected]
+        selected = [_with_equivalents(each, clocks) if each.effect.name == ARM else each for each in selected]
     if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
         opened = replace(opened, late=IN_TIME_STD_S)  # only their combination is observable
     if opened is not None:  # a lag differs from a delay by less than interpolation errors
         selected = [
-            _or_else(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
+            _with_equivalents(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
         ]
     fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
     if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
-        selected = [_or_else(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected]
+        selected = [
+            _with_equivalents(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected
+        ]
     return Identifiability(tuple(sorted(selected, key=lambda each: each.log_p)), fit, opened, moved)
 
 
@@ -139,8 +141,8 @@ def _clock_or_arm(
     """Merge lever arm and clock into one entry if each is insignificant given the other.
 
     called_for: selected effects; a further clock is named only if significant. opened: from `opened_arm`; a reference
-    delay within that ambiguity is insignificant. known: from `told_apart`; an insignificant arm cannot stand in for
-    these clocks.
+    delay within that ambiguity is insignificant. known: from `separable_clocks`; an insignificant arm is no
+    alternative to these clocks.
     """
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
@@ -171,7 +173,7 @@ def _clock_or_arm(
     return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
 
 
-def _or_else(selected: Selected, names: Sequence[str]) -> Selected:
+def _with_equivalents(selected: Selected, names: Sequence[str]) -> Selected:
     """Add equivalent effects to an effect."""
     others = (name for name in (*names, *selected.equivalent) if name != selected.effect.name)
     return replace(selected, equivalent=tuple(dict.fromkeys(others)))

@@ -6,6 +6,7 @@ of the vehicle's motion, so a residual that follows the motion is systematic.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,16 +18,16 @@ from ...calibration.numerics.frames import Array
 from ...calibration.streams.interpolation import shortened
 from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
-from ..fit.cross_validation import predictive_gain
+from ..fit.cross_validation import predictive_gain, surprise_elsewhere
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..fit.selection_criteria import NuisanceFit, SlowNoiseOfFit
 from ..model.forward_model import Problem
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
-from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import ScoreTest, orthonormal
 from .alternative_regressors import ALTERNATIVES, dictionary
+from .effect_selection import EffectSelection
 from .event_scan import events
 
 # Spectral lines: longer than wave periods; more periods than the time dictionary resolves
@@ -48,17 +49,15 @@ OF_GROUP = 0.02
 class Unexplained:
     """Result of the score tests. log_p: of the best entry or of all jointly, adjusted for multiple tests.
 
-    energy: excess over the null, in noise variances. about: name of the regressor, or a period (s). columns: (M, A, f),
-    the dictionary; empty if insignificant. clearest: (M, A, c), the most significant columns. clear_energy: explained
-    by these. price: quantile of the best test under the null at `SETTINGS.robust_level`.
+    about: name of the regressor, or a period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest:
+    (M, A, c), the most significant columns. price: quantile of the best test under the null at
+    `SETTINGS.robust_level`.
     """
 
     log_p: float
-    energy: float
     about: str | float
     columns: Array
     clearest: Array
-    clear_energy: float = 0.0
     price: float = 0.0
 
     @property
@@ -74,71 +73,52 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
-def unexplained(fitter: Fitter, fit: Fit, asked: float = -np.inf) -> Unexplained:
+def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     """Test the residual of a fit against the dictionary.
 
-    The null distribution is from recordings simulated from the fit (parametric bootstrap). asked: required excess over
-    the price; return early without a finding if no test can reach it.
+    The null distribution is from recordings simulated from the fit (parametric bootstrap).
     """
     problem, noise = fitter.problem, fit.noise
-    looks, white, raw, basis = _looked(fitter, fit, problem, fit.seen, fit.residual)
+    score_tests, white, raw, basis = _score_tests(fitter, fit, problem, fit.seen, fit.residual)
     nothing = raw["time"][:, :, :0]
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
     left = noise.whiten(fit.residual)
     left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
     followed = lines(problem, left.reshape(-1, problem.axes))
-    tested = len(looks) + len(followed)
-    happened = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
-    if happened:  # slow noise explains a step as well, unless the step predicts better
+    tested = len(score_tests) + len(followed)
+    found_events = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
+    if found_events:  # slow noise explains a step as well, unless the step predicts better
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
         least = INEXACT * (base.deviance - fit.deviance)
-        happened = [
+        found_events = [
             each
-            for each in happened
+            for each in found_events
             if _is_predictive(problem, fit, each.columns, least + _price(tested + each.tried, each.columns.shape[2]))
         ]
-    if asked > -np.inf and not happened:
-        most = [(look.energy - look.dof + len(look.at), len(look.at)) for look in looks]
-        for line in followed:
-            waves = _along_axes(line.waves, problem.axes)
-            energy = explained(basis[: left.size, :0], noise.whiten(waves), left, 1.0)[1]
-            most.append((energy + waves.shape[2], waves.shape[2]))
-        prices = {columns: _price(tested, columns) for columns in {columns for _, columns in most}}
-        if max(each - prices[columns] for each, columns in most) < asked:
-            return Unexplained(0.0, 0.0, "", nothing, nothing)
     looked_at = float(np.log(tested))
     nominal = [
-        *(each.log_p for each in happened),
-        *(look.log_p() for look in looks),
+        *(each.log_p for each in found_events),
+        *(test.log_p() for test in score_tests),
         *(line.log_p for line in followed),
     ]
     if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
-        return Unexplained(min(min(nominal) + looked_at, 0.0), 0.0, "", nothing, nothing)
-    grown = _grown(fitter, fit, looks)
-    of_group = {look.name: by for look, by in zip(looks, grown, strict=True) if look.is_whole}
+        return Unexplained(min(min(nominal) + looked_at, 0.0), "", nothing, nothing)
+    grown = _inflation_under_null(fitter, fit, score_tests)
     tests: list[tuple[float, str | float, Array]]
-    tests = [(look.log_p(by), look.name, raw[look.name][:, :, look.at]) for look, by in zip(looks, grown, strict=True)]
+    tests = [
+        (test.log_p(by), test.name, raw[test.name][:, :, test.at]) for test, by in zip(score_tests, grown, strict=True)
+    ]
     tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
-    tests += [(each.log_p, each.about, each.columns) for each in happened]
+    tests += [(each.log_p, each.about, each.columns) for each in found_events]
     best = min(tests, key=_first)
     about = _plainest(tests, best[0])
     log_p = best[0] + looked_at
-    whole = [(look.energy / by, look.dof) for look, by in zip(looks, grown, strict=True) if look.is_whole]
-    energy = max(*(each - dof for each, dof in whole), 0.0)
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
-    clearest = noise.whiten(best[2])
-    tested = next((tested + each.tried for each in happened if each.about == best[1]), tested)
-    held_against = (basis[: left.size, :0], clearest, left)
-    if not isinstance(best[1], float):
-        held_against = (basis, clearest, white)
-    clear_energy = explained(*held_against, 1.0)[1]
-    clear_energy = (clear_energy + best[2].shape[2]) / of_group.get(str(best[1]), 1.0)
-    energy = max(energy, clear_energy - best[2].shape[2])  # a period is of no group
-    cost = _price(tested, best[2].shape[2])
-    found = Unexplained(min(log_p, 0.0), energy, about[1], columns, best[2], clear_energy, cost)
+    tested = next((tested + each.tried for each in found_events if each.about == best[1]), tested)
+    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _price(tested, best[2].shape[2]))
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
 
 
@@ -160,11 +140,10 @@ def _first(each: tuple[float, str | float, Array]) -> float:
 
 @dataclass(frozen=True)
 class FollowTest:
-    """Score test. name: of the group; at: columns under test; energy: chi-square of dof; is_whole: all columns."""
+    """Score test. name: of the group; at: columns under test; energy: chi-square of dof."""
 
     name: str
     at: NDArray[np.intp]
-    is_whole: bool
     energy: float
     dof: int
 
@@ -173,7 +152,7 @@ class FollowTest:
         return float(chi2_logsf(self.energy / grown, max(self.dof, 1))) if self.dof else 0.0
 
 
-def _looked(
+def _score_tests(
     fitter: Fitter, fit: Fit, problem: Problem, seen: Sequence[Seen], residual: Array
 ) -> tuple[list[FollowTest], Array, dict[str, Array], Array]:
     """Return tests of a residual (M, A), the whitened residual, each group's columns and the basis.
@@ -187,15 +166,14 @@ def _looked(
     white = white - q @ (q.T @ white)
     unshown = known.columns.shape[2] - own.shape[2]
     white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unshown))
-    looks: list[FollowTest] = []
+    score_tests: list[FollowTest] = []
     raw: dict[str, Array] = {}
-    sound = ~_upset(fitter, noise)[:, None]
     for name, functions in dictionary(problem, seen).items():
-        raw[name] = _along_axes(functions * sound, problem.axes)
+        raw[name] = _along_axes(functions, problem.axes)
         told = ScoreTest.of(q, noise.whiten(raw[name]), white)
-        for number, at in enumerate(_looks(name, functions.shape[1], problem.axes)):
-            looks.append(FollowTest(name, at, number == 0, *told.energy(at)))
-    return looks, white, raw, q
+        for at in _columns_of_tests(name, functions.shape[1], problem.axes):
+            score_tests.append(FollowTest(name, at, *told.energy(at)))
+    return score_tests, white, raw, q
 
 
 def _beside_prior(known: NuisanceFit, columns: Array, white: Array) -> tuple[Array, Array]:
@@ -207,21 +185,13 @@ def _beside_prior(known: NuisanceFit, columns: Array, white: Array) -> tuple[Arr
     return basis, np.concatenate([white, known.centre / known.std])
 
 
-def _upset(fitter: Fitter, noise: Noise) -> NDArray[np.bool_]:
-    """Return (M,) bins with an outlier in or next to them: it affects the motion regressors as well."""
-    if not isinstance(fitter.outliers, np.ndarray):
-        return np.zeros(len(noise.level), dtype=bool)
-    far = np.abs(noise.whiten(fitter.outliers)).reshape(noise.level.shape).max(axis=1) > SETTINGS.outlying
-    return np.asarray(far | np.append(far[1:], False) | np.append(False, far[:-1]))
-
-
-def _grown(fitter: Fitter, fit: Fit, looks: Sequence[FollowTest]) -> list[float]:
+def _inflation_under_null(fitter: Fitter, fit: Fit, score_tests: Sequence[FollowTest]) -> list[float]:
     """Return the inflation of each test's energy over chi-square in simulated recordings, at least 1."""
-    energy, dof = np.full(len(looks), PRIOR_DOF), np.full(len(looks), PRIOR_DOF)
+    energy, dof = np.full(len(score_tests), PRIOR_DOF), np.full(len(score_tests), PRIOR_DOF)
     for other, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
-        found, *_ = _looked(fitter, fit, other, seen, residual)
-        energy += [look.energy for look in found]
-        dof += [look.dof for look in found]
+        found, *_ = _score_tests(fitter, fit, other, seen, residual)
+        energy += [test.energy for test in found]
+        dof += [test.dof for test in found]
     return np.maximum(energy / dof, 1.0).tolist()
 
 
@@ -273,13 +243,46 @@ def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
 
 
 def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:
-    return holds_out(problem, fit, columns) > least - columns.shape[2]
-
-
-def holds_out(problem: Problem, fit: Fit, columns: Array) -> float:
-    """Return the held-out deviance gain of columns (M, A, c) beside a fit's."""
+    """Return whether columns (M, A, c), added to a fit, gain more than the least in held-out deviance."""
     slow = SlowNoiseOfFit.of_fit(problem, fit)
-    return predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
+    gain = predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
+    return gain > least - columns.shape[2]
+
+
+def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:
+    """Reject effects that an unknown cause explains better or may contribute to; return also the new residual's tests.
+
+    Better means better prediction of held-out stretches. A group of functions that contains the effects includes their
+    cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
+    """
+    fitter, fit = selection.fitter, selection.fit
+    problem, rest = fitter.problem, unexplained(fitter, fit)
+    best: tuple[float, EffectSelection, Unexplained] | None = None
+    for out in _subsets(selection):
+        reduced = selection.without({effect.name for effect in out})
+        drop = reduced.fit.deviance - fit.deviance
+        if drop > SETTINGS.instead_of:
+            continue
+        other = unexplained(fitter, reduced.fit)
+        if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
+            continue
+        gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop
+        if gain > 0.0 and (best is None or gain > best[0]):
+            best = gain, reduced, other
+    return (selection, rest) if best is None else best[1:]
+
+
+def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
+    """Return the held-out deviance gain of an unmodelled regressor over the removed effects."""
+    whole, rest = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
+    rest = rest.and_rest(other.clearest, reduced.residual)
+    effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
+    return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
+
+
+def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
+    effects = selection.fit.effects
+    return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
 
 def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
@@ -314,18 +317,11 @@ def _along_axes(functions: Array, axes: int) -> Array:
     return np.einsum("mc,ij->mijc", functions, np.eye(axes)).reshape(m, axes, axes * c)
 
 
-def _looks(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
+def _columns_of_tests(name: str, c: int, axes: int) -> list[NDArray[np.intp]]:
     """Return columns of `_along_axes` per test: the group, each axis and each alternative."""
     index = np.arange(axes * c).reshape(axes, c)
-    looks = [index.ravel(), *index]
+    parts = [index.ravel(), *index]
     if name not in ALTERNATIVES:
-        return looks
+        return parts
     together = ALTERNATIVES[name]
-    return [*looks, *(index[:, at : at + together].ravel() for at in range(0, c, together))]
-
-
-def explained(q: Array, white_columns: Array, white: Array, variance: float) -> tuple[float, float]:
-    """Return log p of the energy of a whitened series in some columns, and its excess over the null."""
-    energy, dof = ScoreTest.of(q, white_columns, white).energy(np.arange(white_columns.shape[1]))
-    energy /= variance
-    return (float(chi2_logsf(energy, dof)), energy - dof) if dof else (0.0, 0.0)
+    return [*parts, *(index[:, at : at + together].ravel() for at in range(0, c, together))]

@@ -17,7 +17,7 @@ from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.recorded_streams import make_recording
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise.noise_model import white_noise
-from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection, _about
+from dvl_calib_ros.diagnosis.search.effect_selection import EffectSelection, with_noise_reestimated
 from dvl_calib_ros.diagnosis.search.identifiability import Selected
 from dvl_calib_ros.diagnosis.search.unexplained import Unexplained
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -56,13 +56,15 @@ def test_nine_of_ten_true_closures_are_inside_the_interval(memory_s, times):
     rng, effect = np.random.default_rng(5), EFFECTS["velocity_bias"]
     clean = Fitter(_problem(np.zeros((300, 3)), times * BIAS))
     start = no_effect().with_effects([effect], 1, {effect.name: (effect.defaults,)})
-    nothing = Unexplained(0.0, 0.0, "", np.zeros((1, 3, 0)), np.zeros((1, 3, 0)))
+    nothing = Unexplained(0.0, "", np.zeros((1, 3, 0)), np.zeros((1, 3, 0)))
     inside, widths = 0, []
     for _ in range(DRAWS):
         problem = _problem(_noise(rng, memory_s), times * BIAS)
         fitter = Fitter(problem)
         _, residual = fitter.evaluated(start)
-        fitter, fit = _about(fitter, fitter.fit(start, white_noise(residual, problem.segments, None)), EFFECTS)
+        fitter, fit = with_noise_reestimated(
+            fitter, fitter.fit(start, white_noise(residual, problem.segments, None)), EFFECTS
+        )
         base = fitter.fit(no_effect(), fit.noise)
         selection = EffectSelection((Selected(effect, -50.0, ()),), base, fit, fitter, (), EFFECTS)
         residuals = held_out(selection, nothing)

@@ -17,10 +17,9 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.numerics.tests import holm
 from dvl_calib_ros.cli import common
-from dvl_calib_ros.diagnosis.answer import confidence_intervals, held_out_validation
+from dvl_calib_ros.diagnosis.answer import confidence_intervals
 from dvl_calib_ros.diagnosis.answer.compensation import compensated, verified_corrections
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
-from dvl_calib_ros.diagnosis.answer.held_out_validation import confirmed
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fit import gauss_newton
@@ -34,7 +33,7 @@ from dvl_calib_ros.diagnosis.model.stream_curve import Curve, segments_of
 from dvl_calib_ros.diagnosis.model.time_grid import Grid, Offsets
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.noise.whitened_least_squares import WhitenedLeastSquares
-from dvl_calib_ros.diagnosis.search import candidates, observable_parameters
+from dvl_calib_ros.diagnosis.search import observable_parameters
 from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_delays, moved_arm, with_moved
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
     repeated_effects,
@@ -45,13 +44,13 @@ from dvl_calib_ros.diagnosis.search.clock_jumps import (
     PARTS,
     Delays,
     gaps,
-    in_gaps,
     time_by_stamps,
+    with_jumps_in_gaps,
 )
 from dvl_calib_ros.diagnosis.search.clock_jumps import _found as _delays
 from dvl_calib_ros.diagnosis.search.effect_selection import (
-    _about,
     started,
+    with_noise_reestimated,
 )
 from dvl_calib_ros.diagnosis.search.identifiability import _clock_or_arm, _selected
 from dvl_calib_ros.diagnosis.search.observable_parameters import (
@@ -164,7 +163,7 @@ def test_a_current_that_was_taken_for_noise_is_proposed_when_it_came_and_went():
     given = scenario(effects=["water_lock:east_mps=0.2,north_mps=-0.34,from_s=120,to_s=241"], gnss_std=0.02)
     fitter, fit, _ = fitted(given, {})
     assert not intermittent_effects(fitter, fit, EFFECTS)
-    fitter, fit = _about(fitter, fit, {})
+    fitter, fit = with_noise_reestimated(fitter, fit, {})
     assert max(arma.ratio for arma in fit.noise.axes) > 2.0
     effects = {name: EFFECTS[name].once for name in ("water_lock", "heading_error", "velocity_bias", "scale_drift")}
     (best, *_) = intermittent_effects(fitter, fit, effects)
@@ -223,35 +222,6 @@ def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best():
 
 
 # ------------------------------------------------------------------ what is found
-
-
-def test_where_all_that_is_proposed_is_beyond_its_bounds_what_is_within_them_is_tried_as_well(monkeypatch):
-    """A shear of 17° and more was in every proposal, no fit of them went anywhere, and a current was not found."""
-    fitter, fit, _ = fitted(scenario(effects=["velocity_bias:x_mps=0.1"]), {})
-    _, worth = candidates._combinations(fitter, fit, EFFECTS)
-    assert worth and () not in worth
-    monkeypatch.setattr(candidates, "_is_possible", lambda table, chosen: chosen in ((), worth[-1]))
-    assert candidates._combinations(fitter, fit, EFFECTS)[1] == worth
-    monkeypatch.setattr(candidates, "_is_possible", lambda table, chosen: chosen == ())
-    assert candidates._combinations(fitter, fit, EFFECTS)[1] == [*worth, ()]
-
-
-def test_linear_solutions_are_possible_within_the_bounds_of_all_their_parameters():
-    shear, clock = EFFECTS["axis_nonorthogonality"], EFFECTS["clock_drift"]
-    (high, *_), (drift,) = ([spec.high for spec in each.parameters] for each in (shear, clock))
-    variants = [
-        candidates.Variant(each, (each.defaults,), np.zeros((1, 3, p)), 1.0) for each, p in ((shear, 3), (clock, 1))
-    ]
-    blocks = [np.arange(6, 9), np.arange(9, 10)]
-    for values, is_possible in (
-        ([0.9 * high, 0.0, 0.0, 0.9 * drift], True),
-        ([1.1 * high, 0.0, 0.0, 0.0], False),
-        ([0.0, 0.0, -1.1 * high, 0.0], False),
-        ([0.0, 0.0, 0.0, 1.1 * drift], False),
-    ):
-        part = Mock(solution=lambda values=values: np.array([9.0] * 6 + values))
-        table = candidates.LinearisedModel(variants, blocks, Mock(part=lambda index, part=part: part))
-        assert candidates._is_possible(table, (0, 1)) is is_possible
 
 
 def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
@@ -390,7 +360,7 @@ def about(given: Scenario, run: Run, offsets: Offsets, effects: list, values: di
     problem = make_problem([recording_of(run, given.gnss_frame)], np.eye(3), np.zeros(3), [offsets])
     start, fitter = no_effect().with_effects(effects, 1, values), Fitter(problem)
     noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-    return _about(fitter, fitter.fit(start, noise), EFFECTS)
+    return with_noise_reestimated(fitter, fitter.fit(start, noise), EFFECTS)
 
 
 LAGGING = "reference_lag:time_constant_s=1.3"
@@ -457,10 +427,10 @@ def test_leaps_ahead_are_put_where_the_stamps_have_a_gap_as_large():
     fit = fitter.fit(start, white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval))
     at = pytest.approx(201.3 - 0.5, abs=0.3)  # since the first stamp, which was late
     assert [gap for _, gap in gaps(fitter, fit)] == pytest.approx([2.0, 1.8]) and gaps(fitter, fit)[1][0] == at
-    assert in_gaps(fitter, fit).values["time_offset_jump"][0]["at_s"] == at
+    assert with_jumps_in_gaps(fitter, fit).values["time_offset_jump"][0]["at_s"] == at
     back = {**fit.values, "time_offset_jump": ({"seconds": -1.8, "at_s": 199.0},)}
     back = replace(fit, hypothesis=replace(fit.hypothesis, values=back))
-    assert in_gaps(fitter, back) is back
+    assert with_jumps_in_gaps(fitter, back) is back
 
 
 def two_leaps(fit: Fit, values) -> Hypothesis:
@@ -483,12 +453,12 @@ def test_a_leap_back_is_put_where_the_stamps_go_back_and_its_time_is_known_to_a_
     start = no_effect().with_effects(effects, 1, values)
     fitter = Fitter(problem)
     noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-    fit = in_gaps(fitter, fitter.fit(start, noise))
+    fit = with_jumps_in_gaps(fitter, fitter.fit(start, noise))
     time, low, high = time_by_stamps(fitter, fit, "at_s")
     assert low < 201.3 - 0.5 < high and high - low == pytest.approx(0.8, abs=0.01)  # since the first stamp
     assert time == pytest.approx(201.3 - 0.5, abs=0.3)
     twice = {"seconds": -0.5, "at_s": 120.0, "again_seconds": -0.8, "again_at_s": 200.0}  # one of two has left it
-    (twice,) = in_gaps(fitter, replace(fit, hypothesis=two_leaps(fit, twice))).values["time_offset_jump"]
+    (twice,) = with_jumps_in_gaps(fitter, replace(fit, hypothesis=two_leaps(fit, twice))).values["time_offset_jump"]
     assert twice["at_s"] == 120.0
     ahead = replace(fit.hypothesis, values={**fit.values, "time_offset_jump": ({"seconds": 1.3, "at_s": time},)})
     assert time_by_stamps(fitter, replace(fit, hypothesis=ahead), "at_s") is None
@@ -927,7 +897,7 @@ def test_noise_is_no_slower_for_what_columns_explain_of_it_by_their_own():
     problem, start, _, _ = started([recording], np.eye(3), np.zeros(3), every)
     fitter = Fitter(problem)
     noise = white_noise(fitter.evaluated(start)[1], problem.segments, None, problem.interval)
-    _, fit = _about(fitter, fitter.fit(start, noise), every)
+    _, fit = with_noise_reestimated(fitter, fitter.fit(start, noise), every)
     left = np.sqrt(np.mean(fit.residual**2, axis=0))
     loud = [axis.std * axis.ratio for axis in fit.noise.axes]
     np.testing.assert_allclose(loud, left, rtol=0.1)
@@ -1083,7 +1053,7 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
 ):
     """A step of a bias that a drift, a lag and an offset stood in for: 85 mm/s became 51, over noise of 14."""
     selection: Any = SimpleNamespace(selected=[SimpleNamespace(equivalent=())], fit=None, fitter=Mock())
-    nothing_left = Unexplained(0.0, 0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
+    nothing_left = Unexplained(0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
     after = float(np.hypot(0.014, not_explained))
     gap = Gap(0.085, after, 0.014, closure, (closure - 0.1, closure + 0.1), not_explained)
     found = _verdict(selection, nothing_left, gap, 1.0)
@@ -1099,7 +1069,7 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
 def test_what_exceeds_the_noise_by_as_much_is_unknown_and_no_sound_bag():
     """94.4 mm/s were not explained beside `no_gap`."""
     selection: Any = SimpleNamespace(selected=[], fit=None, fitter=Mock())
-    nothing_left = Unexplained(0.0, 0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
+    nothing_left = Unexplained(0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
     for not_explained, verdict in ((0.99, DiagnosisVerdict.NO_GAP), (1.01, DiagnosisVerdict.UNKNOWN)):
         after = float(np.hypot(1.0, not_explained))
         gap = Gap(after, after, 1.0, np.nan, (np.nan, np.nan), not_explained)
@@ -1114,23 +1084,6 @@ def test_what_the_very_stretch_that_is_held_out_tells_is_no_unknown_cause():
     assert diagnosis.gap.after > 2.0 * diagnosis.gap.noise_floor
     assert diagnosis.gap.not_expected < 0.3 * diagnosis.gap.noise_floor
     assert diagnosis.verdict is DiagnosisVerdict.KNOWN
-
-
-def test_what_explains_much_may_be_told_by_one_stretch_alone(monkeypatch):
-    """A leap of 0.6 s before a straight leg: without its only turn it came out at 1.2 s, and no gap was left to say."""
-    gap = Gap(0.0417, 0.0419, 0.0350, 0.37, (0.1, 1.0), 0.0230, left_open=0.0142, shown_from=0.05)
-    for low, shown_from, is_there, about, stands in (
-        (-0.08, 0.05, False, "", True), (-0.08, 0.05, True, "speed", False), (-0.08, -0.1, False, "", False),
-        (-0.08, 0.05, True, "a stretch of time", True), (0.01, 0.05, True, "speed", True),
-    ):  # fmt: skip
-        cause = SimpleNamespace(about=about)
-        fit, base = Mock(spec=Fit), Mock(spec=Fit)
-        none = SimpleNamespace(fit=base, fitter=Mock())
-        selection: Any = SimpleNamespace(fit=fit, selected=[None], withdrawn=lambda none=none: none)
-        monkeypatch.setattr(held_out_validation, "unexplained", lambda *_, cause=cause: cause)
-        monkeypatch.setattr(held_out_validation, "matters", lambda *_, is_there=is_there: is_there)
-        found = confirmed(selection, "nothing", replace(gap, shown_from=shown_from, falls_from=low))
-        assert found == ((selection, "nothing") if stands else (none, cause))
 
 
 def test_a_stretch_is_left_open_by_no_more_than_what_it_has_beyond_the_noise():

@@ -148,5 +148,5 @@ def test_noise_that_a_lag_has_made_slow_is_noise(noise_mps):
     selection = Mock(spec=EffectSelection, fitter=fitter, fit=fit)
     squares = (left**2).sum(axis=1).mean()
     assert high.sum() < 0.5 * squares
-    nothing = Unexplained(0.0, 0.0, "", fit.columns[:, :, :0], fit.columns[:, :, :0])
+    nothing = Unexplained(0.0, "", fit.columns[:, :, :0], fit.columns[:, :, :0])
     assert noise_floor(selection, nothing).sum(axis=1).mean() == pytest.approx(squares, rel=0.2)
