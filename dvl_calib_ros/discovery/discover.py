@@ -64,6 +64,8 @@ QUIETEST, CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE, WHITE_FROM_HZ = 0.01, 3.0, 2.0, 3.
 CLAIMS_FAR_TOO_MUCH, NOISIER = 4.0, 1.5
 # a DVL's claimed standard deviation from here on is no information, m/s
 SAYS_NOTHING = math.sqrt(NOT_MEASURED_VARIANCE)
+# Lowest speed (m/s) that is told from standing: five σ of a DVL at low speed, 0.01 m/s by data sheets.
+SLOWEST_MPS = 0.05
 # of two fitting readings of the DVL's axes, the other is used if its residual is below this share
 BETTER = 0.8
 
@@ -212,6 +214,7 @@ class _Search:
                 f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which is no information and not used "
                 "(-p use_message_covariance:=false)"
             )
+        self._admit_slow(dvl)
         if reference is not None:
             chosen = self._fit(frames, dvl, reference, imu, known, placed)
         taken = frames.imu if chosen is None else chosen.imu
@@ -247,6 +250,18 @@ class _Search:
         if imu is not None:
             self._use_claimed_heading(imu)
             self._check_gravity(imu)
+
+    def _admit_slow(self, dvl: Look) -> None:
+        """Set min_speed of a vehicle that mostly moves more slowly than the default."""
+        speed = np.linalg.norm(dvl.values, axis=1)
+        moving = speed[speed > SLOWEST_MPS]
+        if self._is_given("min_speed") or not len(moving) or np.median(moving) > self._parameters.min_speed:
+            return
+        self._values["min_speed"] = SLOWEST_MPS
+        self._found.append(
+            f"the vehicle moves at {float(np.median(moving)):.2g} m/s: samples from {SLOWEST_MPS:g} m/s on are used "
+            f"(-p min_speed:={SLOWEST_MPS:g})"
+        )
 
     @property
     def _is_z_down(self) -> bool:
