@@ -503,9 +503,9 @@ class _Search:
             if (is_sideways or ahead_in_body[0] < 0.0) and not self._is_given("mounting_rpy"):
                 given, fits = rpy_from_rotation(known) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
                 fields = {"given": in_degrees(given), "found": in_degrees(fits), "option": as_option(fits)}
-                astern = {} if is_sideways else {"confirmed": as_option(given)}
-                code = "TRAVELS_ASTERN" if astern else "TRAVELS_SIDEWAYS"
-                self._contradictions.append(finding(code, **fields, **astern))
+                code = "TRAVELS_SIDEWAYS" if is_sideways else "TRAVELS_ASTERN"
+                also = {"also": _other_axes(known, mean)} if is_sideways else {"confirmed": as_option(given)}
+                self._contradictions.append(finding(code, **fields, **also))
         elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 
@@ -527,6 +527,15 @@ class _Search:
                 parts.append(f"lever arm {in_metres(position)} m")
         if parts:
             self._found.append(f"{', '.join(parts)}: {placed.frame} in {placed.base}, from {placed.source}")
+
+
+def _other_axes(rotation_body_from_dvl: Array, mean: Array) -> str:
+    """Return the part of a remedy for axes with which a mounting (3, 3) makes a mean velocity (3,) point ahead."""
+    least = math.cos(OTHER_MOUNTING) * float(np.linalg.norm(mean))
+    changes = {f"negate {axis}": mean * sign for axis, sign in zip("xyz", 1.0 - 2.0 * np.eye(3), strict=True)}
+    changes["swap x and y"] = mean[[1, 0, 2]]
+    fitting = [change for change, seen in changes.items() if rotation_body_from_dvl[0] @ seen > least]
+    return f", or, if that mounting is right, {' or '.join(fitting)} in the DVL's driver" if fitting else ""
 
 
 def _is_located(placed: Placed | None) -> bool:
