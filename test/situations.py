@@ -99,6 +99,26 @@ def wrong_transform_without_reference(told: Told, wrong: bool) -> None:
     sound(told, reference=False, yaw=yaw, said_yaw=-yaw if wrong else yaw)
 
 
+def axes_of_the_driver_without_reference(change: Callable[[Any], None], yaw: float) -> Callable[[Told, bool], None]:
+    """Return the telling of a driver that changes a velocity, of a DVL at a yaw (rad) that its transform says."""
+
+    def tell(told: Told, wrong: bool) -> None:
+        sound(told, reference=False, yaw=yaw, said_yaw=yaw)
+        for _, topic, _, message in told.rows:
+            if wrong and topic == DVL:
+                change(message.twist.twist.linear)
+
+    return tell
+
+
+def negate_y(v: Any) -> None:
+    v.y *= -1.0
+
+
+def swap_x_and_y(v: Any) -> None:
+    v.x, v.y = v.y, v.x
+
+
 def stamps_an_hour_ahead(told: Told, wrong: bool) -> None:
     """A DVL whose stamps are by a clock in another time zone."""
     sound(told)
@@ -242,6 +262,19 @@ SITUATIONS = {
         "try -p mounting_rpy:=[0deg,0deg,-135deg]",
         {"mounting_rpy": (0.0, 0.0, math.radians(-135.0))},
         yaw_deg=-135.0,
+        verdicts=NOISY,
+    ),
+    "negated axis at 45 degrees without reference": Situation(
+        told_by(axes_of_the_driver_without_reference(negate_y, math.radians(45.0))),
+        "TRAVELS_SIDEWAYS",
+        "or, if that mounting is right, negate y in the DVL's driver",
+        yaw_deg=45.0,
+        verdicts=NOISY,
+    ),
+    "swapped axes without reference": Situation(
+        told_by(axes_of_the_driver_without_reference(swap_x_and_y, 0.0)),
+        "TRAVELS_SIDEWAYS",
+        "or, if that mounting is right, swap x and y in the DVL's driver",
         verdicts=NOISY,
     ),
     "stamps an hour ahead": Situation(

@@ -64,6 +64,8 @@ QUIETEST, CLAIMS_TOO_MUCH, CLAIMS_TOO_LITTLE, WHITE_FROM_HZ = 0.01, 3.0, 2.0, 3.
 CLAIMS_FAR_TOO_MUCH, NOISIER = 4.0, 1.5
 # a DVL's claimed standard deviation from here on is no information, m/s
 SAYS_NOTHING = math.sqrt(NOT_MEASURED_VARIANCE)
+# Lowest speed (m/s) that is told from standing: five σ of a DVL at low speed, 0.01 m/s by data sheets.
+SLOWEST_MPS = 0.05
 # of two fitting readings of the DVL's axes, the other is used if its residual is below this share
 BETTER = 0.8
 
@@ -212,6 +214,7 @@ class _Search:
                 f"the DVL claims {dvl.claimed_std:.2g} m/s in every message, which is no information and not used "
                 "(-p use_message_covariance:=false)"
             )
+        self._admit_slow(dvl)
         if reference is not None:
             chosen = self._fit(frames, dvl, reference, imu, known, placed)
         taken = frames.imu if chosen is None else chosen.imu
@@ -247,6 +250,18 @@ class _Search:
         if imu is not None:
             self._use_claimed_heading(imu)
             self._check_gravity(imu)
+
+    def _admit_slow(self, dvl: Look) -> None:
+        """Set min_speed of a vehicle that mostly moves more slowly than the default."""
+        speed = np.linalg.norm(dvl.values, axis=1)
+        moving = speed[speed > SLOWEST_MPS]
+        if self._is_given("min_speed") or not len(moving) or np.median(moving) > self._parameters.min_speed:
+            return
+        self._values["min_speed"] = SLOWEST_MPS
+        self._found.append(
+            f"the vehicle moves at {float(np.median(moving)):.2g} m/s: samples from {SLOWEST_MPS:g} m/s on are used "
+            f"(-p min_speed:={SLOWEST_MPS:g})"
+        )
 
     @property
     def _is_z_down(self) -> bool:
@@ -488,9 +503,9 @@ class _Search:
             if (is_sideways or ahead_in_body[0] < 0.0) and not self._is_given("mounting_rpy"):
                 given, fits = rpy_from_rotation(known) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
                 fields = {"given": in_degrees(given), "found": in_degrees(fits), "option": as_option(fits)}
-                astern = {} if is_sideways else {"confirmed": as_option(given)}
-                code = "TRAVELS_ASTERN" if astern else "TRAVELS_SIDEWAYS"
-                self._contradictions.append(finding(code, **fields, **astern))
+                code = "TRAVELS_SIDEWAYS" if is_sideways else "TRAVELS_ASTERN"
+                also = {"also": _other_axes(known, mean)} if is_sideways else {"confirmed": as_option(given)}
+                self._contradictions.append(finding(code, **fields, **also))
         elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 
@@ -512,6 +527,15 @@ class _Search:
                 parts.append(f"lever arm {in_metres(position)} m")
         if parts:
             self._found.append(f"{', '.join(parts)}: {placed.frame} in {placed.base}, from {placed.source}")
+
+
+def _other_axes(rotation_body_from_dvl: Array, mean: Array) -> str:
+    """Return the part of a remedy for axes with which a mounting (3, 3) makes a mean velocity (3,) point ahead."""
+    least = math.cos(OTHER_MOUNTING) * float(np.linalg.norm(mean))
+    changes = {f"negate {axis}": mean * sign for axis, sign in zip("xyz", 1.0 - 2.0 * np.eye(3), strict=True)}
+    changes["swap x and y"] = mean[[1, 0, 2]]
+    fitting = [change for change, seen in changes.items() if rotation_body_from_dvl[0] @ seen > least]
+    return f", or, if that mounting is right, {' or '.join(fitting)} in the DVL's driver" if fitting else ""
 
 
 def _is_located(placed: Placed | None) -> bool:

@@ -371,8 +371,8 @@ def _mounting_contradicted(given: Array, found: Array, imu: ImuFrame | None) -> 
     rpy, fitting = rpy_from_rotation(given), nominal_rpy(found)
     first = also = ""
     about_z = fitting[2] - float(rpy[2])
-    is_drawn = abs(math.remainder(about_z, DRAWN)) < MEANT_WITHIN
-    if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=MEANT_WITHIN):
+    is_drawn = abs(math.remainder(about_z, DRAWN)) < MEANT_WITHIN[2]
+    if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=MEANT_WITHIN[0]):
         heading = rpy_from_rotation(rotation_from_rpy((0.0, 0.0, -about_z)) @ imu.rotation_body_from_imu) + 0.0
         first = f"set the declination of the compass, here -p imu_rpy:={as_option(heading)}; if the heading is right, "
     shares = np.diag(given.T @ found)

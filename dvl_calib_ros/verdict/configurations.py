@@ -239,8 +239,8 @@ CONFIGURATIONS = on_page(
     reject(
         "TRAVELS_SIDEWAYS",
         "with the mounting {given} the vehicle travels sideways; it goes ahead with {found}",
-        means="A yaw of the wrong sign in the transform, or a vehicle that drifts.",
-        remedy="try -p mounting_rpy:={option}",
+        means="A yaw or an axis of the wrong sign, or a vehicle that drifts.",
+        remedy="try -p mounting_rpy:={option}{also}",
     ),
     reject(
         "TRAVELS_ASTERN",

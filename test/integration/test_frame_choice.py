@@ -137,6 +137,23 @@ def test_a_yaw_of_the_wrong_sign_in_a_transform_is_named_and_its_remedy_works(tm
 
 
 @pytest.mark.spread(1)
+def test_a_yaw_that_no_drawing_has_is_named_as_it_is_and_its_remedy_works(tmp_path):
+    """For 37 degrees 45 was proposed, of which the calibration rejected the rest as misalignment."""
+    yaw = math.radians(37.0)
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link", (0.0, 0.0, yaw))
+    told.imu("/imu", "base_link")
+    told.reference("/gps/velocity", TWIST, "map", "enu")
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
+    bag = told.write(tmp_path / "bag")
+    found = re.search(r"try -p mounting_rpy:=\[0deg,0deg,(.*?)deg\]", doctor(bag).reasons[0].sentence)
+    assert found is not None
+    mended = replay(bag, mounting_rpy=(0.0, 0.0, math.radians(float(found[1]))))
+    assert mended.verdict != "reject"
+    assert is_right(mended, truth_deg((0.0, 0.0, yaw)))
+
+
+@pytest.mark.spread(1)
 def test_a_heading_without_its_declination_is_said_before_another_mounting_and_its_remedy_works(tmp_path):
     declination, told = math.radians(14.0), Told()
     sound(told)

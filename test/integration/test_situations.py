@@ -19,7 +19,10 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 RIGHT_DEG = 0.5
 # The prior of a mounting is 2.9 degrees: with more than this the data said nothing of the yaw.
 YAW_STD_DEG = 2.5
-UNDER_2_S = "wrong transform without reference", "text of a DVL"
+UNDER_2_S = (
+    "wrong transform without reference", "text of a DVL", "negated axis at 45 degrees without reference",
+    "swapped axes without reference",
+)  # fmt: skip
 
 
 SLOW = set(SITUATIONS).difference(UNDER_2_S)

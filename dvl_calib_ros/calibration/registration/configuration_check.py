@@ -85,10 +85,10 @@ FITS_BELOW, BETTER_BY = math.sqrt(0.05), 0.5
 SAME_WITHIN = math.radians(12.0)
 # Step of mounting angles in drawings, rad; a fitted mounting near a multiple is reported as the multiple.
 DRAWN = math.pi / 4.0
-# Signs of the DVL axes: as configured, y or z mirrored, both. Next to a mounting that does not fit also x mirrored, and
-# all axes; x and one other are a mounting.
-SIGNS: Sequence[Array] = [np.array([1.0, y, z]) for y in (1.0, -1.0) for z in (1.0, -1.0)]
-SIGNS_OF_X: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
+# Signs of the DVL axes, that of the axis ahead first: as configured, one or both others mirrored. Next to a mounting
+# that does not fit also the axis ahead mirrored, and all axes; the axis ahead and one other are a mounting.
+SIGNS: Sequence[Array] = [np.array([1.0, one, other]) for one in (1.0, -1.0) for other in (1.0, -1.0)]
+SIGNS_OF_AHEAD: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
 # Largest residual of an explanation as a multiple of the registered one, and an extra factor for few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
 # Smallest excess factor of one axis, above any error of the speed of sound.
@@ -217,16 +217,19 @@ def wrong_axes(
     lever_arm: Array,
     most: float,
     dvl_axes: str,
-    patterns: Sequence[Array] = SIGNS_OF_X,
+    patterns: Sequence[Array] = SIGNS_OF_AHEAD,
 ) -> Reason | None:
     """Return the finding of DVL axes that are mirrored, turned over, or scaled alone, else None.
 
     Each sign pattern has its own delay, because in waves a delay of half a period looks like a sign. The axis factors
-    of the best pattern decide. most: largest residual, m/s per axis.
+    of the best pattern decide. most: largest residual, m/s per axis. patterns: signs, that of the axis ahead first.
     """
+    ahead = int(np.argmax((motion.dvl.velocity**2).sum(axis=0)))
+    others = [axis for axis in range(3) if axis != ahead]
     found: tuple[Array, Fitted] | None = None
     given_up = FAR_ABOVE * FAR_WORSE * most
-    for each in patterns:
+    for pattern in patterns:
+        each = pattern[np.argsort([ahead, *others])]
         quick = MotionFit(_signed(motion, each), lever_arm, curves.signed(each), FEW_ROWS)
         one = nearest(quick, nominal, (REFERENCE,), given_up)
         # a fit that rotates the axes back is the configured pattern
@@ -243,16 +246,18 @@ def wrong_axes(
         return None
     factors, std = fit.axis_factors(fitted, nominal)
     is_shown, is_turned = factors > SURE * std, signs < 0.0
-    ahead = int(np.argmin(std))  # the axis along which the vehicle moves most
     if is_turned[ahead]:  # a mounting unless all signs are observable
         axis = "each of x, y and z" if is_turned.all() else "xyz"[ahead]
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None
     if (is_shown & is_turned).any():
-        if is_turned.sum() == 1 and (is_shown & ~is_turned)[1:].any():
-            axis, other = ("y", "z") if is_turned[1] else ("z", "y")
-            instead = _OTHER_AXES.get(dvl_axes)  # in which the other axis of the same data is inverted
-            alike = f" (read as {dvl_axes}; read as {instead}, {other} does)" if instead else ""
-            return finding("DVL_LEFT_HANDED", axis=axis, alike=alike)
+        if is_turned.sum() == 1 and (is_shown & ~is_turned)[others].any():
+            axis, other = sorted(others, key=lambda each: not is_turned[each])
+            # in which the other axis of the same data is inverted
+            instead = None if ahead else _OTHER_AXES.get(dvl_axes)
+            alike = f" (read as {dvl_axes}; read as {instead}, {'xyz'[other]} does)" if instead else ""
+            return finding("DVL_LEFT_HANDED", axis="xyz"[axis], alike=alike)
+        if ahead:
+            return _mounting_fits(nominal @ np.diag(np.where(np.arange(3) == ahead, 1.0, -1.0)))
         return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
     too_small = np.where(is_shown, (factors - SURE * std) / factors[ahead] - SCALED_ALONE, 0.0)
     if not is_turned.any() and too_small.max() > 1.0:
@@ -285,11 +290,15 @@ def _named(
     if angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
         turned = finding("DVL_AXES_TURNED", axes="the other of flu and frd")
     else:
-        rpy = (round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(_as_drawn(rotation)))
-        turned = finding("MOUNTING_FITS", **dict(zip(("roll", "pitch", "yaw"), rpy, strict=True)))
+        turned = _mounting_fits(_as_drawn(rotation))
     if same_frame:
         return turned
     return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=turned)
+
+
+def _mounting_fits(rotation: Array) -> Reason:
+    rpy = (round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(rotation))
+    return finding("MOUNTING_FITS", **dict(zip(("roll", "pitch", "yaw"), rpy, strict=True)))
 
 
 def _as_drawn(rotation: Array) -> Array:

@@ -56,8 +56,9 @@ INDEPENDENT, LEAST_LEFT = 4.0, 0.005
 SIDEWAYS = 0.5
 # Smallest RMS turn rate that determines the axes, rad/s.
 TURNS = 0.01
-# Distance from a mounting as drawn (multiples of `DRAWN`) below which that mounting is meant, rad.
-MEANT_WITHIN = math.radians(8.0)
+# Distance of roll, pitch, yaw (rad) from a drawn mounting (multiples of `DRAWN`) below which that mounting is meant.
+# The yaw is shown best, and 5 degrees off a mounting is rejected.
+MEANT_WITHIN = np.radians([8.0, 8.0, 4.0])
 
 
 # Body frames of a reference, and the matrix from each frame to body or ENU axes.

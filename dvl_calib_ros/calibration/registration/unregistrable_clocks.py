@@ -140,7 +140,7 @@ def lag(
 ) -> tuple[float, bool]:
     """Return the delay (s) of a series relative to another, and whether it surely exceeds LONGEST_S.
 
-    The delay minimises the mean squared difference; a far delay must be clearly better than all near ones.
+    The delay minimises the mean squared difference; it must be clearly better than none, a far one than all near ones.
 
     Parameters
     ----------
@@ -183,6 +183,7 @@ def lag(
             # repeated legs agree at several lags: take the smallest
             as_good = np.where(mean <= 1.5 * mean[best], np.abs(late), np.inf)
             return float(late[int(np.argmin(as_good))]), True
-    if not np.isfinite(mean[near].min(initial=np.inf)):
-        return 0.0, False
-    return float(late[near][np.argmin(mean[near])]), False
+    best = int(np.argmin(np.where(near, mean, np.inf)))
+    # a nearly constant speed agrees as well at any lag
+    is_better = near[best] and mean[best] < BELIEVED * mean[int(np.argmin(np.abs(late)))]
+    return float(late[best]) if is_better else 0.0, False

@@ -302,6 +302,21 @@ def test_a_left_handed_driver_is_named_with_its_axis(signs, axis):
     assert axis not in ("y", "z") or f"(read as frd; read as flu, {'zy'['yz'.index(axis)]} does)" in said.sentence
 
 
+@pytest.mark.parametrize("axis", "xz")
+def test_a_left_handed_driver_at_90_degrees_is_named_with_its_axis(axis):
+    """With x mirrored it was accepted, with a yaw 6 degrees off."""
+    (td, v), (tg, g), imu = run("free", 5.0)
+    quarter = rotation_from_rpy((0.0, 0.0, 0.5 * np.pi))
+    heave = np.array([[0.0, 0.0, 0.1]])
+    v = v + heave * np.sin(2.0 * np.pi * td / 7.3)[:, None]
+    signs = np.where(np.array([*"xyz"]) == axis, -1.0, 1.0)
+    g = g + heave * np.sin(2.0 * np.pi * tg / 7.3)[:, None]
+    made = make_motion((td, (v @ quarter) * signs), (tg, g), True, (True,) * 3, ImuColumns(*imu))
+    found = register(made, quarter, np.zeros(3))
+    said = fitting_configuration(made, VelocityFrame.ENU, quarter, np.zeros(3), found)
+    assert said and (said.code, said.numbers) == ("DVL_LEFT_HANDED", {"axis": axis, "alike": ""})
+
+
 def test_noise_of_the_axis_across_is_no_scale_of_the_axis_ahead(rng):
     """A DVL at 90 degrees, whose y points ahead, was rejected: "y is 0.22 times its true value"."""
     (td, v), (tg, g), imu = run("box", 5.0)

@@ -63,6 +63,12 @@ def test_legs_that_repeat_between_two_steps_of_the_grid_are_no_reason_to_refuse_
     assert not is_far and abs(late) <= STEP_S
 
 
+def test_a_constant_speed_shows_no_lag():
+    """Of a vehicle on circles with motion capture that was silent, the IMU was said to be 257 s late."""
+    speeds = 0.3 + np.random.default_rng(2).normal(0.0, 0.01, (2, 800))
+    assert lag(speeds[0].astype(complex), 0.0, speeds[1].astype(complex), 0.0) == (0.0, False)
+
+
 @pytest.mark.parametrize(("stream", "whose"), [("dvl", "the DVL's"), ("attitude", "the IMU's")])
 @pytest.mark.parametrize("seconds", [75.0, 100.0, -100.0, 500.0, 1.7e9])
 def test_a_clock_that_is_too_far_off_is_refused_in_one_line_whatever_is_common_to_the_streams(
