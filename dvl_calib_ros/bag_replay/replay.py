@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -18,6 +17,7 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.checks.data_warnings import gate_warnings, message_warnings, recording_warnings, reference_warnings
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_document
 from ..calibration.comparison.mounting_change import Comparison, comparison_document
+from ..calibration.estimators.estimator import return_memory
 from ..calibration.filters.build_observations import Observer
 from ..calibration.filters.state_history import StateTrace
 from ..calibration.models import MODELS, Needs
@@ -255,8 +255,7 @@ def memory_given_back() -> Iterator[None]:
         yield
     finally:
         gc.collect()
-        with suppress(OSError, AttributeError):  # another C library; glibc keeps an additional megabyte per recording
-            ctypes.CDLL(None).malloc_trim(0)
+        return_memory()
         if kept:
             gc.unfreeze()
 

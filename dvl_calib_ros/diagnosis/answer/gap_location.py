@@ -125,7 +125,7 @@ def _log_p(noise: Noise, functions: Array, q: Array, white: Array, axis: int, ma
     """Return log p of functions of motion (M, c), restricted to a place, for the whitened residual."""
     columns = np.zeros((*noise.level.shape, functions.shape[1]))
     columns[mask, axis] = functions[mask]
-    return ScoreTest.of(q, noise.whiten(columns), white).log_p(np.arange(functions.shape[1]))
+    return ScoreTest.of(q, noise.whiten(columns), white).log_p(np.arange(functions.shape[1])[None])[0]
 
 
 def _bands(gap: Array, nyquist: float) -> list[tuple[float, float, float]]:

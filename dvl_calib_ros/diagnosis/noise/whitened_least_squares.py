@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...calibration.numerics.distributions import chi2_logsf
-from ...calibration.numerics.frames import Array
+from ...calibration.numerics.frames import Array, product
 
 # Share of noise in a direction's squares from which the direction is excluded
 MOSTLY = 0.5
@@ -128,15 +128,20 @@ class ScoreTest:
 
     def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
         """Return the energy that columns `at` explain jointly, and their rank."""
-        at = at[self.has[at]]
-        if not len(at):
-            return 0.0, 0
-        squares, directions = np.linalg.eigh(self.gram[np.ix_(at, at)])
-        apart = squares > INDEPENDENT**2
-        along = directions[:, apart].T @ self.along[at]
-        return float(np.sum(along**2 / squares[apart])), int(np.count_nonzero(apart))
+        (energy,), (rank,) = self.energies(at[None])
+        return float(energy), int(rank)
 
-    def log_p(self, at: NDArray[np.intp]) -> float:
-        """Return log p of the energy that columns `at` explain jointly."""
-        energy, dof = self.energy(at)
-        return float(chi2_logsf(energy, dof)) if dof else 0.0
+    def energies(self, groups: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        """Return the energy and rank (K,) of each group of columns (K, c), see `energy`."""
+        has = self.has[groups]
+        gram = self.gram[groups[:, :, None], groups[:, None, :]]
+        squares, directions = np.linalg.eigh(np.where(has[:, :, None] & has[:, None, :], gram, 0.0))
+        apart = squares > INDEPENDENT**2
+        along = product(directions.swapaxes(1, 2), np.where(has, self.along[groups], 0.0))
+        energies = np.where(apart, along**2 / np.where(apart, squares, 1.0), 0.0)
+        return energies.sum(axis=1), np.count_nonzero(apart, axis=1)
+
+    def log_p(self, groups: NDArray[np.intp]) -> Array:
+        """Return log p (K,) of the energy that each group of columns (K, c) explains jointly."""
+        energies, ranks = self.energies(groups)
+        return np.where(ranks > 0, chi2_logsf(energies, np.maximum(ranks, 1)), 0.0)

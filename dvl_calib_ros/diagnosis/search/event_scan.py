@@ -63,7 +63,7 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
                 log_p = _log_p(fit, basis, white, columns, part)
                 at = int(np.argmin(log_p))
                 if log_p[at] < best:
-                    best, event = log_p[at], np.zeros_like(event)
+                    best, event = float(log_p[at]), np.zeros_like(event)
                     event[part] = columns[:, :, at]
         if best < 0.0:
             found.append(Event(about, best + float(np.log(tried)), event, tried))
@@ -80,12 +80,12 @@ def _beside_known_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     return beside
 
 
-def _log_p(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) -> list[float]:
-    """Return log p of each of K events with columns (m, A, K, c) in a part of the bins, zero in others."""
+def _log_p(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) -> Array:
+    """Return log p (K,) of each of K events with columns (m, A, K, c) in a part of the bins, zero in others."""
     m, axes, k, c = columns.shape
     whitened = fit.noise.part(part).whiten(columns.reshape(m, axes, k * c))
     test = ScoreTest.of(basis, whitened, white, axes * part.start)
-    return [test.log_p(at) for at in np.arange(k * c).reshape(k, c)]
+    return test.log_p(np.arange(k * c).reshape(k, c))
 
 
 def _steps(time: Array) -> Array:
