@@ -64,7 +64,8 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
 def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
     scale = robust_std(innovations)
     far = (np.abs(innovations) > SETTINGS.outlying * scale).any(axis=1)
-    count, n = int(np.count_nonzero(far)), len(innovations)
+    off = problem.bursts // problem.grids[0].per_bin
+    count, n = int(np.count_nonzero(far)) + off, len(innovations) + off
     spikes, received = (sum(getattr(r, name) for r in problem.recordings) for name in ("spikes", "received"))
     if spikes > count:
         count, n = spikes, received

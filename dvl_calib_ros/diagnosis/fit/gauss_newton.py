@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...calibration.numerics.frames import Array
+from ...calibration.numerics.robust import robust_std
 from ...effects.base import Effect
 from ..model.forward_model import Problem, SeenAgain
 from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, whose_parameters
@@ -30,6 +31,8 @@ BY_CHANCE = 1.5
 PRIOR_IN_TYPICAL = 50.0
 # Bounds below which a fit is skipped as worse: deviance, plus a share of its first step's gain for nonlinearity
 SURELY, BENT = 2.0, 0.2
+# A burst: outliers with neighbours beyond half of that, of at most this share of the recording
+RARE = 0.02
 # Deviance bound of a change point's 95 per cent interval (Hansen, 2000, Econometrica 68, theorem 2)
 OF_A_TIME = -2.0 * float(np.log(1.0 - np.sqrt(0.95)))
 # Half width, in standard deviations, of a 95 per cent interval
@@ -141,6 +144,17 @@ class Fitter:
     def without(self, held: Mask) -> Fitter:
         """Return a fitter with some bins (M,) held out."""
         return replace(self, held=held, _fits={})
+
+    def bursts(self, fit: Fit) -> Mask:
+        """Return (M,) bins with large errors for some seconds, too few for an effect.
+
+        The residual is not whitened: bursts would determine the noise's colour.
+        """
+        raw = (fit.residual + self.outliers) / fit.noise.level
+        size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
+        run = np.cumsum(np.diff(size > 0.5 * SETTINGS.outlying, prepend=False))  # odd in the runs, even between them
+        far = np.isin(run, run[size > SETTINGS.outlying])
+        return far & (np.count_nonzero(far) <= RARE * len(far))
 
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
         """Evaluate a hypothesis; return the evaluation and the residual (M, A)."""

@@ -95,16 +95,17 @@ class SeenAgain(Sequence[Seen]):
 
 @dataclass(frozen=True)
 class Problem:
-    """Recordings to explain. lever_arm: (3,) m, known. grids: per recording. of_axes: axes to compare. shown_turns:
-    (3, 3) projection of φ on the mounting rotations that are observable without a vertical reference; φ is held at zero
-    along others. unshown: unobservable parts of effects, nuisance where the effect is in a hypothesis or on every
-    vehicle."""
+    """Recordings to explain. lever_arm: (3,) m, known. grids: per recording. of_axes: axes to compare. bursts: number
+    of samples excluded as instrument errors. shown_turns: (3, 3) projection of φ on the mounting rotations that are
+    observable without a vertical reference; φ is held at zero along others. unshown: unobservable parts of effects,
+    nuisance where the effect is in a hypothesis or on every vehicle."""
 
     recordings: tuple[RecordedStreams, ...]
     rotation_dvl_from_body: Array
     lever_arm: Array
     grids: tuple[Grid, ...]
     of_axes: tuple[bool, bool, bool] = (True, True, True)
+    bursts: int = 0
     shown_turns: Array = field(default_factory=lambda: np.eye(3), repr=False, compare=False)
     unshown: tuple[Effect, ...] = ()
     # Last fitted hypotheses by effects and times: starting points for further fits
@@ -134,6 +135,15 @@ class Problem:
     def time(self) -> Array:
         """Return (M,) s of all bins since the beginning of their recording."""
         return np.concatenate([grid.bin_time for grid in self.grids])
+
+    def without(self, far: NDArray[np.bool_]) -> Problem:
+        """Return the problem without some bins (M,)."""
+        of_sample, ends = far[self.bin_of], np.cumsum([len(grid.stamps) for grid in self.grids])[:-1]
+        grids = tuple(
+            replace(grid, stamps=grid.stamps[~off])
+            for grid, off in zip(self.grids, np.split(of_sample, ends), strict=True)
+        )
+        return replace(self, grids=grids, bursts=int(of_sample.sum()), fitted={})
 
     @cached_property
     def recording_of(self) -> NDArray[np.intp]:

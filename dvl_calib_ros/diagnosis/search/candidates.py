@@ -18,7 +18,7 @@ from ...effects.base import Effect
 from ..fit.gauss_newton import PRIOR_IN_TYPICAL, Fit, Fitter, prior_std
 from ..fit.selection_criteria import price, step_of_times, windows
 from ..model.forward_model import Problem
-from ..model.hypothesis import Hypothesis, Values, is_time_of_run, no_effect
+from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, no_effect
 from ..model.settings import SETTINGS
 from ..noise.noise_model import Noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
@@ -125,8 +125,13 @@ def _combinations(
             if table.variants[index].effect.name not in names and len(chosen) < SETTINGS.max_effects
         ]
     scored.sort()
-    likely = (tuple(sorted(chosen)) for score, chosen in scored if score < scored[0][0] + SETTINGS.conclusive)
-    return table, list(dict.fromkeys(likely))[:FITTED]
+    scored = [each for each in scored if _has_no_redundant_clock(table, each[1])]
+    to_fit = list(dict.fromkeys(tuple(sorted(c)) for score, c in scored if score < scored[0][0] + SETTINGS.conclusive))[
+        :FITTED
+    ]
+    if not any(_is_possible(table, chosen) for chosen in to_fit):  # outside the linear range
+        to_fit += itertools.islice((chosen for _, chosen in scored if _is_possible(table, chosen)), 1)
+    return table, to_fit
 
 
 def variants_about(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Variant]:
@@ -240,6 +245,24 @@ def combined(fitter: Fitter, fit: Fit, table: LinearisedModel, chosen: Sequence[
         start[variant.effect.name] = moved.values[variant.effect.name]
     effects = [table.variants[index].effect for index in chosen]
     return fit.hypothesis.with_effects(effects, n, start)
+
+
+def _is_possible(table: LinearisedModel, chosen: Sequence[int]) -> bool:
+    """Return whether the linear solution of a combination is within the bounds of each parameter."""
+    part = table.system.part(np.concatenate([np.arange(6), *(table.blocks[index] for index in chosen)]))
+    variants = [table.variants[index] for index in chosen]
+    specs = [
+        spec
+        for variant in variants
+        for spec in amplitudes(variant.effect) * (variant.p // len(amplitudes(variant.effect)))
+    ]
+    return all(spec.low < x < spec.high for spec, x in zip(specs, part.solution()[6:].tolist(), strict=True))
+
+
+def _has_no_redundant_clock(table: LinearisedModel, chosen: Sequence[int]) -> bool:
+    """Return whether a combination has no redundant pair of clocks: DVL and reference represent any pair."""
+    names = {table.variants[index].effect.name for index in chosen}
+    return ATTITUDE_CLOCK not in names or len(names & set(CLOCKS)) == 1
 
 
 def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:

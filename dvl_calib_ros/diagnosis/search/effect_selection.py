@@ -130,6 +130,10 @@ def select(
         problem = replace(problem, unshown=fitter.problem.unshown)
         fitter, fit = _first_fit(problem, fit.hypothesis)
     fitter, fit = with_noise_reestimated(fitter, fit, every)
+    far = fitter.bursts(fit)
+    if far.any():
+        problem = problem.without(far)
+        fitter, fit = with_noise_reestimated(*_first_fit(problem, fit.hypothesis), every)
     best = fit
     seen_before: set[frozenset[str]] = set()
     for _ in range(ROUNDS):

@@ -33,7 +33,7 @@ from dvl_calib_ros.diagnosis.model.stream_curve import Curve, segments_of
 from dvl_calib_ros.diagnosis.model.time_grid import Grid, Offsets
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.noise.whitened_least_squares import WhitenedLeastSquares
-from dvl_calib_ros.diagnosis.search import observable_parameters
+from dvl_calib_ros.diagnosis.search import candidates, observable_parameters
 from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_delays, moved_arm, with_moved
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
     repeated_effects,
@@ -222,6 +222,35 @@ def test_a_fit_that_goes_astray_at_its_end_does_not_stand_for_the_best():
 
 
 # ------------------------------------------------------------------ what is found
+
+
+def test_where_all_that_is_proposed_is_beyond_its_bounds_what_is_within_them_is_tried_as_well(monkeypatch):
+    """A shear of 17° and more was in every proposal, no fit of them went anywhere, and a current was not found."""
+    fitter, fit, _ = fitted(scenario(effects=["velocity_bias:x_mps=0.1"]), {})
+    _, worth = candidates._combinations(fitter, fit, EFFECTS)
+    assert worth and () not in worth
+    monkeypatch.setattr(candidates, "_is_possible", lambda table, chosen: chosen in ((), worth[-1]))
+    assert candidates._combinations(fitter, fit, EFFECTS)[1] == worth
+    monkeypatch.setattr(candidates, "_is_possible", lambda table, chosen: chosen == ())
+    assert candidates._combinations(fitter, fit, EFFECTS)[1] == [*worth, ()]
+
+
+def test_linear_solutions_are_possible_within_the_bounds_of_all_their_parameters():
+    shear, clock = EFFECTS["axis_nonorthogonality"], EFFECTS["clock_drift"]
+    (high, *_), (drift,) = ([spec.high for spec in each.parameters] for each in (shear, clock))
+    variants = [
+        candidates.Variant(each, (each.defaults,), np.zeros((1, 3, p)), 1.0) for each, p in ((shear, 3), (clock, 1))
+    ]
+    blocks = [np.arange(6, 9), np.arange(9, 10)]
+    for values, is_possible in (
+        ([0.9 * high, 0.0, 0.0, 0.9 * drift], True),
+        ([1.1 * high, 0.0, 0.0, 0.0], False),
+        ([0.0, 0.0, -1.1 * high, 0.0], False),
+        ([0.0, 0.0, 0.0, 1.1 * drift], False),
+    ):
+        part = Mock(solution=lambda values=values: np.array([9.0] * 6 + values))
+        table = candidates.LinearisedModel(variants, blocks, Mock(part=lambda index, part=part: part))
+        assert candidates._is_possible(table, (0, 1)) is is_possible
 
 
 def test_a_run_without_a_gap_is_cleared_with_what_it_would_have_shown():
