@@ -18,7 +18,8 @@ from ..filters.cross_validation import HeldOutError
 from ..filters.observability import OBSERVED_SHARE, Convergence, body_angle_std
 from ..models import Model
 from ..models.parameters import Parameters
-from ..numerics.frames import Array
+from ..numerics.error_model import corrected_mounting
+from ..numerics.frames import Array, whole_degrees
 from ..numerics.kalman import GaussianState
 from ..numerics.tests import chi2_isf
 from .results import Verification
@@ -135,7 +136,11 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
     angle, reject = _angle_deg(model, state, parameters), math.degrees(parameters.reject_misalignment)
     findings = []
     if angle >= reject:
-        findings.append(finding("MISALIGNMENT_LARGE", degrees=angle, limit=reject))
+        nominal = parameters.rotation_dvl_from_body
+        about_dvl_axes = nominal @ shown_misalignment(model, state, parameters)
+        rpy = np.degrees(whole_degrees(corrected_mounting(about_dvl_axes, nominal)))
+        option = dict(zip(("roll", "pitch", "yaw"), rpy.tolist(), strict=True))
+        findings.append(finding("MISALIGNMENT_LARGE", degrees=angle, limit=reject, **option))
     variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
     std = np.sqrt(variance)
     known = (variance > 0.0) & (
