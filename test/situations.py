@@ -99,6 +99,15 @@ def wrong_transform_without_reference(told: Told, wrong: bool) -> None:
     sound(told, reference=False, yaw=yaw, said_yaw=-yaw if wrong else yaw)
 
 
+def earth_axes_without_reference(told: Told, wrong: bool) -> None:
+    """A driver that turns the velocity into east, north, up."""
+    sound(told, reference=False)
+    velocities = [message.twist.twist.linear for _, topic, _, message in told.rows if topic == DVL]
+    for (i, _), v in zip(told.every(5.0), velocities, strict=True):
+        if wrong:
+            v.x, v.y, v.z = (told.motion.rotation_enu_from_body[i] @ [v.x, v.y, v.z]).tolist()
+
+
 def axes_of_the_driver_without_reference(change: Callable[[Any], None], yaw: float) -> Callable[[Told, bool], None]:
     """Return the telling of a driver that changes a velocity, of a DVL at a yaw (rad) that its transform says."""
 
@@ -262,6 +271,12 @@ SITUATIONS = {
         "try -p mounting_rpy:=[0deg,0deg,-135deg]",
         {"mounting_rpy": (0.0, 0.0, math.radians(-135.0))},
         yaw_deg=-135.0,
+        verdicts=NOISY,
+    ),
+    "earth axes without reference": Situation(
+        told_by(earth_axes_without_reference),
+        "DVL_TURNS_WITH_HEADING",
+        "let the driver send the velocity in the DVL's own axes",
         verdicts=NOISY,
     ),
     "negated axis at 45 degrees without reference": Situation(

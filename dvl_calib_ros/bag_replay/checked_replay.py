@@ -132,13 +132,13 @@ def checked_replay(
 
 
 # Findings of discovery that reject a calibration.
-DECISIVE = "DVL_SIDE_INVERTED", "TRAVELS_ASTERN"
+DECISIVE = "DVL_SIDE_INVERTED", "DVL_TURNS_WITH_HEADING", "TRAVELS_ASTERN"
 
 
 def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
     """Add ambiguous frames to the verdict and, if the calibration is rejected anyway, their likely cause.
 
-    Without a reference nothing else rejects an inverted sway or a vehicle that travels astern.
+    Without a reference nothing else rejects these axes of the DVL or a vehicle that travels astern.
     """
     is_rejected = verification.verdict is Severity.REJECT
     kept = [

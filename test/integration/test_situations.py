@@ -22,7 +22,7 @@ RIGHT_DEG = 0.5
 YAW_STD_DEG = 2.5
 UNDER_2_S = (
     "wrong transform without reference", "text of a DVL", "negated axis at 45 degrees without reference",
-    "swapped axes without reference",
+    "swapped axes without reference", "earth axes without reference",
 )  # fmt: skip
 
 
