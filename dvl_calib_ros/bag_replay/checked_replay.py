@@ -25,10 +25,8 @@ from ..calibration.comparison.mounting_change import (
 )
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.error_model import corrected_mounting
-from ..calibration.numerics.frames import whole_degrees
 from ..calibration.results.extrinsics import Extrinsics
-from ..calibration.results.held_out_verification import shown_misalignment
+from ..calibration.results.held_out_verification import shown_misalignment, shown_mounting
 from ..calibration.results.results import Result, Verification
 from ..calibration.streams.stream_order import DROPOUT_NS
 from ..errors import InputError
@@ -159,8 +157,7 @@ def _mounting_instead_of_guess(result: Result) -> tuple[float, float, float] | N
     about = shown_misalignment(model, state, parameters)
     if math.atan(float(np.linalg.norm(about))) < parameters.reject_misalignment or parameters.initial_calibration:
         return None
-    t = parameters.rotation_dvl_from_body
-    found = np.array(whole_degrees(corrected_mounting(t @ about, t)))
+    found = np.array(shown_mounting(model, state, parameters))
     # a difference that may be a misalignment remains one
     guessed = np.array(parameters.mounting_rpy)
     is_other = np.cos(found - guessed) < math.cos(0.5 * parameters.reject_misalignment)

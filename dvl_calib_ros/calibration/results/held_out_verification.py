@@ -121,6 +121,12 @@ def shown_misalignment(model: Model, state: GaussianState, parameters: Parameter
     return np.where(shown, about, 0.0)
 
 
+def shown_mounting(model: Model, state: GaussianState, parameters: Parameters) -> tuple[float, float, float]:
+    """Return the mounting_rpy (rad, whole degrees) that corrects the misalignment about the observable body axes."""
+    t = parameters.rotation_dvl_from_body
+    return whole_degrees(corrected_mounting(t @ shown_misalignment(model, state, parameters), t))
+
+
 def _angle_deg(model: Model, state: GaussianState, parameters: Parameters) -> float:
     """Return the misalignment angle, degrees, about the observable body axes."""
     return math.degrees(math.atan(float(np.linalg.norm(shown_misalignment(model, state, parameters)))))
@@ -136,10 +142,8 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
     angle, reject = _angle_deg(model, state, parameters), math.degrees(parameters.reject_misalignment)
     findings = []
     if angle >= reject:
-        nominal = parameters.rotation_dvl_from_body
-        about_dvl_axes = nominal @ shown_misalignment(model, state, parameters)
-        rpy = np.degrees(whole_degrees(corrected_mounting(about_dvl_axes, nominal)))
-        option = dict(zip(("roll", "pitch", "yaw"), rpy.tolist(), strict=True))
+        rpy = map(math.degrees, shown_mounting(model, state, parameters))
+        option = dict(zip(("roll", "pitch", "yaw"), rpy, strict=True))
         findings.append(finding("MISALIGNMENT_LARGE", degrees=angle, limit=reject, **option))
     variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
     std = np.sqrt(variance)
