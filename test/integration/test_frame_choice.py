@@ -98,6 +98,10 @@ def test_two_readings_that_fit_as_well_are_both_said_and_the_answer_is_marginal(
     told.imu("/imu", "base_link")
     odometry(told, np.eye(3), pose=False)
     bag = told.write(tmp_path / "bag")
+    as_found = replay(bag)
+    assert as_found.verdict == "marginal" and doctor(bag).verdict == "partly"
+    assert "dvl_axes frd and, as well, dvl_axes flu" in as_found.reasons[0]
+    assert "which side is port on the DVL" in as_found.reasons[0]
     told_axes = replay(bag, dvl_axes="frd", gnss_frame="body")
     assert "FRAMES_AMBIGUOUS" not in codes(told_axes.discovery.contradictions)
     assert is_right(told_axes, truth_deg())
