@@ -57,6 +57,27 @@ def one_axis_negated(told: Told, wrong: bool) -> None:
             message.twist.twist.linear.z *= -1.0
 
 
+def attitude_inverted(told: Told, wrong: bool) -> None:
+    """An IMU driver whose quaternions are from the world to the body."""
+    sound(told)
+    for _, _, kind, message in told.rows:
+        if wrong and kind == IMU:
+            message.orientation.w *= -1.0
+
+
+def astern_by_its_transform(told: Told, wrong: bool) -> None:
+    """A DVL that is turned about, without a transform that says so, and nothing to compare with."""
+    sound(told, reference=False, yaw=math.pi)
+
+
+def stamps_a_minute_and_a_half_ahead(told: Told, wrong: bool) -> None:
+    """A DVL whose stamps are too far from the others to be estimated, but arrived with them."""
+    sound(told)
+    for _, topic, _, message in told.rows:
+        if topic == DVL:
+            message.header.stamp.sec += 90
+
+
 def one_beam_low(told: Told, wrong: bool) -> None:
     """One of four beams at 30 degrees reads 15 % low."""
     sound(told)
@@ -97,6 +118,15 @@ def wrong_transform_without_reference(told: Told, wrong: bool) -> None:
     """A transform with the yaw of a DVL at 135 degrees the wrong way round, and nothing to compare with."""
     yaw = math.radians(-135.0)
     sound(told, reference=False, yaw=yaw, said_yaw=-yaw if wrong else yaw)
+
+
+def earth_axes_without_reference(told: Told, wrong: bool) -> None:
+    """A driver that turns the velocity into east, north, up."""
+    sound(told, reference=False)
+    velocities = [message.twist.twist.linear for _, topic, _, message in told.rows if topic == DVL]
+    for (i, _), v in zip(told.every(5.0), velocities, strict=True):
+        if wrong:
+            v.x, v.y, v.z = (told.motion.rotation_enu_from_body[i] @ [v.x, v.y, v.z]).tolist()
 
 
 def axes_of_the_driver_without_reference(change: Callable[[Any], None], yaw: float) -> Callable[[Told, bool], None]:
@@ -264,6 +294,12 @@ SITUATIONS = {
         yaw_deg=-135.0,
         verdicts=NOISY,
     ),
+    "earth axes without reference": Situation(
+        told_by(earth_axes_without_reference),
+        "DVL_TURNS_WITH_HEADING",
+        "let the driver send the velocity in the DVL's own axes",
+        verdicts=NOISY,
+    ),
     "negated axis at 45 degrees without reference": Situation(
         told_by(axes_of_the_driver_without_reference(negate_y, math.radians(45.0))),
         "TRAVELS_SIDEWAYS",
@@ -276,6 +312,20 @@ SITUATIONS = {
         "TRAVELS_SIDEWAYS",
         "or, if that mounting is right, swap x and y in the DVL's driver",
         verdicts=NOISY,
+    ),
+    "attitude inverted": Situation(
+        told_by(attitude_inverted, long_motion), "GRAVITY_FITS_INVERTED", "correct the IMU's driver"
+    ),
+    "astern without reference": Situation(
+        told_by(astern_by_its_transform),
+        "TRAVELS_ASTERN",
+        "try -p mounting_rpy:=[0deg,0deg,",
+        {"mounting_rpy": (0.0, 0.0, math.pi)},
+        yaw_deg=180.0,
+        verdicts=NOISY,
+    ),
+    "stamps a minute and a half ahead": Situation(
+        told_by(stamps_a_minute_and_a_half_ahead, long_motion), "CLOCK_FAR", "--restamp log", {"restamp": RESTAMP_ALL}
     ),
     "stamps an hour ahead": Situation(
         told_by(stamps_an_hour_ahead), "CLOCKS_APART", "--restamp log", {"restamp": RESTAMP_ALL}

@@ -25,10 +25,8 @@ from ..calibration.comparison.mounting_change import (
 )
 from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
-from ..calibration.numerics.error_model import corrected_mounting
-from ..calibration.numerics.frames import whole_degrees
 from ..calibration.results.extrinsics import Extrinsics
-from ..calibration.results.held_out_verification import shown_misalignment
+from ..calibration.results.held_out_verification import shown_misalignment, shown_mounting
 from ..calibration.results.results import Result, Verification
 from ..calibration.streams.stream_order import DROPOUT_NS
 from ..errors import InputError
@@ -132,13 +130,13 @@ def checked_replay(
 
 
 # Findings of discovery that reject a calibration.
-DECISIVE = "DVL_SIDE_INVERTED", "TRAVELS_ASTERN"
+DECISIVE = "DVL_SIDE_INVERTED", "DVL_TURNS_WITH_HEADING", "TRAVELS_ASTERN"
 
 
 def _with_frame_doubts(verification: Verification, contradictions: Sequence[Reason]) -> Verification:
     """Add ambiguous frames to the verdict and, if the calibration is rejected anyway, their likely cause.
 
-    Without a reference nothing else rejects an inverted sway or a vehicle that travels astern.
+    Without a reference nothing else rejects these axes of the DVL or a vehicle that travels astern.
     """
     is_rejected = verification.verdict is Severity.REJECT
     kept = [
@@ -159,8 +157,7 @@ def _mounting_instead_of_guess(result: Result) -> tuple[float, float, float] | N
     about = shown_misalignment(model, state, parameters)
     if math.atan(float(np.linalg.norm(about))) < parameters.reject_misalignment or parameters.initial_calibration:
         return None
-    t = parameters.rotation_dvl_from_body
-    found = np.array(whole_degrees(corrected_mounting(t @ about, t)))
+    found = np.array(shown_mounting(model, state, parameters))
     # a difference that may be a misalignment remains one
     guessed = np.array(parameters.mounting_rpy)
     is_other = np.cos(found - guessed) < math.cos(0.5 * parameters.reject_misalignment)

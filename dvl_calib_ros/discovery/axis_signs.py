@@ -1,4 +1,4 @@
-"""Signs of the DVL's axes without a reference velocity.
+"""Axes of the DVL without a reference velocity: those of the earth, and the signs of its own.
 
 A current c adds c·ahead to the speed ahead and c·left to the sway. So the current by the sway over all headings
 predicts how the speed ahead changes in turns. A mirrored y inverts the prediction. Nothing predicts the sign of z.
@@ -17,6 +17,7 @@ from ..calibration.numerics.block_covariance import of_few
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.robust import robust_std
 from ..calibration.numerics.tests import BY_CHANCE
+from ..calibration.registration.configuration_check import Directions
 from ..calibration.registration.frame_hypotheses import ImuFrame
 from ..calibration.streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..messages.decode import turns_dvl
@@ -98,24 +99,30 @@ def sway_sign(times: Array, velocity: Array, imu: ImuColumns) -> SwaySign | None
 
 
 def sign_findings(recordings: Sequence[Survey], topics: Topics, parameters: Parameters) -> Iterator[Reason]:
-    """Yield the finding of an inverted sway, else of each axis whose sign is open and changes the mounting."""
+    """Yield the finding of axes of the earth, of an inverted sway, or of each open sign that changes the mounting."""
     seen = [(one.looks[topics.dvl], one.looks.get(topics.imu)) for one in recordings if topics.dvl in one.looks]
     if not seen:
         return
     first = seen[0][0]
     is_turned = turns_dvl(VELOCITY_TYPES[first.msgtype], first.frame_id, parameters)
     body_from_message = parameters.rotation_dvl_from_body.T @ (FLU_FROM_FRD if is_turned else np.eye(3))
+    frame = ImuFrame(rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, "")
+    each, directions = [], Directions()
+    for dvl, imu in seen:
+        imu = in_time_of(dvl, imu, parameters)
+        if imu is not None and imu.has_orientation:
+            velocity, read = dvl.values @ body_from_message.T, frame.read(imu_columns_of(imu))
+            each.append(sway_sign(dvl.stamps_s, velocity, read))
+            rotation, known = attitude_at(read, dvl.stamps_s, GAP_S)
+            directions.add(velocity[known], rotation[known])
+    if directions.turn_with_heading:
+        yield finding("DVL_TURNS_WITH_HEADING")
+        return
     mean = np.concatenate([dvl.values[np.isfinite(dvl.values).all(axis=1)] for dvl, _ in seen]).mean(axis=0)
     given = body_from_message @ mean
     straight = np.array([given[0], 0.0, 0.0])
     if _angle(given, straight) > LIKELY:
         return  # no vehicle that travels ahead
-    frame = ImuFrame(rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, "")
-    each = []
-    for dvl, imu in seen:
-        imu = in_time_of(dvl, imu, parameters)
-        if imu is not None and imu.has_orientation:
-            each.append(sway_sign(dvl.stamps_s, dvl.values @ body_from_message.T, frame.read(imu_columns_of(imu))))
     signs = [one for one in each if one is not None and one.sign]
     if signs and all(one.sign < 0 for one in signs):
         axes = FLU if is_turned != parameters.is_z_down else FRD

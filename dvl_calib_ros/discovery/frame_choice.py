@@ -8,7 +8,7 @@ Its likelihood is that of the residual of DVL and reference, see `frame_hypothes
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -167,7 +167,7 @@ class FrameChooser:
             return []
         if self._given & {"imu_rpy", "imu_frame"}:
             rotation = rotation_from_rpy(self._parameters.imu_rpy)
-            frame = ImuFrame(rotation, self._parameters.imu_frame, "as given")
+            frame = ImuFrame(rotation, self._parameters.imu_frame, "as given", self._parameters.heading_offset)
             return [ImuHypothesis(frame, self._parameters.is_z_down, 0.0)]
         at = np.eye(3) if placed is None else placed.rotation
         text = f"as {placed.source} has {placed.frame}" if placed is not None and placed.source else "as the body"
@@ -200,6 +200,7 @@ class FrameChooser:
             if self._gravity is not None:
                 wrong = self._gravity.contradicts(frame.rotation_body_from_imu, frame.world, z_down)
                 prior += (0.0, GRAVITY_CONTRADICTS, GRAVITY_INVERTED)[wrong]
+            frame = replace(frame, heading_offset=self._parameters.heading_offset)
             found.append(ImuHypothesis(frame, z_down, prior))
         return found
 
@@ -349,7 +350,8 @@ class FrameChooser:
             and best.mounting is None
             and not readings.are_axes_mirrored(best.reading, turn, mounting)
         ):
-            reasons += (_mounting_contradicted(mounting.T, turn.T, None if best.reading.in_body else best.reading.imu),)
+            imu = None if best.reading.in_body else imus[best.reading]
+            reasons += (_mounting_contradicted(mounting.T, turn.T, imu),)
         return FrameChoice(best.agreement, imus[best.reading], reasons)
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
@@ -363,7 +365,7 @@ class FrameChooser:
         }
 
 
-def _mounting_contradicted(given: Array, found: Array, imu: ImuFrame | None) -> Reason:
+def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None) -> Reason:
     """Return the finding of another mounting; its remedy names what looks the same.
 
     given, found: (3, 3) rotation_body_from_dvl. imu: by which the reference is turned into the body, None for none.
@@ -373,8 +375,10 @@ def _mounting_contradicted(given: Array, found: Array, imu: ImuFrame | None) -> 
     about_z = fitting[2] - float(rpy[2])
     is_drawn = abs(math.remainder(about_z, DRAWN)) < MEANT_WITHIN[2]
     if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=MEANT_WITHIN[0]):
-        heading = rpy_from_rotation(rotation_from_rpy((0.0, 0.0, -about_z)) @ imu.rotation_body_from_imu) + 0.0
-        first = f"set the declination of the compass, here -p imu_rpy:={as_option(heading)}; if the heading is right, "
+        offset = math.degrees(imu.frame.heading_offset + math.remainder(-about_z if imu.z_down else about_z, math.tau))
+        first = (
+            f"set the declination of the compass, here -p heading_offset:={offset:.4g}deg; if the heading is right, "
+        )
     shares = np.diag(given.T @ found)
     if np.abs(shares).min() > math.cos(TURNED_FROM):  # a half turn
         negated = " and ".join(axis for axis, share in zip("xyz", shares, strict=True) if share < 0.0)

@@ -251,8 +251,7 @@ CONFIGURATIONS = on_page(
     marginal(
         "FRAMES_AMBIGUOUS",
         "the data fit {taken} and, as well, {other}; the first is taken",
-        means="Which side is port, and which axes has the reference?",
-        remedy="set the one that is right",
+        remedy="which side is port on the DVL, and which axes has the reference? Set the one that is right",
     ),
     reject("TWO_CONTRADICTIONS", "{one}; {other}"),
 )

@@ -113,7 +113,7 @@ def finding(code: str, **numbers: object) -> Reason:
 
 # Causes in causal order, by the beginnings of their codes: frames and signs, clocks, mounting.
 _CAUSES = (
-    ("DOCTOR_", "DVL_SIDE_INVERTED", "FRAMES_AMBIGUOUS", "GRAVITY_"),
+    ("DOCTOR_", "DVL_SIDE_INVERTED", "DVL_TURNS_WITH_HEADING", "FRAMES_AMBIGUOUS", "GRAVITY_"),
     ("CLOCK_DRIFTS", "CLOCK_FAR", "CLOCK_LEAPS", "CLOCKS_APART"),
     ("MOUNTING_CONTRADICTED", "MOUNTING_FITS", "TRAVELS_"),
 )

@@ -43,7 +43,10 @@ VERDICTS = on_page(
         "MISALIGNMENT_LARGE",
         "the misalignment is {degrees:.1f}°, and from {limit:.1f}° on it is rejected",
         means="Seldom the bracket.",
-        remedy="are mounting_rpy, the frames and a compass's declination right?",
+        remedy=(
+            "check mounting_rpy, the frames and a compass's declination; if they are right, try "
+            "-p mounting_rpy:=[{roll:.0f}deg,{pitch:.0f}deg,{yaw:.0f}deg]"
+        ),
     ),
     reject(
         "SCALE_LARGE",

@@ -98,6 +98,10 @@ def test_two_readings_that_fit_as_well_are_both_said_and_the_answer_is_marginal(
     told.imu("/imu", "base_link")
     odometry(told, np.eye(3), pose=False)
     bag = told.write(tmp_path / "bag")
+    as_found = replay(bag)
+    assert as_found.verdict == "marginal" and doctor(bag).verdict == "partly"
+    assert "dvl_axes frd and, as well, dvl_axes flu" in as_found.reasons[0]
+    assert "which side is port on the DVL" in as_found.reasons[0]
     told_axes = replay(bag, dvl_axes="frd", gnss_frame="body")
     assert "FRAMES_AMBIGUOUS" not in codes(told_axes.discovery.contradictions)
     assert is_right(told_axes, truth_deg())
@@ -154,8 +158,9 @@ def test_a_yaw_that_no_drawing_has_is_named_as_it_is_and_its_remedy_works(tmp_pa
 
 
 @pytest.mark.spread(1)
-def test_a_heading_without_its_declination_is_said_before_another_mounting_and_its_remedy_works(tmp_path):
-    declination, told = math.radians(14.0), Told()
+@pytest.mark.parametrize("degrees", [14.0, -60.0])
+def test_a_heading_without_its_declination_is_said_before_another_mounting_and_its_remedy_works(tmp_path, degrees):
+    declination, told = math.radians(degrees), Told()
     sound(told)
     for _, _, kind, message in told.rows:
         if kind == IMU:
@@ -164,12 +169,10 @@ def test_a_heading_without_its_declination_is_said_before_another_mounting_and_i
             q.x, q.y, q.z, q.w = turned.as_quat().tolist()
     bag = told.write(tmp_path / "bag")
     said = doctor(bag).reasons[0].sentence
-    found = re.search(
-        r"set the declination of the compass, here -p imu_rpy:=\[0deg,0deg,(.*)deg\]; if the heading", said
-    )
-    heading = -float(found[1]) if found else 0.0
-    assert heading == pytest.approx(14.0, abs=3.0)  # the DVL's misalignment is in it
-    assert replay(bag, imu_rpy=(0.0, 0.0, -math.radians(heading))).verdict != "reject"
+    found = re.search(r"set the declination of the compass, here -p heading_offset:=(.*?)deg; if the heading", said)
+    heading = float(found[1]) if found else 0.0
+    assert heading == pytest.approx(degrees, abs=3.0)  # the DVL's misalignment is in it
+    assert replay(bag, heading_offset=math.radians(heading)).verdict != "reject"
 
 
 def test_two_negated_axes_are_a_mounting_or_the_drivers(tmp_path):

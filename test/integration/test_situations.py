@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ RIGHT_DEG = 0.5
 YAW_STD_DEG = 2.5
 UNDER_2_S = (
     "wrong transform without reference", "text of a DVL", "negated axis at 45 degrees without reference",
-    "swapped axes without reference",
+    "swapped axes without reference", "earth axes without reference",
 )  # fmt: skip
 
 
@@ -46,6 +47,20 @@ def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_t
     errors_deg, std_deg = errors_of(calibration, situation.yaw_deg)
     assert (errors_deg < np.maximum(3.0 * std_deg, RIGHT_DEG)).all(), (errors_deg, std_deg)
     assert std_deg[2] < YAW_STD_DEG
+
+
+def test_the_mounting_of_a_large_misalignment_is_said_and_is_accepted_once_set(tmp_path):
+    told = Told()
+    sound(told, yaw=math.radians(7.0))
+    bag = told.write(tmp_path / "bag")
+    first, *_ = dc.doctor(bag).reasons
+    assert first.code == "MISALIGNMENT_LARGE"
+    option = re.search(r"-p mounting_rpy:=\[(.*?)deg,(.*?)deg,(.*?)deg\]", first.sentence)
+    mounting = np.radians([float(each) for each in option.groups()])
+    mended = dc.replay(bag, history=False, mounting_rpy=tuple(mounting.tolist()))
+    assert mended.verdict != "reject"
+    errors_deg, std_deg = errors_of(mended, 7.0)
+    assert (errors_deg < np.maximum(3.0 * std_deg, RIGHT_DEG)).all(), (errors_deg, std_deg)
 
 
 @pytest.mark.slow

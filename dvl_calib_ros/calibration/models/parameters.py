@@ -222,6 +222,13 @@ class Parameters:
         "(nwu).",
         choices=(IMU_ENU, IMU_NED, NWU),
     )
+    heading_offset: float = _parameter(
+        0.0,
+        "Added to the heading of the IMU's orientation, counter-clockwise: minus the declination of a compass, or the "
+        "heading at which a gyro started.",
+        unit="rad",
+        within=(-2 * math.pi, 2 * math.pi),
+    )
     restamp: str = _parameter("", "Topics whose stamps are replaced by recording times, with commas between; log: all.")
     dvl_time_offset: float = _parameter(
         0.0,

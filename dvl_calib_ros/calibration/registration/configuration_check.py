@@ -251,11 +251,11 @@ def wrong_axes(
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None
     if (is_shown & is_turned).any():
         if is_turned.sum() == 1 and (is_shown & ~is_turned)[others].any():
-            turned, other = sorted(others, key=lambda each: not is_turned[each])
+            mirrored, other = sorted(others, key=lambda each: not is_turned[each])
             # in which the other axis of the same data is inverted
             instead = None if ahead else _OTHER_AXES.get(dvl_axes)
             alike = f" (read as {dvl_axes}; read as {instead}, {'xyz'[other]} does)" if instead else ""
-            return finding("DVL_LEFT_HANDED", axis="xyz"[turned], alike=alike)
+            return finding("DVL_LEFT_HANDED", axis="xyz"[mirrored], alike=alike)
         if ahead:
             return _mounting_fits(nominal @ np.diag(np.where(np.arange(3) == ahead, 1.0, -1.0)))
         return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))

@@ -30,7 +30,7 @@ from ..numerics.frames import (
     whole_degrees,
 )
 from ..numerics.samples import VelocityFrame
-from ..streams.imu_frame import ENU_FROM, quaternion_product
+from ..streams.imu_frame import enu_from, quaternion_product
 from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from .configuration_check import DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
 from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
@@ -72,19 +72,21 @@ READ_BY: Mapping[str, Array] = {
 class ImuFrame:
     """Hypothesis about the IMU's axes and world.
 
-    rotation_body_from_imu (3, 3); world: as parameter imu_frame; says: description.
+    rotation_body_from_imu (3, 3); world: as parameter imu_frame; says: description. heading_offset: rad, as parameter.
     """
 
     rotation_body_from_imu: Array
     world: str
     says: str
+    heading_offset: float = 0.0
 
     def read(self, imu: ImuColumns) -> ImuColumns:
         """Return attitudes and rates converted to body axes and ENU."""
         quaternions = quaternion_product(
             imu.orientation, np.array(quaternion_from_rotation(self.rotation_body_from_imu.T))
         )
-        quaternions = quaternion_product(np.array(quaternion_from_rotation(ENU_FROM[self.world])), quaternions)
+        enu_from_world = np.array(quaternion_from_rotation(enu_from(self.world, self.heading_offset)))
+        quaternions = quaternion_product(enu_from_world, quaternions)
         return ImuColumns(imu.times, quaternions, imu.angular_velocity @ self.rotation_body_from_imu.T)
 
 

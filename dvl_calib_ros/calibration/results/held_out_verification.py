@@ -18,7 +18,8 @@ from ..filters.cross_validation import HeldOutError
 from ..filters.observability import OBSERVED_SHARE, Convergence, body_angle_std
 from ..models import Model
 from ..models.parameters import Parameters
-from ..numerics.frames import Array
+from ..numerics.error_model import corrected_mounting
+from ..numerics.frames import Array, whole_degrees
 from ..numerics.kalman import GaussianState
 from ..numerics.tests import BY_CHANCE, CHANCE, chi2_isf
 from .results import Verification
@@ -115,6 +116,12 @@ def shown_misalignment(model: Model, state: GaussianState, parameters: Parameter
     return np.where(shown, about, 0.0)
 
 
+def shown_mounting(model: Model, state: GaussianState, parameters: Parameters) -> tuple[float, float, float]:
+    """Return the mounting_rpy (rad, whole degrees) that corrects the misalignment about the observable body axes."""
+    t = parameters.rotation_dvl_from_body
+    return whole_degrees(corrected_mounting(t @ shown_misalignment(model, state, parameters), t))
+
+
 def _angle_deg(model: Model, state: GaussianState, parameters: Parameters) -> float:
     """Return the misalignment angle, degrees, about the observable body axes."""
     return math.degrees(math.atan(float(np.linalg.norm(shown_misalignment(model, state, parameters)))))
@@ -130,7 +137,9 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
     angle, reject = _angle_deg(model, state, parameters), math.degrees(parameters.reject_misalignment)
     findings = []
     if angle >= reject:
-        findings.append(finding("MISALIGNMENT_LARGE", degrees=angle, limit=reject))
+        rpy = map(math.degrees, shown_mounting(model, state, parameters))
+        option = dict(zip(("roll", "pitch", "yaw"), rpy, strict=True))
+        findings.append(finding("MISALIGNMENT_LARGE", degrees=angle, limit=reject, **option))
     variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
     std = np.sqrt(variance)
     known = (variance > 0.0) & (

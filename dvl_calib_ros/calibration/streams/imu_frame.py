@@ -29,18 +29,24 @@ ENU_FROM: Mapping[str, Array] = {IMU_ENU: np.eye(3), IMU_NED: ENU_FROM_NED, NWU:
 _QUIET = np.errstate(invalid="ignore", over="ignore")
 
 
+def enu_from(world: str, heading_offset: float) -> Array:
+    """Return the rotation (3, 3) to ENU from the IMU's world. heading_offset: rad, as the parameter."""
+    return rotation_from_rpy((0.0, 0.0, heading_offset)) @ ENU_FROM[world]
+
+
 class ImuAlignment:
-    """Rotation of IMU samples by the parameters imu_rpy and imu_frame.
+    """Rotation of IMU samples by the parameters imu_rpy, imu_frame and heading_offset.
 
     is_identity: no rotation; samples are returned as the same objects.
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        self.is_identity = not any(parameters.imu_rpy) and parameters.imu_frame == IMU_ENU
+        turns = any(parameters.imu_rpy) or parameters.heading_offset
+        self.is_identity = not turns and parameters.imu_frame == IMU_ENU
         rotation_body_from_imu = rotation_from_rpy(parameters.imu_rpy)
         self._rotation_body_from_imu: Array = rotation_body_from_imu
         self._imu_from_body = quaternion_from_rotation(rotation_body_from_imu.T)
-        self._enu_from_world = quaternion_from_rotation(ENU_FROM[parameters.imu_frame])
+        self._enu_from_world = quaternion_from_rotation(enu_from(parameters.imu_frame, parameters.heading_offset))
 
     def sample(self, sample: ImuSample) -> ImuSample:
         """Rotate one live sample. Missing values stay None, non-finite values stay non-finite."""

@@ -171,7 +171,7 @@ def test_a_rejected_calibration_beside_accepted_ones_is_a_suspected_move_if_it_d
 
 
 def test_a_calibration_that_is_rejected_for_its_size_alone_is_believed():
-    of_size = finding("MISALIGNMENT_LARGE", degrees=5.7, limit=5.0)
+    of_size = finding("MISALIGNMENT_LARGE", degrees=5.7, limit=5.0, roll=0.0, pitch=0.0, yaw=6.0)
     other = finding("NO_SAMPLE_USED")
     assert rejection([of_size.as_dict()]) == ""
     assert rejection([of_size.as_dict(), other.as_dict()]) == other.says

@@ -43,6 +43,15 @@ def test_an_imu_that_is_mounted_turned_gives_the_bodys_attitude_and_rates(frame,
     np.testing.assert_allclose(turned.angular_velocity, rate, atol=1e-12)
 
 
+def test_a_heading_offset_turns_the_attitude_about_the_vertical_and_leaves_the_rates():
+    attitude, rate = Rotation.from_euler("ZYX", [0.7, -0.2, 0.1]), (0.1, 0.2, 0.3)
+    measured = ImuSample(0, tuple(attitude.as_quat().tolist()), rate)
+    turned = ImuAlignment(Parameters(heading_offset=0.4)).sample(measured)
+    wanted = Rotation.from_euler("ZYX", [1.1, -0.2, 0.1])
+    np.testing.assert_allclose(as_matrix(turned.orientation), wanted.as_matrix(), atol=1e-12)
+    assert turned.angular_velocity == pytest.approx(rate)
+
+
 def test_a_marine_imu_forward_right_down_in_north_east_down_is_imu_frame_ned_and_imu_rpy_pi():
     rpy_ned = (0.1, -0.2, 1.3)
     measured = ImuSample(0, quaternion_from_rotation(Rotation.from_euler("xyz", rpy_ned).as_matrix()), None)
