@@ -15,6 +15,7 @@ import numpy as np
 
 from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, FROM_REFERENCE, TOLD, Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
+from ..calibration.numerics.robust import median
 from ..calibration.numerics.samples import VelocityFrame
 from ..calibration.registration.frame_hypotheses import (
     CLEARLY,
@@ -255,13 +256,15 @@ class _Search:
         """Set min_speed of a vehicle that mostly moves more slowly than the default."""
         speed = np.linalg.norm(dvl.values, axis=1)
         moving = speed[speed > SLOWEST_MPS]
-        if self._is_given("min_speed") or not len(moving) or np.median(moving) > self._parameters.min_speed:
+        if self._is_given("min_speed") or not len(moving):
             return
-        self._values["min_speed"] = SLOWEST_MPS
-        self._found.append(
-            f"the vehicle moves at {float(np.median(moving)):.2g} m/s: samples from {SLOWEST_MPS:g} m/s on are used "
-            f"(-p min_speed:={SLOWEST_MPS:g})"
-        )
+        typical = float(median(moving))
+        if typical < self._parameters.min_speed:
+            self._values["min_speed"] = SLOWEST_MPS
+            self._found.append(
+                f"the vehicle moves at {typical:.2g} m/s: samples from {SLOWEST_MPS:g} m/s on are used "
+                f"(-p min_speed:={SLOWEST_MPS:g})"
+            )
 
     @property
     def _is_z_down(self) -> bool:
