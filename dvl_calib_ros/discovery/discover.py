@@ -400,8 +400,8 @@ class _Search:
         """Write the frames and mounting of a reading into the parameters."""
         reading, parameters = chosen.reading, self._parameters
         declared = self._declared_reference(reference)
-        if declared is not None and self._is_z_down and declared.points_down:
-            declared = DeclaredFrame(VelocityFrame.BODY)
+        if declared is not None:
+            declared = declared.in_base(FRD if self._is_z_down else FLU)
         taken = DECLARED_FRAMES[reading.reference]
         # without an attitude only the body frame could be tried
         if imu is None and declared is None and chosen.best_left >= FITS:

@@ -60,7 +60,7 @@ BASE_Z_DOWN, UNPLACED_BASE_Z_DOWN = math.log(1 / 50), math.log(1 / 500)
 REFERENCE_FRAME_OTHER = math.log(1 / 200)
 REFERENCE_AXES_OTHER = math.log(1 / 50)
 # a reference without a declared frame: ENU, the body, NED; other worlds
-UNDECLARED = {"enu": 0.0, "body": math.log(1 / 2), FRD: math.log(1 / 2), "ned": math.log(1 / 3)}
+UNDECLARED = {"enu": 0.0, "ned": math.log(1 / 3)} | dict.fromkeys(("body", FLU, FRD), math.log(1 / 2))
 OTHER_WORLD = math.log(1 / 50)
 # axes of a twist that contradict its own turn rates or its pose's world; that contradict the motion of its pose
 TWIST_RATES_OTHER, TWIST_POSE_OTHER = math.log(1 / 20), math.log(1 / 1000)
@@ -233,24 +233,23 @@ class FrameChooser:
     def _reference_priors(self, reference: Look, imu: ImuHypothesis | None) -> dict[str, float]:
         """Return the log odds of the frames that a reference may be in, by name."""
         z_down = self._says_z_down if imu is None else imu.z_down
+        own, turned = (FRD, FLU) if z_down else (FLU, FRD)
         declared = declared_reference(reference, self._parameters, self._base_frame)
-        if self._parameters.gnss_frame != FROM_FRAME_ID and declared is not None:
-            return {declared.in_base(self._parameters.replace(base_axes=FRD)).name if z_down else declared.name: 0.0}
-        names = ["enu", "body", *([] if z_down else [FRD]), "ned", NWU]
+        if declared is not None:
+            declared = declared.in_base(own)
+            if self._parameters.gnss_frame != FROM_FRAME_ID:
+                return {declared.name: 0.0}
+        names = ["enu", "body", turned, "ned", NWU]
         if declared is None:
             priors = {name: UNDECLARED.get(name, OTHER_WORLD) for name in names}
         else:
             of_body = declared.frame is VelocityFrame.BODY
-            other = {"body": REFERENCE_AXES_OTHER, FRD: REFERENCE_AXES_OTHER} if of_body else {}
-            priors = {name: other.get(name, REFERENCE_FRAME_OTHER) for name in names}
-            priors["body" if z_down and declared.points_down else declared.name] = 0.0
+            other = dict.fromkeys(("body", turned), REFERENCE_AXES_OTHER) if of_body else {}
+            priors = {name: other.get(name, REFERENCE_FRAME_OTHER) for name in names} | {declared.name: 0.0}
         shown = twist_axes(reference)
         if shown is not None:
-            agreeing = {"body" if z_down else FRD} if shown == FRD else {"body"} if shown == "body" else {shown}
-            agreeing = set() if shown == "body" and z_down else agreeing
-            return {name: prior if name in agreeing else prior + TWIST_POSE_OTHER for name, prior in priors.items()} | {
-                name: 0.0 for name in agreeing
-            }
+            agreeing = "body" if shown == own else shown
+            return {name: prior + TWIST_POSE_OTHER for name, prior in priors.items()} | {agreeing: 0.0}
         if not z_down and (declared is None or declared.frame is not VelocityFrame.BODY):
             right = self._points_down(reference, imu)
             priors["body" if right else FRD] += TWIST_RATES_OTHER
@@ -438,8 +437,8 @@ def twist_axes(look: Look) -> str | None:
     in_ned = world is not None and world.frame is VelocityFrame.NED
     if best in _BODY_AXES:
         body_down = (float(rotation[:, 2, 2].mean()) < 0.0) != in_ned
-        return FRD if body_down != (best == FRD) else "body"
+        return FRD if body_down != (best == FRD) else FLU
     return best if not in_ned else {"enu": "ned", "ned": "enu"}[best]
 
 
-_BODY_AXES = {"body": np.eye(3), FRD: FLU_FROM_FRD}
+_BODY_AXES = {FLU: np.eye(3), FRD: FLU_FROM_FRD}

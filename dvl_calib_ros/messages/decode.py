@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..calibration.models.parameters import FRD, FROM_FRAME_ID, FROM_MESSAGE, NWU, Parameters
+from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAGE, NWU, Parameters
 from ..calibration.numerics.frames import ENU_FROM_NED, Array, Vector
 from ..calibration.numerics.samples import DvlSample, ImuSample, ReferenceSample, Stream, VelocityFrame
 from ..calibration.streams.imu_frame import ImuAlignment
@@ -64,24 +64,23 @@ HALF_TURN, QUARTER_TURN = Axes((0, 1, 2), (1.0, -1.0, -1.0)), Axes((1, 0, 2), (-
 
 
 class DeclaredFrame(NamedTuple):
-    """A frame of reference velocities: the core's frame, and the axes from which messages are converted to it."""
+    """A frame of reference velocities: the core's frame, and the axes from which messages are converted to it.
+
+    body_axes: flu or frd, if the body's axes are named; empty for those of base_frame.
+    """
 
     frame: VelocityFrame
     axes: Axes = AS_SENT
-
-    @property
-    def points_down(self) -> bool:
-        """Whether this is the body frame, forward-right-down."""
-        return self.axes is HALF_TURN
+    body_axes: str = ""
 
     @property
     def name(self) -> str:
         """Value of parameter gnss_frame."""
-        return {HALF_TURN: FRD, QUARTER_TURN: NWU}.get(self.axes, self.frame.value)
+        return NWU if self.axes is QUARTER_TURN else self.body_axes or self.frame.value
 
-    def in_base(self, parameters: Parameters) -> DeclaredFrame:
-        """Return the frame to use: with a z-down base_frame, its own axes need no conversion."""
-        return DeclaredFrame(self.frame) if parameters.is_z_down and self.points_down else self
+    def in_base(self, base_axes: str) -> DeclaredFrame:
+        """Return the frame to use: the own axes of base_frame need no conversion."""
+        return DeclaredFrame(self.frame) if self.body_axes == base_axes else self
 
 
 # by value of parameter gnss_frame
@@ -89,12 +88,12 @@ DECLARED_FRAMES = {
     each.name: each
     for each in (
         *map(DeclaredFrame, VelocityFrame),
-        DeclaredFrame(VelocityFrame.BODY, HALF_TURN),
+        *(DeclaredFrame(VelocityFrame.BODY, HALF_TURN, axes) for axes in (FLU, FRD)),
         DeclaredFrame(VelocityFrame.ENU, QUARTER_TURN),
     )
 }
 # by suffix of a frame's name
-_SUFFIXES = {"enu": "enu", "ned": "ned", "nwu": NWU, "flu": "body", "frd": FRD}
+_SUFFIXES = {"enu": "enu", "ned": "ned", "nwu": NWU, "flu": FLU, "frd": FRD}
 
 
 def frame_name(frame_id: str) -> str:
@@ -356,14 +355,14 @@ class MessageDecoder:
         """Return the reference's frame, by parameter, type or frame_id; None, with a note, if unknown."""
         p = self.parameters
         if p.gnss_frame != FROM_FRAME_ID:
-            return DECLARED_FRAMES[p.gnss_frame].in_base(p)
+            return DECLARED_FRAMES[p.gnss_frame].in_base(p.base_axes)
         if self.reference_type.reference_frame is not None:
             return DeclaredFrame(self.reference_type.reference_frame)
         frame = frame_named(frame_id, (p.base_frame,))
         if frame is None:
             self._problem("reference frame", finding("REFERENCE_FRAME", frame_id=frame_id, base=p.base_frame))
             return None
-        return frame.in_base(p)
+        return frame.in_base(p.base_axes)
 
     def note_imu_frame(self, frame_id: str) -> None:
         """Note the frame of IMU messages."""

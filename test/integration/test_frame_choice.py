@@ -92,6 +92,20 @@ def test_a_twist_is_in_the_axes_in_which_it_moves_its_own_pose(tmp_path, twist):
 
 
 @pytest.mark.spread(1)
+def test_a_forward_left_up_twist_of_a_vehicle_that_is_z_down_is_turned(tmp_path):
+    """It was no hypothesis: accepted with pitch and yaw of the opposite signs."""
+    told = Told()
+    told.dvl("/dvl", TWIST, "dvl_link", frd=True)
+    told.imu("/imu", "base_link", FLU_FROM_FRD, "ned")
+    odometry(told, np.eye(3), pose=True)
+    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), FLU_FROM_FRD @ np.array(LEVER_ARM)))
+    calibration = replay(told.write(tmp_path / "bag"))
+    parameters = calibration.replayed.result.parameters
+    assert parameters["base_axes"] == "frd" and parameters["gnss_frame"] == "flu"
+    assert is_right(calibration, truth_deg() * [1.0, -1.0, -1.0])
+
+
+@pytest.mark.spread(1)
 def test_two_readings_that_fit_as_well_are_both_said_and_the_answer_is_marginal(tmp_path):
     told = Told()
     told.dvl("/dvl", TWIST, "dvl_link", frd=True)

@@ -119,7 +119,7 @@ def test_a_px4_odometry_says_what_it_does_not_know_and_its_boot_time_is_no_stamp
 
 
 def test_a_frame_below_a_namespace_or_with_a_suffix_says_what_it_is():
-    names = {"world_ned": "ned", "map_enu": "enu", "base_link_frd": "frd", "ins_flu": "body", "auv/base_link": "body"}
+    names = {"world_ned": "ned", "map_enu": "enu", "base_link_frd": "frd", "ins_flu": "flu", "auv/base_link": "body"}
     assert {name: frame_named(name, ["base_link"]).name for name in names} == names
     assert frame_named("gps", ["base_link"]) is frame_named("frd", ["base_link"]) is None
 

@@ -136,10 +136,10 @@ class Parameters:
     )
     gnss_frame: str = _parameter(
         FROM_FRAME_ID,
-        "Frame of the reference velocity; body: base_axes, frd: forward-right-down body. from_frame_id: "
+        "Frame of the reference velocity; body: base_axes; flu, frd: body with other axes. from_frame_id: "
         "base_frame is body; enu, map, odom, world: ENU; ned, nwu; or by ending: _enu, _ned, _nwu, _flu, "
         "_frd.",
-        choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame), FRD, NWU),
+        choices=(FROM_FRAME_ID, *(frame.value for frame in VelocityFrame), FLU, FRD, NWU),
     )
     gnss_axes: str = _parameter(
         AUTO,

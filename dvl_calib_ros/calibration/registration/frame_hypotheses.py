@@ -62,9 +62,10 @@ MEANT_WITHIN = np.radians([8.0, 8.0, 4.0])
 
 
 # Body frames of a reference, and the matrix from each frame to body or ENU axes.
-IN_BODY = (VelocityFrame.BODY.value, "frd")
+IN_BODY = (VelocityFrame.BODY.value, "flu", "frd")
 READ_BY: Mapping[str, Array] = {
-    "body": np.eye(3), "frd": FLU_FROM_FRD, "enu": np.eye(3), "ned": ENU_FROM_NED, "nwu": ENU_FROM_NWU,
+    "body": np.eye(3), "flu": FLU_FROM_FRD, "frd": FLU_FROM_FRD,
+    "enu": np.eye(3), "ned": ENU_FROM_NED, "nwu": ENU_FROM_NWU,
 }  # fmt: skip
 
 

@@ -42,7 +42,7 @@ def test_a_dvl_is_turned_where_its_axes_are_not_those_of_the_body(kind, frame_id
     assert turns_dvl(kind, frame_id, Parameters(**given)) is turned
 
 
-def test_a_reference_forward_right_down_is_not_turned_for_a_body_that_is():
-    down = DECLARED_FRAMES["frd"]
-    assert down.in_base(Parameters()).axes is HALF_TURN
-    assert down.in_base(Parameters(base_axes="frd")).axes is AS_SENT
+def test_a_reference_in_named_body_axes_is_turned_for_a_body_with_other_axes():
+    for name, other in (("flu", "frd"), ("frd", "flu")):
+        assert DECLARED_FRAMES[name].in_base(other).axes is HALF_TURN
+        assert DECLARED_FRAMES[name].in_base(name) == DECLARED_FRAMES["body"]
