@@ -202,7 +202,7 @@ def _share(sums: Array) -> Array:
 
 
 # samples per update of the models; larger arrays do not fit the processor's caches
-BLOCK_SIZE = 2048
+BLOCK_SIZE = 1024
 
 
 @dataclass(frozen=True)
