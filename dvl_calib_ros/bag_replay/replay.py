@@ -17,7 +17,6 @@ from ..calibration.calibrator import Calibrator
 from ..calibration.checks.data_warnings import gate_warnings, message_warnings, recording_warnings, reference_warnings
 from ..calibration.checks.speed_of_sound import CauseOfScale, Water, cause_of_scale, water_document
 from ..calibration.comparison.mounting_change import Comparison, comparison_document
-from ..calibration.estimators.estimator import return_memory
 from ..calibration.filters.build_observations import Observer
 from ..calibration.filters.state_history import StateTrace
 from ..calibration.models import MODELS, Needs
@@ -34,6 +33,7 @@ from ..calibration.numerics.samples import (
     VelocityFrame,
     no_samples,
 )
+from ..calibration.numerics.tables import return_memory
 from ..calibration.results.extrinsics import Extrinsics, dvl_in_words, extrinsics_of, rejection
 from ..calibration.results.held_out_verification import verification_document
 from ..calibration.results.results import Day, Estimate, Result
@@ -202,7 +202,7 @@ def _share(sums: Array) -> Array:
 
 
 # samples per update of the models; larger arrays do not fit the processor's caches
-BLOCK_SIZE = 2048
+BLOCK_SIZE = 1024
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import combinations
 from pathlib import Path
@@ -24,7 +25,6 @@ from std_srvs.srv import Trigger
 
 from ..calibration.calibrator import Calibrator
 from ..calibration.checks.speed_of_sound import Water
-from ..calibration.estimators.estimator import WorkerThread
 from ..calibration.models import MODELS, Model
 from ..calibration.models.parameters import SCHEMA, ParameterError, Parameters
 from ..calibration.numerics import kalman
@@ -93,7 +93,7 @@ class CalibrationNode(AnsweringNode):
         if parameters.prior_source == "initial_window":
             self.warn(str(finding("PRIOR_HOLDS_ERROR")))
         kalman.prepare()
-        self._worker = WorkerThread()
+        self._worker = ThreadPoolExecutor(1, "g2")
         self._initial = initial
         self._begin(parameters, initial)
         # a saved calibration belongs to the mounting that it was saved with

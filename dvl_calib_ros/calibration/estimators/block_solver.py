@@ -19,6 +19,7 @@ from ..filters.cross_validation import folds_of
 from ..filters.filter_bank import ModelCounts
 from ..models.parameters import Parameters
 from ..numerics.kalman import GaussianState
+from ..numerics.tables import return_memory
 from ..registration.registration import Registration
 from ..results.thinned_recording import MEASURED_BELOW, ThinnedBlock, mean_around
 from ..streams.interpolation import LONGEST_DELAY_S, DvlColumns, ImuColumns, InBody, attitude_at, in_body
@@ -138,6 +139,7 @@ class BlockSolver:
         outcomes = [self._solve(block) for block in blocks]
         if self._is_live:
             self._clocks.look_again(self._so_far)
+            return_memory()
         looked = self._clocks.looked(fresh=False)
         suggestion = self.suggestion(fresh=False) if self._is_live else None
         return [outcome._replace(looked=looked, suggestion=suggestion) for outcome in outcomes]

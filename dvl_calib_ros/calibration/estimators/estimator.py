@@ -6,11 +6,10 @@ the aligner hold rows until it has copied them.
 
 from __future__ import annotations
 
-import ctypes
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -310,25 +309,6 @@ class AtOnce(Executor):
         done: Future[Any] = Future()
         done.set_result(fn(*args, **kwargs))
         return done
-
-
-class WorkerThread(ThreadPoolExecutor):
-    """Worker in one thread that returns unused memory to the system after each work."""
-
-    def __init__(self) -> None:
-        super().__init__(1, "blocks")
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run the work in the thread."""
-        done = super().submit(fn, *args, **kwargs)
-        super().submit(return_memory)
-        return done
-
-
-def return_memory() -> None:
-    """Return unused memory to the system; glibc would keep some megabytes."""
-    with suppress(OSError, AttributeError):  # another C library
-        ctypes.CDLL(None).malloc_trim(0)
 
 
 class Rest(NamedTuple):

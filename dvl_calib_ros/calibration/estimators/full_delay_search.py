@@ -46,12 +46,12 @@ def _beside(joined: JoinedBlocks, parameters: Parameters) -> _Beside:
     """Return the comparable references of blocks with the DVL at every delay."""
     reference = joined.reference
     rotation, oriented, rates, _, turning_known = joined.attitude_at(reference.times, parameters.imu_timeout)
-    seen = joined.dvl_at(reference.times + DELAYS_S[:, None])
-    known = seen.known.all(axis=0) & (oriented | reference.in_body)
+    velocity, seen = joined.dvl_at(reference.times + DELAYS_S[:, None])
+    known = seen.all(axis=0) & (oriented | reference.in_body)
     known &= turning_known & joined.measured[:, :2].all(axis=1)
     onto = np.where(reference.in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
     body = product(onto, np.where(joined.measured, reference.velocity, 0.0))
-    return _Beside(body[known], seen.value[:, known], rates[known])
+    return _Beside(body[known], velocity[:, known], rates[known])
 
 
 def _left_by_delay(each: Sequence[_Beside]) -> Array | None:

@@ -446,7 +446,7 @@ class JointFit:
                     gram = None if section.gram is None else section.gram * (folds != section.fold)[:, None, None]
                     chain = chain.after(gram, section.seconds, slow)
                 ended.append(None if day.chain is None else chain.ended())
-            own = [[each and each.part(fold) for each in ended] for fold in range(FOLDS)]
+            own = [[each and Eliminated(*(x[f : f + 1] for x in each)) for each in ended] for f in range(FOLDS)]
             found = [self._mixture(each, points, self._climbs(fold)) for fold, each in enumerate(own)]
             self._without = self._fitted, [self._by_day(each.state) for each in found]
         return self._without[1]

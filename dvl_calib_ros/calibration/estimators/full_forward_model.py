@@ -96,11 +96,6 @@ class FitBlock:
         return len(self.dvl.times) >= 4 and len(self.imu.times) >= 2 and len(self.reference.times) > 0
 
     @cached_property
-    def has_attitude(self) -> bool:
-        """Whether the IMU has an attitude."""
-        return not np.isnan(self.imu.orientation).any()
-
-    @cached_property
     def slope_reach_s(self) -> float:
         """Half-width (s) of the difference for the DVL's acceleration; over less, its noise dominates."""
         return max(SLOPE_REACH_S, SLOPE_INTERVALS * self.interval_s)
@@ -172,27 +167,6 @@ def spline_slopes(times: Array, values: Array) -> Array:
     return np.linalg.solve(matrix, right)
 
 
-class AtTimes(NamedTuple):
-    """Interpolated values (..., J, k), and whether they are known (..., J)."""
-
-    value: Array
-    known: Mask
-
-
-class Attitude(NamedTuple):
-    """Attitude and angular velocity at J times.
-
-    rotation: (J, 3, 3) ``rotation_enu_from_body``, known where oriented (J,). rates: (J, 3) rad/s, and turning: (J, 3)
-    rad/s², known (J,).
-    """
-
-    rotation: Array
-    oriented: Mask
-    rates: Array
-    turning: Array
-    known: Mask
-
-
 class JoinedBlocks:
     """Streams of B blocks, interpolated at times of their J references.
 
@@ -213,16 +187,16 @@ class JoinedBlocks:
         """Return values (J,) of the block of each reference."""
         return np.repeat(of_blocks, self._counts)
 
-    def dvl_at(self, times: Array) -> AtTimes:
-        """Interpolate the DVL's velocity (..., J, 3) m/s at times (..., J) s."""
+    def dvl_at(self, times: Array) -> tuple[Array, Mask]:
+        """Interpolate the DVL's velocity (..., J, 3) m/s at times (..., J) s; return whether it is known (..., J)."""
         gap_s = self.by_row([max(GAP_INTERVALS * block.interval_s, GAP_S) for block in self.blocks])
         spline = _Spline(self, [block.dvl.times for block in self.blocks], times, gap_s)
-        return AtTimes(spline.of([(block.dvl.velocity, block.slope) for block in self.blocks]), spline.known)
+        return spline.of([(block.dvl.velocity, block.slope) for block in self.blocks]), spline.known
 
-    def attitude_at(self, times: Array, gap_s: float) -> Attitude:
-        """Interpolate attitude, angular velocity and acceleration at times (J,) s.
+    def attitude_at(self, times: Array, gap_s: float) -> tuple[Array, Mask, Array, Array, Mask]:
+        """Interpolate ``rotation_enu_from_body`` (J, 3, 3), known (J,), rates and accelerations (J, 3), known (J,).
 
-        A spline, because at 1 Hz linear interpolation of attitude is wrong by a degree at the start of a turn.
+        times: (J,) s. A straight line between attitudes at 1 Hz is wrong by a degree at the start of a turn.
         """
         around = times + np.array([[0.0], [-TURNING_S], [TURNING_S]])
         spline = _Spline(self, [block.imu.times for block in self.blocks], around, gap_s)
@@ -232,10 +206,10 @@ class JoinedBlocks:
         q = spline.of([(block.imu.orientation, block.imu_slope[:, :4]) for block in self.blocks], 0)
         rotation = rotation_from_quaternion(q / np.sqrt(squared(q))[:, None])
         # references in body axes need no attitude
-        has = self.by_row([block.has_attitude for block in self.blocks])
+        has = self.by_row([not np.isnan(block.imu.orientation).any() for block in self.blocks])
         rotation[~has] = np.eye(3)
         known = spline.known[0]
-        return Attitude(rotation, known & has, rates, (after - before) / (2.0 * TURNING_S), known)
+        return rotation, known & has, rates, (after - before) / (2.0 * TURNING_S), known
 
 
 class _Spline:
@@ -320,9 +294,8 @@ def _predicted(joined: JoinedBlocks, x: Array, parameters: Parameters) -> list[P
     own[:, :, LEVER_ARM] = -skew(rates)
     own[:, :, BIAS] = -through
     own[:, :, DELAY] = accelerating
-    own[:, :, REFERENCE_DELAY] = cross(turning, arm) - accelerating
     turn = np.where(in_body[:, None], 0.0, 1.0)
-    own[:, :, REFERENCE_DELAY] -= turn * cross(rates, body)
+    own[:, :, REFERENCE_DELAY] = cross(turning, arm) - accelerating - turn * cross(rates, body)
     upwards = rotation[:, 2] * oriented[used, None]
     up = np.column_stack([np.einsum("ni,nik->nk", upwards, own), (upwards * body).sum(axis=1)])
     cycles = heading_cycles(rotation)

@@ -158,10 +158,6 @@ class Eliminated(NamedTuple):
     gram: Array
     log_determinant: Array
 
-    def part(self, point: int) -> Eliminated:
-        """Return those of one point."""
-        return Eliminated(self.gram[point : point + 1], self.log_determinant[point : point + 1])
-
 
 class Chain(NamedTuple):
     """Chain of sections up to a knot: Gram matrix (C, 27, 27) over [slow errors there, states, residual]."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -98,3 +100,9 @@ class RowTable:
         """Discard all rows; numbers continue."""
         self.base += self.size
         self.begin = self.size = 0
+
+
+def return_memory() -> None:
+    """Return unused memory to the system; glibc would keep some megabytes."""
+    with suppress(OSError, AttributeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)

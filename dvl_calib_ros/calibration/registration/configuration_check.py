@@ -226,20 +226,18 @@ def wrong_axes(
     """
     ahead = int(np.argmax((motion.dvl.velocity**2).sum(axis=0)))
     others = [axis for axis in range(3) if axis != ahead]
-    found: tuple[Array, Fitted] | None = None
-    given_up = FAR_ABOVE * FAR_WORSE * most
+    found: list[tuple[float, Array, Fitted]] = []
     for pattern in patterns:
-        each = pattern[np.argsort([ahead, *others])]
-        quick = MotionFit(_signed(motion, each), lever_arm, curves.signed(each), FEW_ROWS)
-        one = nearest(quick, nominal, (REFERENCE,), given_up)
+        signs = pattern[np.argsort([ahead, *others])]
+        quick = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), FEW_ROWS)
+        given_up = min([FAR_ABOVE * FAR_WORSE * most, *(level for level, *_ in found)])
+        near = nearest(quick, nominal, (REFERENCE,), given_up)
         # a fit that rotates the axes back is the configured pattern
-        is_turned_back = one is None or _shown_turn(one.rotation_body_from_dvl, nominal, one.std[TURN]) >= MISALIGNED
-        if one is not None and not is_turned_back and (found is None or one.level < found[1].level):
-            found = each, one
-            given_up = min(given_up, one.level)
-    if found is None:
+        if near is not None and _shown_turn(near.rotation_body_from_dvl, nominal, near.std[TURN]) < MISALIGNED:
+            found.append((near.level, signs, near))
+    if not found:
         return None
-    signs, near = found
+    _, signs, near = min(found, key=lambda each: each[0])
     fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), MOST_ROWS)
     fitted = fit(0.0, near.dvl_late, nominal, (REFERENCE,))
     if fitted is None or fitted.level > most:

@@ -224,7 +224,7 @@ def _registered(
                 x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
                 x[APART], x[LATE] = found.dvl.late - found.reference.late, found.reference.late
                 return replace(found, unsteady=moves.timed(motion, fit, x, found.rotation_body_from_dvl, found.spread))
-    in_time = _in_time(quick, best, rotation_body_from_dvl)
+    in_time = _held(quick, best, rotation_body_from_dvl)
     if in_time[1] < NO_DOUBT:  # the full fit would add no evidence
         seen = _explained(quick, best, in_time, rotation_body_from_dvl, lever_arm)
         if not seen.left_open.any():
@@ -233,14 +233,13 @@ def _registered(
         free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
         if free is None or not _is_possible(free):
             return seen
-        if _in_time(fit, free, rotation_body_from_dvl)[1] < NO_DOUBT:
+        if _held(fit, free, rotation_body_from_dvl)[1] < NO_DOUBT:
             return replace(seen, **_open(fit, free, 0.0, rotation_body_from_dvl))
         best = free
     best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
     if best is None or not _is_possible(best):
         return None
-    in_time = _in_time(fit, best, rotation_body_from_dvl)
-    return _explained(fit, best, in_time, rotation_body_from_dvl, lever_arm)
+    return _explained(fit, best, _held(fit, best, rotation_body_from_dvl), rotation_body_from_dvl, lever_arm)
 
 
 def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> Fitted | None:
@@ -275,7 +274,7 @@ def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation:
 def _explained(
     fit: MotionFit, free: Fitted, in_time: tuple[Fitted | None, float], rotation: Array | None, lever_arm: Array
 ) -> Registration:
-    """Explain a fit by the fewest delayed clocks: none (`_in_time`), one of the three, or both DVL and reference."""
+    """Explain a fit by the fewest delayed clocks: none (in_time, see `_held`), one of three, or DVL and reference."""
     apart = float(free.x[APART])
     early, too_early = (EARLY, 0.0) if apart < 0.0 else (0.0, EARLY)
     tried = {_Off.NONE: in_time}
@@ -342,21 +341,16 @@ class _Off(Enum):
     NONE, DVL, REFERENCE, IMU, BOTH = range(5)
 
 
-def _in_time(fit: MotionFit, free: Fitted, rotation: Array | None) -> tuple[Fitted | None, float]:
-    """Return `_held` with all clocks synchronised."""
-    return _held(fit, free, rotation, 0.0, 0.0, (DVL, REFERENCE))
-
-
 def _held(
     fit: MotionFit,
     free: Fitted,
     rotation: Array | None,
-    reference: float,
-    apart: float,
-    in_time: tuple[Array, ...],
+    reference: float = 0.0,
+    apart: float = 0.0,
+    in_time: tuple[Array, ...] = (DVL, REFERENCE),
     costs: float = 0.0,
 ) -> tuple[Fitted | None, float]:
-    """Fit with some clocks synchronised. Return the fit and its chi-square growth plus `costs`.
+    """Fit with some or all clocks synchronised. Return the fit and its chi-square growth plus `costs`.
 
     in_time: rows that select the synchronised clocks. Without a possible fit: None and infinity.
     """
