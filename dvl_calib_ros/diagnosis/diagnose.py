@@ -111,7 +111,7 @@ def diagnose_recordings(
     selection, rest = without_replaceable(selection)
     residuals = held_out(selection, rest)
     gap = measure_gap(selection, residuals)
-    if selection.selected and gap.fails_elsewhere:
+    if selection.selected and not gap.after < gap.before:
         selection = selection.without(selection.fit.values)
         rest = unexplained(selection.fitter, selection.fit)
         residuals = held_out(selection, rest)

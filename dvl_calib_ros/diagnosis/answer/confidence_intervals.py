@@ -1,6 +1,6 @@
-"""Confidence intervals of effects: noise, uncertain start times, and interpolation between samples.
+"""Confidence intervals of effects: noise and uncertain start times.
 
-A fit's own covariance takes its start times and its interpolation as exact.
+A fit's own covariance takes its start times as exact.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ import numpy as np
 
 from ...calibration.numerics.frames import Array
 from ...effects.base import MountingEffect
-from ..fit.gauss_newton import Fit, Fitter
-from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
+from ..fit.gauss_newton import Fit
 from ..fit.selection_criteria import NuisanceFit, robust_covariance
 from ..model.forward_model import Problem
 from ..model.hypothesis import is_time_of_run
@@ -20,12 +19,6 @@ from ..search.effect_selection import EffectSelection
 Triple = tuple[float, float, float]
 Times = dict[tuple[str, int, str], Triple]
 
-# Thresholds of significance: of the mean error, in σ; of the relative scatter, exceeded by chance in one of thirty sets
-# of simulated recordings
-OFF_BY, SCATTER = 1.0, 1.35
-# True motion between samples lies between fitted and simulated interpolation: half of their difference counts
-HALF_WAY = 0.5
-
 
 def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     """Return the covariance (6 + p, 6 + p) of a selection, and effects' times with 95 per cent intervals. Times are by
@@ -34,7 +27,7 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
     covariance, _ = robust_covariance(fitter.problem, fit)
     if not selection.selected:
         return covariance, {}
-    covariance = with_unshown_turns(fitter.problem, fit, _with_samples(fitter, fit, covariance))
+    covariance = with_unshown_turns(fitter.problem, fit, covariance)
     times: Times = {}
     for effect in fit.effects:
         for spec in filter(is_time_of_run, effect.parameters):
@@ -44,21 +37,6 @@ def covariance_of(selection: EffectSelection) -> tuple[Array, Times]:
                 times[effect.name, recording, spec.name] = found
                 covariance = covariance + fitter.moved_by_time(fit, effect, spec.name, recording, found[1:])
     return covariance, times
-
-
-def _with_samples(fitter: Fitter, fit: Fit, covariance: Array) -> Array:
-    """Add bias and excess scatter of fits to simulated recordings to a covariance (n, n)."""
-    steps = np.array(
-        [
-            fitter.step_of(other, seen, left, fit)
-            for other, seen, left in simulated_recordings(fitter.problem, fit, SIMULATED)
-        ]
-    )
-    std = np.sqrt(np.diag(covariance))
-    off, scatter = steps.mean(axis=0), steps.std(axis=0, ddof=1) / std
-    off = np.where(np.abs(off) > OFF_BY * std, HALF_WAY * off, 0.0)
-    grown = np.where(scatter > SCATTER, scatter, 1.0)
-    return np.asarray(covariance * np.outer(grown, grown) + np.outer(off, off))
 
 
 def with_unshown_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:

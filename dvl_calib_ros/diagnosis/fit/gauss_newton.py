@@ -266,13 +266,6 @@ class Fitter:
         found = replace(system, gram=gram)
         return found if found.is_definite else system
 
-    def step_of(self, other: Problem, seen: Sequence[Seen], residual: Array, fit: Fit) -> Array:
-        """Return the step (6 + p,) of a fit's hypothesis in another problem, from its evaluation and residual."""
-        fitter = replace(self, problem=other, outliers=0.0, _fits={})
-        columns = fitter.columns(fit.hypothesis, seen)
-        system = fitter._system(fit.noise, columns, residual, fit.hypothesis)
-        return fitter._without_own_noise(system, fit.hypothesis, fit.noise, columns, residual).solution()
-
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
         """Return the whitened contribution (S n,) of simulated velocity noise to a hypothesis' residual (M, A)."""
         white = [

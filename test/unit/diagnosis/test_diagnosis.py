@@ -17,14 +17,12 @@ from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.samples import VelocityFrame
 from dvl_calib_ros.calibration.numerics.tests import holm
 from dvl_calib_ros.cli import common
-from dvl_calib_ros.diagnosis.answer import confidence_intervals
 from dvl_calib_ros.diagnosis.answer.compensation import compensated, verified_corrections
 from dvl_calib_ros.diagnosis.answer.gap_closure import Gap, HeldOutResiduals
 from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict, FoundEffect, diagnosis_document
 from dvl_calib_ros.diagnosis.diagnose import _reasons, _verdict, diagnose_recordings
 from dvl_calib_ros.diagnosis.fit import gauss_newton
 from dvl_calib_ros.diagnosis.fit.gauss_newton import Fit, Fitter, _with_time
-from dvl_calib_ros.diagnosis.fit.parametric_bootstrap import SIMULATED
 from dvl_calib_ros.diagnosis.fit.selection_criteria import finer_steps
 from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import Hypothesis, no_effect
@@ -535,21 +533,6 @@ def test_what_is_not_known_of_the_time_of_a_leap_is_in_the_intervals_of_all_size
     moved = fitter.fit(_with_time(fit, leap, "at_s", 0, 170.0), fit.noise, 3).hypothesis.vector()[6:]
     added = fitter.moved_by_time(fit, leap, "at_s", 0, (170.0, 200.0))[6:, 6:]
     assert np.diag(added) == pytest.approx(((moved - fit.hypothesis.vector()[6:]) / 1.96) ** 2 / 2.0)
-
-
-def test_what_fits_to_made_up_recordings_are_off_by_is_in_the_intervals_where_it_is_no_chance(monkeypatch):
-    """At 1 Hz a flexure of the mount was 4 standard deviations off, which recordings made up from the fit showed."""
-    monkeypatch.setattr(
-        confidence_intervals,
-        "simulated_recordings",
-        lambda problem, fit, count: ((None, [], None) for _ in range(count)),
-    )
-    scatter = np.tile([1.0, -1.0], SIMULATED // 2)
-    steps = np.column_stack([0.3 + 0.5 * scatter, 4.0 + 0.5 * scatter, 3.0 * scatter])
-    fitter = Mock(spec=Fitter, problem=None, step_of=Mock(side_effect=list(steps)))
-    grown = confidence_intervals._with_samples(fitter, Mock(spec=Fit), np.eye(3))
-    expected = [1.0, 1.0 + (4.0 / 2.0) ** 2, steps[:, 2].var(ddof=1)]
-    assert np.diag(grown) == pytest.approx(expected)
 
 
 def test_two_recordings_are_not_asked_for_a_second_leap_at_one_time_of_both():
