@@ -17,7 +17,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 ROUND_S = 60  # a process of libFuzzer at most: what it keeps of coverage grows without bound
 LIMITS = (
-    "-timeout=60",  # instrumented, niced and beside other work, a diagnosis takes ten times its own time
+    "-timeout=60",
+    "-report_slow_units=60",  # instrumented, niced and beside other work, a diagnosis takes ten times its own time
     "-rss_limit_mb=1500",
     "-malloc_limit_mb=1000",
     "-print_final_stats=1",
