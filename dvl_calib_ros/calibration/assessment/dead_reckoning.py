@@ -22,12 +22,12 @@ from ..checks.heading_deviation import HeadingDeviation, heading_deviation, head
 from ..checks.lever_arm_check import lever_arm_warnings
 from ..checks.residual_tests import (
     ResidualTrend,
+    confused_with_bias_std,
     is_insignificant,
     moving_bed,
     reference_lag_s,
     residual_trend,
     residual_warnings,
-    std_along,
 )
 from ..filters.observability import KM
 from ..models.parameters import Parameters
@@ -398,7 +398,7 @@ def doubts(
         are_positions(parameters),
         reference_lag_s(estimate, parameters),
         is_insignificant(estimate),
-        std_along(estimate, parameters),
+        confused_with_bias_std(estimate, parameters),
         None if is_large else navigation.beam,
         ACCEPTED_DRIFT * parameters.target_drift / KM,
     )

@@ -20,7 +20,7 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..numerics.samples import Mask
-from ..numerics.tests import BY_CHANCE, FOUND
+from ..numerics.tests import Z_FIFTY_TESTS, Z_ONE_TEST
 
 # Longest sample intervals, s: of both streams, because slower differences hold waves; and of a reference next to a fast
 # DVL.
@@ -106,12 +106,12 @@ class SharedNoise:
         std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0) / (n - 1.0))
         best = int(np.argmax(np.where(self._stretches >= ENOUGH, mean[:, 0], -math.inf)))
         c_4, v_4, steps = mean[best].tolist()
-        if steps < BY_CHANCE * float(std[best, 2]):
+        if steps < Z_ONE_TEST * float(std[best, 2]):
             steps = 0.0
         passed, own = c_4 - steps, v_4 - steps
         if own < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
             return 0.0
-        return passed / own if passed > max(SHARED_FROM * own, FOUND * float(std[best, 0])) else 0.0
+        return passed / own if passed > max(SHARED_FROM * own, Z_FIFTY_TESTS * float(std[best, 0])) else 0.0
 
     def contradiction(self) -> Reason | None:
         """Return the reason if the reference contains the DVL's noise."""

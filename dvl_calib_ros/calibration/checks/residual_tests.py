@@ -27,7 +27,7 @@ from ..numerics.block_covariance import alike_of, of_few
 from ..numerics.frames import Array, cross, skew
 from ..numerics.robust import median, robust_std
 from ..numerics.samples import Index
-from ..numerics.tests import BY_CHANCE, COVERED, FOUND, SURE, SURE_AT_SEA
+from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
 from ..results.results import ARM, OFFSETS, Estimate
 from .beam_faults import BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
@@ -43,28 +43,27 @@ QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
 # about the earth's vertical (rad), which differs from yaw when the vehicle tilts. BY_HEADING: heading errors with one
 # and two cycles of the heading, and with a drift over the recording (rad), similar to a bias but not to fast signals.
-KNOWN: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
+NUISANCE_STD: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2 + [0.1])
-# Prior σ of the tested signals: shares of tilt, and second derivative (s²); DVL bias (m/s), tested on means over MEAN_S
-# (s).
-QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
+# Prior σ of the tested signals: shares of tilt, second derivative (s²); DVL bias (m/s), tested on means over MEAN_S.
+SIGNAL_STD, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 # Smallest tilt (rad, rms) and second derivative (m/s²) for a test, and share of tilt that the residual must follow.
-LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
+LEAST_TILT, MISSING_TILT_SHARE, LEAST_BEND = math.radians(0.08), 0.6, 0.006
 # Prior σ of the bed's velocity, m/s: sediment in a flood, or a water layer. Below MOVES_FROM_MPS the reference may be
 # the cause: an inertial navigation at sea (recording T09) had an error of 0.054.
 BED_STD_MPS, MOVES_FROM_MPS = 1.0, 0.08
-# Columns of the reference error, east and north, in `KNOWN`.
+# Columns of the reference error, east and north, in `NUISANCE_STD`.
 OVER_GROUND = slice(10, 12)
 # Share of the second derivative that means over `MEAN_S` must keep for the smoothing test.
 LEAST_OF_BEND = 0.3
 # σ of the missing share of tilt above which it may be the whole tilt.
-TILT_SHOWN = 0.2
-# Bias of the DVL that occurs (m/s), and its σ (forward or port) from which the motion does not show it.
-SEEN_BIAS, BIAS_OPEN = 0.02, 0.008
+TILT_UNOBSERVABLE_STD = 0.2
+# Bias of a usual DVL (m/s), and its σ (forward or port) from which the motion does not make it observable.
+TYPICAL_BIAS_MPS, BIAS_UNOBSERVABLE_STD_MPS = 0.02, 0.008
 # Share of tilt from which a sign is wrong, instead of a levelled velocity.
-WRONG_SIGN_FROM = 1.6
+WRONG_SIGN_TILT_SHARE = 1.6
 # Mounting error (rad) from which it is reported.
-SAID_FROM = math.radians(0.2)
+REPORTED_FROM_RAD = math.radians(0.2)
 # Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 # Residual, relative to the median, beyond which it is an outlier; number of iterations.
@@ -78,12 +77,11 @@ FORETOLD_BY, NEW_AT_MOST = 12, 4.0
 # σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
 OF_WAVES = 0.015
 # Delay of a reference that a filter explains: within this factor of the filter's time constant, and at least this, s.
-LAGS_WITHIN, LEAST_LAG_S = 2.0, 0.2
-# Corrections (rad, scale, m) below these, or below `BY_CHANCE` σ, count as none.
+LAG_FACTOR, LEAST_LAG_S = 2.0, 0.2
+# Corrections (rad, scale, m) below these, or below `Z_ONE_TEST` σ, count as none.
 NO_ANGLE, NO_SCALE, NO_ARM_M = math.radians(0.35), 0.005, 0.2
-# Smallest share of DVL noise for references from positions, whose windows hold motion on both sides, which looks
-# similar.
-FOLLOWED_BY_POSITIONS = 0.1
+# Smallest share of DVL noise in a reference from positions: the motion on both sides in its window looks similar.
+POSITIONS_NOISE_SHARE = 0.1
 
 
 class ResidualTrend(NamedTuple):
@@ -179,15 +177,15 @@ def residual_trend(
     bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
     # linear interpolation loses this part of the second derivative on average
     bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
-    both = np.concatenate([_known(moving, rates, slope, body_from_enu), quick], axis=2)
-    fast = _fitted(time, both, bent, np.concatenate([KNOWN, QUICK]))
+    both = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), quick], axis=2)
+    fast = _fitted(time, both, bent, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
-    beside = _known(_beside(time, moving, starts), rates, slope, body_from_enu)
+    beside = _nuisance_columns(_beside(time, moving, starts), rates, slope, body_from_enu)
     by_heading = beside[:, :, -1, None] * around[:, None]
     columns = np.concatenate([_means(each, starts) for each in (beside, by_heading, constant)], axis=2)
-    likely = np.concatenate([KNOWN, BY_HEADING, CONSTANT])
+    likely = np.concatenate([NUISANCE_STD, BY_HEADING, CONSTANT])
     means = _means(time, starts), columns, _means(error, starts)
     slow = _fitted(*means, likely, LASTING)
     likely[OVER_GROUND] = BED_STD_MPS
@@ -217,9 +215,9 @@ def residual_trend(
     )  # fmt: skip
 
 
-def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
+def _nuisance_columns(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
     """Return nuisance columns (N, 3, 14) from velocity, turn rate and acceleration (N, 3), body axes."""
-    known = np.zeros((len(moving), 3, len(KNOWN)))
+    known = np.zeros((len(moving), 3, len(NUISANCE_STD)))
     known[:, :, :3] = skew(moving)
     known[:, [0, 1, 2], [3, 4, 5]] = moving
     known[:, :, 6:9] = skew(rates)
@@ -255,19 +253,19 @@ def is_insignificant(estimate: Estimate) -> bool:
     terms = MODELS[estimate.model].error_terms_from_state
     found = np.abs(terms @ estimate.state)
     std = np.sqrt(np.diag(terms @ estimate.recording_covariance @ terms.T))
-    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, BY_CHANCE * std)).any() or np.sort(std[:3])[1] > NO_ANGLE:
+    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, Z_ONE_TEST * std)).any() or np.sort(std[:3])[1] > NO_ANGLE:
         return False
     arm, own = estimate.std_of(*ARM), dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
-    return arm is None or not (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, BY_CHANCE * arm)).any()
+    return arm is None or not (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, Z_ONE_TEST * arm)).any()
 
 
-def std_along(estimate: Estimate, parameters: Parameters) -> Array:
-    """Return σ (3,) of the errors that a bias along body x, y and z imitates: scale, yaw (rad), pitch (rad)."""
+def confused_with_bias_std(estimate: Estimate, parameters: Parameters) -> Array:
+    """Return σ (3,) of scale, yaw and pitch (rad), which a bias along body x, y and z resembles at constant speed."""
     terms, dvl_from_body = MODELS[estimate.model].error_terms_from_state, parameters.rotation_dvl_from_body
     p = terms @ estimate.recording_covariance @ terms.T
-    ahead = dvl_from_body[:, 0] ** 2
-    turned = np.diag(dvl_from_body.T @ p[:3, :3] @ dvl_from_body)
-    return np.sqrt([float(ahead @ p[3:, 3:] @ ahead), turned[2], turned[1]])
+    weights = dvl_from_body[:, 0] ** 2
+    angles = np.diag(dvl_from_body.T @ p[:3, :3] @ dvl_from_body)
+    return np.sqrt([float(weights @ p[3:, 3:] @ weights), angles[2], angles[1]])
 
 
 def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None:
@@ -278,7 +276,7 @@ def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None
     if found is None:
         return None
     size = float(np.linalg.norm(found.over_ground))
-    if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < SURE_AT_SEA * found.over_ground_std).all():
+    if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < Z_SLOW_ERRORS * found.over_ground_std).all():
         return None
     own = [estimate.state_of(name) for name in OFFSETS]
     is_held = float(np.linalg.norm(found.over_ground - own)) < 0.5 * size
@@ -291,68 +289,70 @@ def residual_warnings(
     found: ResidualTrend | None,
     of_positions: bool = False,
     lag_s: float = 0.0,
-    is_nil: bool = False,
-    along: Sequence[float] | Array = (0.0, 0.0, 0.0),
+    finds_nothing: bool = False,
+    mounting_std: Sequence[float] | Array = (0.0, 0.0, 0.0),
     beam: BeamFault | None = None,
     accepted: float = 0.01,
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
-    of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, is_nil, along:
-    see `reference_lag_s`, `is_insignificant` and `std_along`. accepted: error of the mounting (rad, or share of the
-    distance) up to which a calibration is accepted; one that its own σ cover does not reject it either.
+    of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, finds_nothing,
+    mounting_std: see `reference_lag_s`, `is_insignificant`, `confused_with_bias_std`. accepted: error of the mounting
+    (rad, or share of the distance) that does not reject a calibration; nor does an error within its own 95 % interval.
     """
     if found is None:
         return []
-    least = FOLLOWED_BY_POSITIONS if of_positions else 0.0
+    smallest_share = POSITIONS_NOISE_SHARE if of_positions else 0.0
     seconds = math.sqrt(2.0 * abs(found.smoothed))
-    lags_so = lag_s > max(LEAST_LAG_S, seconds / LAGS_WITHIN) and lag_s < LAGS_WITHIN * seconds
-    # a filter both smooths and passes noise on: each may be less sure
-    is_filter = not of_positions and found.smoothed > COVERED * found.smoothed_std
-    if found.circular > max((BY_CHANCE if is_filter else SURE) * found.circular_std, least):
+    lag_fits_filter = lag_s > max(LEAST_LAG_S, seconds / LAG_FACTOR) and lag_s < LAG_FACTOR * seconds
+    # a filter smooths and passes noise on: with evidence for one, the other needs less
+    is_filter = not of_positions and found.smoothed > Z_95_PERCENT * found.smoothed_std
+    if found.circular > max((Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * found.circular_std, smallest_share):
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
-    if is_filter and lags_so and is_nil:
+    if is_filter and lag_fits_filter and finds_nothing:
         return [finding("FILTER_FINDS_NOTHING", late=lag_s).weighed(Severity.REJECT)]
-    is_ours = of_positions and found.smoothed > 0.0
-    is_smoothed = abs(found.smoothed) > SURE * found.smoothed_std
-    if is_smoothed and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
-        word = Severity.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Severity.MARGINAL
+    by_position_window = of_positions and found.smoothed > 0.0
+    is_smoothed = abs(found.smoothed) > Z_REPEATED_TEST * found.smoothed_std
+    if is_smoothed and seconds > (TOO_SMOOTH_S if by_position_window else SMOOTHED_FROM_S):
+        severity = Severity.REJECT if seconds > TOO_SMOOTH_S and not by_position_window else Severity.MARGINAL
         # smoothing causes any other signal
-        return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(word)]
-    said = []
+        return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(severity)]
+    reasons = []
     for axis, name in enumerate(("roll", "pitch")):
         share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
-        if abs(share) > max(SURE_AT_SEA * std, NOT_FOLLOWED):
+        if abs(share) > max(Z_SLOW_ERRORS * std, MISSING_TILT_SHARE):
             off = abs(share * float(found.lean[axis]))
-            word = Severity.REJECT if off > accepted or abs(share) > WRONG_SIGN_FROM else Severity.MARGINAL
+            severity = Severity.REJECT if off > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
             found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))
-            said.append(found_tilt.weighed(word))
-        elif std > TILT_SHOWN and abs(float(found.lean[axis])) > accepted:
-            said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
+            reasons.append(found_tilt.weighed(severity))
+        elif std > TILT_UNOBSERVABLE_STD and abs(float(found.lean[axis])) > accepted:
+            reasons.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
     # the heading at either end, relative to its mean
     off = 0.5 * abs(found.turned)
-    if off > SAID_FROM and off > BY_CHANCE * found.turned_std:
-        word = Severity.MARGINAL if off > max(accepted, COVERED * along[1]) else Severity.WARNING
+    if off > REPORTED_FROM_RAD and off > Z_ONE_TEST * found.turned_std:
+        severity = Severity.MARGINAL if off > max(accepted, Z_95_PERCENT * mounting_std[1]) else Severity.WARNING
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
-        said.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(word))
-    if all(each.severity is Severity.WARNING for each in said):  # a wrong tilt or heading looks like a beam
-        said += beam_warning(beam, accepted)
-    size = np.abs(found.bias)
-    shown = (size > FOUND * found.bias_std) & (size > SAID_FROM * found.speed)
+        reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(severity))
+    if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
+        reasons += beam_warning(beam, accepted)
+    magnitude = np.abs(found.bias)
+    shown = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
     if shown.any():
         axes = ", ".join(
             f"{axis} {1000.0 * found.bias[i]:+.0f} ± {1000.0 * found.bias_std[i]:.0f}"
             for i, axis in enumerate("xyz")
             if shown[i]
         )
-        turned = float(size[shown].max()) / found.speed
-        is_wrong = size - found.bias_std > np.maximum(accepted, COVERED * np.asarray(along)) * found.speed
-        word = Severity.REJECT if (shown & is_wrong).any() else Severity.MARGINAL
-        said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))
-    elif float(found.bias_std[:2].max()) > BIAS_OPEN:
-        share = SEEN_BIAS / found.speed
-        said.append(finding("ONE_SPEED", off=SEEN_BIAS, degrees=math.degrees(share), percent=100.0 * share))
-    return said
+        turned = float(magnitude[shown].max()) / found.speed
+        is_wrong = (
+            magnitude - found.bias_std > np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * found.speed
+        )
+        severity = Severity.REJECT if (shown & is_wrong).any() else Severity.MARGINAL
+        reasons.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(severity))
+    elif float(found.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
+        share = TYPICAL_BIAS_MPS / found.speed
+        reasons.append(finding("ONE_SPEED", off=TYPICAL_BIAS_MPS, degrees=math.degrees(share), percent=100.0 * share))
+    return reasons
 
 
 def _smoothed_one(found: ResidualTrend) -> str:
@@ -384,7 +384,7 @@ def _fitted(
     each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
     told = np.sum(each_axis, axis=0)
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
-    beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
+    beside = p[:, : len(NUISANCE_STD)] * (prior * likely)[: len(NUISANCE_STD)]
     std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T, together)
     return _Fit(x, np.sqrt(std**2 + (beside**2).sum(axis=1)), p, weight, starts)
 

@@ -23,7 +23,7 @@ from ...verdict.answering import Answering
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array, near_angles
-from ..numerics.tests import CHANCE, COVERED, FOUND, chance_of, chi2_sf, holm, smallest_found
+from ..numerics.tests import CHANCE, Z_95_PERCENT, Z_FIFTY_TESTS, chance_of, chi2_sf, holm, smallest_found
 from ..results.extrinsics import (
     ANGLES,
     COMPONENTS,
@@ -42,7 +42,7 @@ from ..results.mounting_quantities import date
 
 # False-alarm rates of one comparison, for any numbers of quantities and instants: of a mounting that has moved, and of
 # one that is suspicious. `CHANCE` is that of scale and delay.
-MOVED, SUSPICIOUS = chance_of(FOUND), chance_of(COVERED)
+MOVED, SUSPICIOUS = chance_of(Z_FIFTY_TESTS), chance_of(Z_95_PERCENT)
 # Standard deviation of a lever arm between recordings without a movement, m: the phase centre of a GNSS antenna wanders
 # by one to two centimetres with the satellites in view (IGS antenna calibrations)
 ARM_WANDERS_M = 0.015
@@ -150,7 +150,7 @@ class Comparison(Answering):
     pairs
         All pairs.
     moved, suspicious
-        Changes of angles or lever arm beyond `FOUND` σ, and beyond `COVERED` σ.
+        Changes of angles or lever arm beyond `Z_FIFTY_TESTS` σ, and beyond `Z_95_PERCENT` σ.
     suspected
         Rejected calibrations that differ from the accepted one next to them.
     scale_changed, clock_changed

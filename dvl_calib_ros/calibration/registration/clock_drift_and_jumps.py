@@ -16,7 +16,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.samples import Index, Mask
-from ..numerics.tests import RULED_OUT, SURE_AT_SEA
+from ..numerics.tests import RULED_OUT, Z_SLOW_ERRORS
 from ..streams.interpolation import DvlColumns, ImuColumns, TurnRates
 from .gauss_newton import APART, ARM, LATE, Fitted, MotionFit, N
 from .motion_streams import MotionStreams
@@ -186,7 +186,7 @@ def unsteady(
     # noise as long as a stretch adds scatter, so all evidence is scaled down
     scatter = max(1.0, left / (seen.size - len(states) - 1.0))
     std *= math.sqrt(scatter)
-    is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > SURE_AT_SEA * std
+    is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > Z_SLOW_ERRORS * std
     if not is_shown or left > min(but_one) + ANYTHING * scatter or scatter > LEFT:
         return None
     others = min((each[0] for each in found if each[3] != name), default=np.inf)

@@ -16,7 +16,7 @@ from ...verdict.reasons import Reason, finding
 from ..models.parameters import FLU, FRD
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
-from ..numerics.tests import BY_CHANCE, SURE
+from ..numerics.tests import Z_ONE_TEST, Z_REPEATED_TEST
 from ..streams.interpolation import attitude_at
 from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion_streams import GAP_S, Curves, MotionStreams
@@ -193,7 +193,7 @@ def misfit(one: Fitted, nominal: Array, left: float | None = None) -> float:
 def _shown_turn(rotation: Array, nominal: Array, std: Array) -> float:
     """Return the significant angle (rad) between two mountings (3, 3). std: (3,) rad per body axis."""
     about = np.abs(turn_between(nominal, rotation))
-    return float(np.linalg.norm(np.maximum(about - BY_CHANCE * std, 0.0)))
+    return float(np.linalg.norm(np.maximum(about - Z_ONE_TEST * std, 0.0)))
 
 
 def _left(left: float, scale: float, turned: float) -> float:
@@ -243,7 +243,7 @@ def wrong_axes(
     if fitted is None or fitted.level > most:
         return None
     factors, std = fit.axis_factors(fitted, nominal)
-    is_shown, is_turned = factors > SURE * std, signs < 0.0
+    is_shown, is_turned = factors > Z_REPEATED_TEST * std, signs < 0.0
     if is_turned[ahead]:  # a mounting unless all signs are observable
         axis = "each of x, y and z" if is_turned.all() else "xyz"[ahead]
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None
@@ -257,7 +257,7 @@ def wrong_axes(
         if ahead:
             return _mounting_fits(nominal @ np.diag(np.where(np.arange(3) == ahead, 1.0, -1.0)))
         return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
-    too_small = np.where(is_shown, (factors - SURE * std) / factors[ahead] - SCALED_ALONE, 0.0)
+    too_small = np.where(is_shown, (factors - Z_REPEATED_TEST * std) / factors[ahead] - SCALED_ALONE, 0.0)
     if not is_turned.any() and too_small.max() > 1.0:
         at = int(np.argmax(too_small))
         factor = float(factors[ahead] / factors[at])

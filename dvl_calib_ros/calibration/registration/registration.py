@@ -16,7 +16,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
-from ..numerics.tests import FOUND, RULED_OUT
+from ..numerics.tests import RULED_OUT, Z_FIFTY_TESTS
 from .clock_drift_and_jumps import MOST_STRETCHES, STRETCH_S, ClockChange, stamps, unsteady
 from .delay_search import LONGEST_S, places
 from .gauss_newton import (  # fmt: skip
@@ -39,7 +39,7 @@ from .motion_streams import Curves, MotionStreams
 
 # Smallest delay that is reported, s. It shifts a lever arm by a tenth of a second times the speed. Interpolated
 # attitudes and the filters of an INS have smaller delays (five real recordings: 0.03 to 0.07 s).
-SAID_FROM_S = 0.1
+REPORTED_FROM_S = 0.1
 # Chi-square that each additional delayed clock must gain.
 ONE_MORE = 12.0
 # Chi-square by which the next explanation must be worse for a refusal, if the σ of the calibration cover the delay. The
@@ -370,7 +370,7 @@ def _is_off(fitted: Fitted, index: int) -> bool:
 def is_beyond_doubt(seconds: float, std: float) -> bool:
     """Return whether a delay (s) with this σ (s) is significant and large enough to report."""
     is_known = std < min(max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds)), KNOWN_AT_MOST_S)
-    return is_known and abs(seconds) > max(SAID_FROM_S, FOUND * std)
+    return is_known and abs(seconds) > max(REPORTED_FROM_S, Z_FIFTY_TESTS * std)
 
 
 def _is_possible(fitted: Fitted) -> bool:
