@@ -98,7 +98,7 @@ class Calibrator:
         self._models = tuple(name for name in MODELS if name in models)
         # without positions the position model is not reported
         unknown = () if are_positions(parameters) else (POSITIONS.name,)
-        self._told = tuple(name for name in self._models if name not in unknown)
+        self._reported_models = tuple(name for name in self._models if name not in unknown)
         check_model(parameters)
         self._initial = initial
         self._block_size = block_size
@@ -245,7 +245,7 @@ class Calibrator:
         rows, end = self._aligner.rows, self._aligner.partners.n_paired
         first = self._n_selected - rows.base
         stamps_ns = rows.stamps_ns[first : end - rows.base]
-        until_ns = self._further.told_until_ns
+        until_ns = self._further.pending_from_ns
         if until_ns is not None:
             stamps_ns = stamps_ns[: int(np.searchsorted(stamps_ns, until_ns))]
         if len(stamps_ns):
@@ -350,12 +350,12 @@ class Calibrator:
 
     @property
     def first_ns(self) -> int | None:
-        """Stamp of the first DVL sample in order; None before."""
+        """Stamp of the first DVL sample, of those sorted by stamp; None before it."""
         return self._aligner.first_ns
 
     @property
     def last_ns(self) -> int | None:
-        """Stamp of the newest DVL sample in order; None before the first."""
+        """Stamp of the newest DVL sample, of those sorted by stamp; None before the first."""
         return self._aligner.last_ns
 
     @property
@@ -473,7 +473,7 @@ class Calibrator:
             selected=self.selected,
             iac_model=self.selection.iac_model(self.parameters),
             selected_because=self.selection.reason(self.parameters),
-            estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._told},
+            estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._reported_models},
             segments=tuple(self.selection.segments),
             counts=self.counts,
             first_ns=self.first_ns,
@@ -489,7 +489,7 @@ class Calibrator:
     def _verifications(self, doubts: Sequence[Reason]) -> dict[str, Verification]:
         """Return verdicts by model; live, only of the selected model, with all reasons against it."""
         if self._verified:
-            return {name: self.verification(name) for name in self._told}
+            return {name: self.verification(name) for name in self._reported_models}
         if self._worker is None:
             return {}
         verification = self._judge.so_far(self.selected, fresh=True)
@@ -512,8 +512,8 @@ class Calibrator:
     @property
     def doubts_so_far(self) -> Sequence[Reason]:
         """`doubts` by the latest evaluation, recomputed (some milliseconds) only when its inputs have changed."""
-        clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_told
-        of = (self.selected, *self._further.n_told, *(each.code for each in clocks))
+        clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_updates
+        of = (self.selected, *self._further.n_updates, *(each.code for each in clocks))
         if self._doubted is None or self._doubted[0] != of:
             self._doubted = of, self._judge.doubts(self.selected, clocks, fresh=False)
         return self._doubted[1]

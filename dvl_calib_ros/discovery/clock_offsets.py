@@ -59,7 +59,7 @@ class FoundClocks:
             return self.far.reason
         moves = self.registration.unsteady
         is_left = moves is not None and not MOVING & self.offsets.keys()
-        return moves.reason if moves is not None and is_left else self.registration.not_told_apart
+        return moves.reason if moves is not None and is_left else self.registration.ambiguity
 
     def says(self) -> Iterator[str]:
         """Yield one sentence per clock with an offset: its delay, and the treatment."""
@@ -75,7 +75,7 @@ class FoundClocks:
             else:
                 done = "not taken off"
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
-            yield f"{r.told(name).says}{which}: {done}"
+            yield f"{r.clock_reason(name).says}{which}: {done}"
         if r.apart.is_shown and not (r.offsets or self.doubt):
             yield (
                 f"stamps of DVL and reference differ by {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s; the data do "
@@ -173,15 +173,14 @@ def _one_per_interval(block: SampleBlock) -> SampleBlock:
     return block.part(np.flatnonzero(np.diff(bins, prepend=-1)))
 
 
-def in_time(recording: Recording, topics: Topics, found: Registration) -> Survey:
-    """Return the three streams with stamps of the IMU's clock."""
+def on_imu_clock(recording: Recording, topics: Topics, found: Registration) -> Survey:
+    """Return the previewed streams with their stamps corrected to the IMU's clock by a registration."""
     seen = recording.whole(topics)
-    late = {topics.dvl: found.dvl.late, topics.gnss: found.reference.late}
-    if not found.is_turned:
-        late = {topics.dvl: found.apart.late}
-    # the clock offset by arrival times no longer applies
+    delays_s = {topics.dvl: found.dvl.late, topics.gnss: found.reference.late}
+    if not found.is_turned:  # without turns only the delay between DVL and reference is observable
+        delays_s = {topics.dvl: found.apart.late}
     looks = {
-        name: replace(look, stamps_s=look.stamps_s - late.get(name, 0.0), ahead_s=0.0)
+        name: replace(look, stamps_s=look.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
         for name, look in seen.looks.items()
     }
     if topics.dvl in looks:

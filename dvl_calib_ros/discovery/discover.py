@@ -37,7 +37,7 @@ from ..recordings.topics import NONE, ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
 from .axis_signs import sign_findings
-from .clock_offsets import compared_motion, difference_of, in_time
+from .clock_offsets import compared_motion, difference_of, on_imu_clock
 from .discovery import (
     Discovery,
     Given,
@@ -87,7 +87,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         return found
     if clocks.registration.offsets:
         # finding frames needs velocities of the same time
-        seen = in_time(recording, found.topics, clocks.registration)
+        seen = on_imu_clock(recording, found.topics, clocks.registration)
         seen = replace(seen, topics=recording.survey.topics, counts=recording.survey.counts)
         topics = found.topics
         imu = topics.imu if topics.imu in seen.topics else named.imu_topic

@@ -27,7 +27,7 @@ from .block_preprocessing import Block, Cleaned, cleaned, seconds
 from .estimator import Rest
 from .full_fit import JointFit
 from .full_forward_model import FitBlock, spline_slopes
-from .registration_schedule import KeptClocks, Looked, ToldSoFar
+from .registration_schedule import FitSoFar, KeptClocks, Looked
 
 # DVL and IMU are kept this far beyond a block, s: the longest delay, and the end of a spline.
 MARGIN_S = LONGEST_DELAY_S + 0.8
@@ -121,8 +121,8 @@ class BlockSolver:
         return self._clocks.looked(self._so_far).rest
 
     @property
-    def _so_far(self) -> ToldSoFar | None:
-        return None if not self.fit.has_data else ToldSoFar(self.fit, self.epoch_ns)
+    def _so_far(self) -> FitSoFar | None:
+        return None if not self.fit.has_data else FitSoFar(self.fit, self.epoch_ns)
 
     @property
     def is_level(self) -> bool:

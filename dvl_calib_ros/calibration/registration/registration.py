@@ -152,7 +152,7 @@ class Registration:
         is_little = found.keys() == {"dvl_time_offset"} and abs(found["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S
         return {} if is_little else found
 
-    def told(self, name: str) -> Reason:
+    def clock_reason(self, name: str) -> Reason:
         """Return the finding of the delay that a parameter corrects."""
         clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference, "imu_time_offset": self.imu}
         if not self.is_turned and name == "reference_time_offset":
@@ -174,7 +174,7 @@ class Registration:
             return self.unsteady.reason
         name, clock = ("imu_time_offset", self.imu) if self.imu.is_shown else ("reference_time_offset", self.reference)
         if not clock.is_shown or (self.next_worse < REFUSED_FROM and self._holds(clock)):
-            return self.not_told_apart
+            return self.ambiguity
         offset = round(getattr(parameters, name) + clock.late, 2)
         off = {"seconds": abs(clock.late), "way": _way(clock), "parameter": name, "offset": offset}
         if clock is self.reference and self.dvl.is_shown:
@@ -186,7 +186,7 @@ class Registration:
         return bool(self.left_open.any()) and abs(clock.late) < FAR_OPEN * _with_prior(self.open_late)
 
     @property
-    def not_told_apart(self) -> Reason | None:
+    def ambiguity(self) -> Reason | None:
         """Finding of a large relative delay whose clock is not identifiable, or None."""
         if self.offsets or not self.apart.is_shown or abs(self.apart.late) < LEFT_TO_CALIBRATION_S:
             return None
@@ -289,16 +289,16 @@ def _explained(
     next_worse = min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost
     if best is None or cost > 2.0 * ONE_MORE:
         likeliest, best, next_worse = _Off.BOTH, free, math.inf
-    is_told_apart = next_worse > RULED_OUT
+    is_identified = next_worse > RULED_OUT
     x, p = best.x, best.p
     # an insignificant delay is set to zero, and σ must cover it
-    stays = likeliest in (_Off.NONE, _Off.DVL) or not (is_told_apart and _is_off(best, LATE))
+    stays = likeliest in (_Off.NONE, _Off.DVL) or not (is_identified and _is_off(best, LATE))
     late = 0.0 if stays else float(x[LATE])
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
     return Registration(
-        dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and is_beyond_doubt(best.dvl_late, best.dvl_std)),
-        reference=Clock(float(x[LATE]), float(std[LATE]), is_told_apart and _is_off(best, LATE)),
-        imu=Clock(-float(x[LATE]), float(std[LATE]), likeliest is _Off.IMU and is_told_apart and _is_off(best, LATE)),
+        dvl=Clock(best.dvl_late, best.dvl_std, is_identified and is_beyond_doubt(best.dvl_late, best.dvl_std)),
+        reference=Clock(float(x[LATE]), float(std[LATE]), is_identified and _is_off(best, LATE)),
+        imu=Clock(-float(x[LATE]), float(std[LATE]), likeliest is _Off.IMU and is_identified and _is_off(best, LATE)),
         apart=Clock(float(x[APART]), float(std[APART]), likeliest is not _Off.NONE and _is_off(best, APART)),
         is_turned=fit.is_turned,
         are_known=bool((free.std[[APART, LATE] if fit.is_turned else [APART]] < KNOWN_STD_S).all()),

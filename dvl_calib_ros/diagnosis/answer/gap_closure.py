@@ -261,26 +261,25 @@ def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
 def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
-    The residual is the noise, per sample: before and after share it, and their difference has the precision of the gap
-    rather than of the noise. Two parts of it are not: what an unknown cause explains, and what exceeds the fitted
-    noise, since it is slower. The part that the parameters have absorbed is added.
+    It is the squared residual, so that noise common to the errors before and after cancels in the gap. The energy of an
+    unknown cause, and of slow noise beyond its fitted level, is subtracted; that absorbed by parameters is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
     slow = SlowNoiseOfFit.of_fit(problem, fit)
-    noise, unfollowed, followed = slow.noise, slow.left, np.zeros(len(slow.left))
+    noise, slow_residual, explained = slow.noise, slow.left, np.zeros(len(slow.left))
     if matters(problem, fit, rest):
         *_, noise, without = slow.with_rest(problem, slow.noise, rest.clearest)
-        followed, unfollowed = (unfollowed**2 - without**2).sum(axis=1), without
-    usual = noise.energy
-    slower = (unfollowed**2).sum(axis=1) - usual
+        explained, slow_residual = (slow_residual**2 - without**2).sum(axis=1), without
+    expected = noise.energy
+    beyond_expected = (slow_residual**2).sum(axis=1) - expected
     floor, of_sample = left**2, problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
         of_bin, at = problem.recording_of == recording, of_sample == recording
         error = noise.energy_error / np.sqrt(of_bin.mean())
-        excess = float(slower[of_bin].mean())
-        systematic = max(0.0, float(followed[of_bin].mean()))
-        if excess > SETTINGS.noise_tolerance * error * float(usual[of_bin].mean()):
+        excess = float(beyond_expected[of_bin].mean())
+        systematic = max(0.0, float(explained[of_bin].mean()))
+        if excess > SETTINGS.noise_tolerance * error * float(expected[of_bin].mean()):
             systematic += excess
         energy = float(floor[at].sum(axis=1).mean())
         floor[at] *= max(0.0, energy - systematic) / max(energy, 1e-300)

@@ -40,6 +40,9 @@ from .arm_clock_ambiguity import (
 from .candidates import combined, linearised
 from .initial_guess import FirstGuess
 
+# Share of an effect's deviance drop, less a margin, from which a substitute is fitted: linearisation errs by as much.
+SCREENED_SHARE, SCREENED_MARGIN = 0.7, 4.0 * SETTINGS.indistinguishable
+
 
 @dataclass(frozen=True)
 class Selected:
@@ -89,7 +92,7 @@ def identify_effects(
             for each in selected
         ]
     fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
-    if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
+    if any(each.registration is not None and each.registration.ambiguity for each in guesses):
         selected = [
             _with_equivalents(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected
         ]
@@ -99,8 +102,7 @@ def identify_effects(
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
     """Test an effect given all others, and every other effect in its place.
 
-    An equally good substitute with more parameters could be the cause, even if less likely. A worse one could be if it
-    has fewer parameters, or chooses no time: a drifting clock was once named a clock jump at the best of nine times.
+    A substitute that fits worse is a possible cause, too, if it has fewer parameters or fewer times were tried for it.
     """
     rest = fit_without(fitter, fit, effect)
     log_p = log_p_in_place(fitter, fit, rest, effect)
@@ -113,9 +115,9 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     drops = {i: table.misfit(own) - table.misfit([*own, i]) for i in range(len(own), len(table.variants))}
     for index in sorted(drops, key=lambda i: -drops[i]):
         best_by_name.setdefault(table.variants[index].effect.name, index)
-    straight = drops.get(best_by_name.get(effect.name, -1), drop)
+    linear_drop = drops.get(best_by_name.get(effect.name, -1), drop)
     for name, index in best_by_name.items():
-        if name == effect.name or drops[index] < 0.7 * min(straight, drop) - 4.0 * SETTINGS.indistinguishable:
+        if name == effect.name or drops[index] < SCREENED_SHARE * min(linear_drop, drop) - SCREENED_MARGIN:
             continue
         rival = fitter.fit_kept(combined(fitter, rest, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance

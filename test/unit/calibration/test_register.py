@@ -163,7 +163,7 @@ def leg_in_waves(seed: int) -> MotionStreams:
 @pytest.mark.parametrize("seed", [1, 11])
 def test_waves_that_repeat_with_other_noise_are_no_clock(seed):
     found = register(leg_in_waves(seed), np.eye(3), np.zeros(3))
-    assert found is not None and found.offsets == {} and found.not_told_apart is None
+    assert found is not None and found.offsets == {} and found.ambiguity is None
 
 
 def leg_in_moving_water(share: float, seed: int) -> MotionStreams:
@@ -398,8 +398,8 @@ def test_a_clock_that_is_far_off_is_known_to_a_share_of_it():
 def test_clocks_that_are_far_apart_and_not_told_are_a_reason_against_a_calibration():
     in_time = Clock(0.0, 0.1, False)
     found = replace(registered("box", 5.0), dvl=in_time, reference=in_time, imu=in_time, apart=Clock(-50.0, 0.1, True))
-    assert found.not_told_apart is not None and found.not_told_apart.code == "CLOCKS_NOT_TOLD_APART"
-    assert found.contradiction(Parameters()) == found.not_told_apart
+    assert found.ambiguity is not None and found.ambiguity.code == "CLOCKS_NOT_TOLD_APART"
+    assert found.contradiction(Parameters()) == found.ambiguity
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ class Look:
     def taken_off(self):
         return {"reference_time_offset": self.late}
 
-    def told(self, name: str) -> Reason:
+    def clock_reason(self, name: str) -> Reason:
         return finding("CLOCK_OFF", whose=name, seconds=self.late, std=0.01, way="late", against="IMU")
 
 
