@@ -156,7 +156,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
     if parameters.dvl_frame not in ("", frames[1]):
         raise InputError(
-            f"{path}: its mounting is of {frames[1]!r}, its parameters of {parameters.dvl_frame!r}; save it again"
+            f"{path}: mounting is for frame {frames[1]!r}, parameters for {parameters.dvl_frame!r}; save it again"
         )
     doubts += _unobservable(model, state, parameters)
     delay = scale_and_delay(model, state, parameters).time_offset
@@ -434,7 +434,7 @@ class Targets:
 
     def __post_init__(self) -> None:
         if self.urdf is None and (self.output is not None or self.joint is not None or self.keep_position):
-            raise InputError("--output, --joint and --keep-position go with --urdf; name that, too")
+            raise InputError("--output, --joint and --keep-position need --urdf")
 
     @property
     def paths(self) -> list[Path]:

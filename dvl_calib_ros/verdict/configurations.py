@@ -189,17 +189,17 @@ CONFIGURATIONS = on_page(
     reject(
         "CLOCKS_NOT_TOLD_APART",
         "the stamps of DVL and reference differ by {seconds:.2f} ± {std:.2f} s; it is unknown whose clock is wrong",
-        remedy="set the clocks by one source, or drive turns at two speeds",
+        remedy="synchronise the clocks, or drive turns at two speeds",
     ),
     reject(
         "CLOCK_DRIFTS",
         "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
-        remedy="set the clocks by one source",
+        remedy="synchronise the clocks",
     ),
     reject(
         "CLOCK_DRIFTS_DVL",
         "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
-        remedy="set the clocks by one source, or dvl_clock_drift to {drift:.2g}",
+        remedy="synchronise the clocks, or dvl_clock_drift to {drift:.2g}",
     ),
     reject(
         "CLOCK_LEAPS",
@@ -250,7 +250,7 @@ CONFIGURATIONS = on_page(
     ),
     marginal(
         "FRAMES_AMBIGUOUS",
-        "the data fit {taken} and, as well, {other}; the first is taken",
+        "the data fit {taken} and {other} equally well; the first is used",
         remedy="which side is port on the DVL, and which axes has the reference? Set the one that is right",
     ),
     reject("TWO_CONTRADICTIONS", "{one}; {other}"),

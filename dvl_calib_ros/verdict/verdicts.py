@@ -111,7 +111,7 @@ VERDICTS = on_page(
     reject(
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
-        remedy="set the clocks by one source; by the recording times for this bag: --restamp log",
+        remedy="synchronise the clocks; to use the recording times of this bag instead: --restamp log",
     ),
     # several recordings
     reject(
@@ -296,18 +296,18 @@ DIAGNOSES = on_page(
     ),
     marginal(
         "GAP_TOO_SHORT",
-        "this recording cannot show a gap: {samples} samples over {seconds:.0f} s are too few",
+        "no gap can be measured in this recording: {samples} samples over {seconds:.0f} s are too few",
         means="Samples with DVL, reference and attitude count.",
         remedy="record {wanted:.0f} s at least, better 600 s",
     ),
     marginal(
         "GAP_REFERENCE_CONSTANT",
-        "this recording cannot show a gap: the reference velocity is constant to the last digit",
+        "no gap can be measured in this recording: the reference velocity is constant to the last digit",
         remedy="check the receiver",
     ),
     marginal(
         "GAP_REFERENCE_VERTICAL",
-        "this recording cannot show a gap: the reference does not measure the horizontal velocity",
+        "no gap can be measured in this recording: the reference does not measure the horizontal velocity",
         remedy="record a horizontal reference velocity",
     ),
     accept("REST_UNEXPLAINED", "{rest:.1f} mm/s are not explained"),
@@ -319,7 +319,7 @@ DIAGNOSES = on_page(
     accept("NEXT_SHOW", "to see {name}: {manoeuvre}"),
     accept("NEXT_SAME_ROUTE", "the same route again, to see whether the residual follows place, time or motion"),
     accept("NEXT_RECORD", "record {needs} as well, to test {names}"),
-    accept("NEXT_NOTHING", "nothing: all effects show"),
+    accept("NEXT_NOTHING", "nothing: all effects are observable"),
     accept("NEXT_ANYTHING", "straight legs on several headings and at several speeds, with turns to both sides"),
 )
 
@@ -328,11 +328,11 @@ UNPAIRED = on_page(
     "troubleshooting.md#what-a-comparison-with-a-simulator-says",
     reject("SIMULATOR_LACKS", "the simulator lacks {names}"),
     reject("SIMULATOR_OTHER_SIZE", "the simulator has {names} of another size"),
-    reject("SIMULATOR_ALONE_HAS", "the simulator has {names} which the vehicle has not"),
+    reject("SIMULATOR_ALONE_HAS", "the simulator has {names}, which the vehicle lacks"),
     marginal("SIMULATOR_FRAME", "its DVL is mounted {simulator}, the vehicle's {vehicle}"),
     accept(
         "SIMULATOR_PUT_RIGHT",
-        "put right, its error on the vehicle's own motion falls from {before:.1f} to {after:.1f} mm/s, held out",
+        "corrected, its error on the vehicle's own motion falls from {before:.1f} to {after:.1f} mm/s, held out",
     ),
     accept(
         "SIMULATOR_ROUNDS",
@@ -341,7 +341,7 @@ UNPAIRED = on_page(
     ),
     marginal(
         "SIMULATOR_ROUNDS_IN_VAIN",
-        "put right, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
+        "corrected, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
         "held out; noise alone makes {floor:.1f}",
         means="No round is better than the simulator as recorded.",
     ),
@@ -352,7 +352,7 @@ UNPAIRED = on_page(
     ),
     accept(
         "SIMULATOR_NO_ROUNDS",
-        "nothing differs that could be put right, so no round was made",
+        "no difference can be corrected, so no round was made",
         means="The comparison claims no difference.",
     ),
     marginal(

@@ -280,7 +280,7 @@ def test_a_calibration_is_applied_to_all_files_or_none(calibration, tmp_path):
     with pytest.raises(dc.InputError, match="no such URDF"):
         dc.apply(saved, urdf=tmp_path / "none.urdf", launch=launch)
     assert not launch.exists()
-    with pytest.raises(dc.InputError, match="go with --urdf"):
+    with pytest.raises(dc.InputError, match="need --urdf"):
         dc.apply(saved, joint="dvl")
 
 
