@@ -1,4 +1,4 @@
-"""Calibration of every recording below some places into a growing catalogue."""
+"""Calibration of every recording in the given places into a growing catalogue."""
 
 from __future__ import annotations
 
