@@ -93,9 +93,11 @@ class BlockSolver:
         self.restarted = 0
 
     def outcome(self, has_rows: bool = False) -> Outcome:
-        """Return the current results."""
+        """Return the results of all blocks so far. has_rows: whether any reference has been used."""
         fit = self.fit
-        counts = ModelCounts(fit.used, fit.gated + self._spikes, fit.mean_misfit, 3.0, self.restarted)
+        counts = ModelCounts(
+            fit.used, fit.gated + self._spikes, fit.mean_misfit, mean_rows=3.0, restarted=self.restarted
+        )
         return Outcome(tuple(fit.states), counts, self._claims, has_rows)
 
     def suggestion(self, *, fresh: bool = True) -> Reason | None:
