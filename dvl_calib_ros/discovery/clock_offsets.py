@@ -78,7 +78,7 @@ class FoundClocks:
             yield f"{r.clock_reason(name).says}{which}: {done}"
         if r.apart.is_shown and not (r.offsets or self.doubt):
             yield (
-                f"stamps of DVL and reference differ by {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s; the data do "
+                f"stamps of DVL and reference differ by {abs(r.apart.delay_s):.2f} ± {r.apart.std:.2f} s; the data do "
                 f"not show whose clock is wrong: drive turns at two speeds"
             )
 
@@ -176,9 +176,9 @@ def _one_per_interval(block: SampleBlock) -> SampleBlock:
 def on_imu_clock(recording: Recording, topics: Topics, found: Registration) -> Survey:
     """Return the previewed streams with their stamps corrected to the IMU's clock by a registration."""
     seen = recording.whole(topics)
-    delays_s = {topics.dvl: found.dvl.late, topics.gnss: found.reference.late}
+    delays_s = {topics.dvl: found.dvl.delay_s, topics.gnss: found.reference.delay_s}
     if not found.is_turned:  # without turns only the delay between DVL and reference is observable
-        delays_s = {topics.dvl: found.apart.late}
+        delays_s = {topics.dvl: found.apart.delay_s}
     looks = {
         name: replace(look, stamps_s=look.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
         for name, look in seen.looks.items()

@@ -18,7 +18,7 @@ from ..numerics.frames import Array
 from ..numerics.samples import Index, Mask
 from ..numerics.tests import RULED_OUT, Z_SLOW_ERRORS
 from ..streams.interpolation import DvlColumns, ImuColumns, TurnRates
-from .gauss_newton import APART, ARM, LATE, Fitted, MotionFit, N
+from .gauss_newton import ARM, DELTA, RHO, Fitted, MotionFit, N
 from .motion_streams import MotionStreams
 
 # Change of (δ, ρ) of a fit per second of delay of a stream.
@@ -77,7 +77,7 @@ class ClockChange:
         if self.leap > 0.0 and len(holes) == 1:
             return replace(self, at=float(times[holes[0] : holes[0] + 2].mean()))
         after = x.copy()
-        after[[APART, LATE]] += self.leap * np.array(DIRECTIONS[self.whose or "dvl"])
+        after[[DELTA, RHO]] += self.leap * np.array(DIRECTIONS[self.whose or "dvl"])
         (at, before), (later, behind) = (fit.costs(each, rotation, level) for each in (x, after))
         shared, own, other = np.intersect1d(at, later, return_indices=True)
         near = np.abs(fit.times[shared] - self.at) <= reach
@@ -86,7 +86,7 @@ class ClockChange:
         place = int(np.argmin(np.cumsum((before[own] - behind[other])[near])))
         seconds = float(fit.times[shared][near][place])
         # converted to DVL stamps, midway between those before and after a forward step
-        return replace(self, at=seconds + (float(x[APART]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
+        return replace(self, at=seconds + (float(x[DELTA]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
 
     def taken_off(self, epoch_ns: int) -> dict[str, float]:
         """Return the parameters that correct a change of the DVL clock. epoch_ns: stamp of time 0."""
@@ -159,7 +159,7 @@ def unsteady(
     if len(times) < 2 * EACH_SIDE:
         return None
     # a delay without acceleration looks like a lever arm, which is the same in all stretches
-    states = [*range(N)[ARM], APART, LATE]
+    states = [*range(N)[ARM], DELTA, RHO]
     seen = np.array([each.x[states] for each in stretches])
     lags = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
     # a stretch has few time blocks, so the autocorrelation of its residuals estimates lasting noise

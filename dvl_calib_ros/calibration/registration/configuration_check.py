@@ -96,7 +96,7 @@ SCALED_ALONE = 0.2
 # Largest misalignment (rad) and scale error of a right configuration.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
 # Initial DVL delays, s: the range of a calibration, in steps that are short compared to waves.
-LATE_S = (0.0, -1.2, 1.2, -2.4, 2.4)
+DELAYS_S = (0.0, -1.2, 1.2, -2.4, 2.4)
 # A fit that hardly improves is given up above this multiple of the largest useful residual.
 FAR_ABOVE = 2.0
 # Constraints of alternative configurations: synchronised reference, configured lever arm.
@@ -174,8 +174,8 @@ def nearest(
     held: rows of states held at zero. most: residual (m/s) above which a fit that hardly improves is given up.
     """
     best: Fitted | None = None
-    for late in LATE_S:
-        one = fit(0.0, late, rotation_body_from_dvl, held, most=most if best is None else min(most, best.level))
+    for delay_s in DELAYS_S:
+        one = fit(0.0, delay_s, rotation_body_from_dvl, held, most=most if best is None else min(most, best.level))
         if one is not None and np.isfinite(one.x).all() and (best is None or one.level < best.level):
             best = one
     return best
@@ -239,7 +239,7 @@ def wrong_axes(
         return None
     _, signs, near = min(found, key=lambda each: each[0])
     fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), MOST_ROWS)
-    fitted = fit(0.0, near.dvl_late, nominal, (REFERENCE,))
+    fitted = fit(0.0, near.dvl_delay_s, nominal, (REFERENCE,))
     if fitted is None or fitted.level > most:
         return None
     factors, std = fit.axis_factors(fitted, nominal)
