@@ -180,7 +180,7 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
 
 def _fold_of(problem: Problem, index: int) -> Array:
     """Return the fold (N,) of each DVL sample of a recording: stretches of time in turn; -1 outside the fit."""
-    time = problem.recordings[index].dvl.time - problem.grids[index].late
+    time = problem.recordings[index].dvl.time - problem.grids[index].delay_s
     of = problem.grids[index].bin_time
     fold = stretch_of(time) % SETTINGS.folds
     inside = (time >= of[0]) & (time <= of[-1]) if len(of) else np.zeros(len(time), dtype=bool)

@@ -130,7 +130,7 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
     std = estimate.std_of(*OFFSETS)
     if std is None:
         return []
-    said = []
+    reasons = []
     open_std = np.sqrt(np.diag(estimate.left_open))
     if open_std.any():
         by_name = dict(zip(estimate.state_names, open_std.tolist(), strict=True))
@@ -138,9 +138,9 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
         if metres >= REPORTED_FROM_M or seconds >= REPORTED_FROM_S:
-            said.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
+            reasons.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
         elif turn >= REPORTED_FROM_DEG:  # the lever arm is configured
-            said.append(finding("CLOCK_ON_TURN", degrees=turn))
+            reasons.append(finding("CLOCK_ON_TURN", degrees=turn))
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
         for day in days
@@ -150,5 +150,5 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
         if size < OFFSET_REPORTED_FROM_MPS or (np.abs(offset) < Z_REPEATED_TEST * own_std).all():
             continue
         course = math.degrees(math.atan2(*offset)) % 360.0
-        said.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))
-    return said
+        reasons.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))
+    return reasons

@@ -359,18 +359,18 @@ _ANGLE_NAMES = COMPONENTS[ANGLES]
 
 def reasons(comparison: Comparison) -> list[Reason]:
     """Return the findings, the mounting first."""
-    said = [*map(moved, comparison.moved), *map(suspicious, comparison.suspicious)]
-    said = [*said, *map(suspected, comparison.suspected)] or [_same(comparison)]
-    said += map(scale_changed, comparison.scale_changed)
+    findings = [*map(moved, comparison.moved), *map(suspicious, comparison.suspicious)]
+    findings = [*findings, *map(suspected, comparison.suspected)] or [_same(comparison)]
+    findings += map(scale_changed, comparison.scale_changed)
     for change in comparison.clock_changed:
         seconds, std = float(change.difference.value[TIME_OFFSET]), float(change.difference.std[TIME_OFFSET])
         way = "later" if seconds > 0.0 else "earlier"
-        said.append(finding("DELAY_CHANGED", seconds=abs(seconds), std=std, way=way, between=between(change)))
+        findings.append(finding("DELAY_CHANGED", seconds=abs(seconds), std=std, way=way, between=between(change)))
     scatter = comparison.scatter
     if scatter.freedom and scatter.p < CHANCE:
         code = "SCATTER_BESIDE_MOVES" if comparison.moved or comparison.suspicious else "SCATTER"
-        said.append(finding(code, by=math.sqrt(scatter.value / scatter.freedom)))
-    return said
+        findings.append(finding(code, by=math.sqrt(scatter.value / scatter.freedom)))
+    return findings
 
 
 def _same(comparison: Comparison) -> Reason:
@@ -464,13 +464,13 @@ def between(change: Change) -> str:
 
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
     """Return plain data for `compare --json`, in SI units."""
-    said, remarked = reasons(comparison), remarks(comparison)
+    findings, remarked = reasons(comparison), remarks(comparison)
     return {
         "verdict": comparison.word,
         "same_mounting": comparison.same_mounting,
-        "says": [each.full_sentence for each in said],
+        "says": [each.full_sentence for each in findings],
         "remarks": [str(each) for each in remarked],
-        "findings": [each.as_dict() for each in (*said, *remarked)],
+        "findings": [each.as_dict() for each in (*findings, *remarked)],
         "calibrations": [
             {name: getattr(each, name) for name in ("name", "model", "first_ns", "last_ns", "used", "rejected")}
             | {"value": _named(each.value), "std": _named(each.std)}

@@ -85,7 +85,7 @@ def identify_effects(
     if clocks:
         selected = [_with_equivalents(each, clocks) if each.effect.name == ARM else each for each in selected]
     if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
-        opened = replace(opened, late=IN_TIME_STD_S)  # only their combination is observable
+        opened = replace(opened, delay_std_s=IN_TIME_STD_S)  # only their combination is observable
     if opened is not None:  # a lag differs from a delay by less than interpolation errors
         selected = [
             _with_equivalents(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
@@ -149,7 +149,7 @@ def _clock_or_arm(
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
     late = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
-    is_late = opened is None or max(late, default=0.0) >= OF_INTERVAL * opened.late
+    is_late = opened is None or max(late, default=0.0) >= OF_INTERVAL * opened.delay_std_s
 
     def is_shown(each: Selected) -> bool:
         if each.effect.name == REFERENCE_CLOCK and not is_late:
