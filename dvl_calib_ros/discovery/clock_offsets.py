@@ -73,13 +73,13 @@ class FoundClocks:
             elif name == "dvl_time_offset" and abs(late) < LEFT_TO_CALIBRATION_S:
                 done = "left to the calibration, which estimates it"
             else:
-                done = "not taken off"
+                done = "not subtracted"
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
             yield f"{r.clock_reason(name).says}{which}: {done}"
         if r.apart.is_shown and not (r.offsets or self.doubt):
             yield (
-                f"stamps of DVL and reference differ by {abs(r.apart.delay_s):.2f} ± {r.apart.std:.2f} s; the data do "
-                f"not show whose clock is wrong: drive turns at two speeds"
+                f"stamps of DVL and reference differ by {abs(r.apart.delay_s):.2f} ± {r.apart.std:.2f} s; it is "
+                f"unknown whose clock is wrong: drive turns at two speeds"
             )
 
 

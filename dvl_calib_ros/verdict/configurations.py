@@ -210,7 +210,7 @@ CONFIGURATIONS = on_page(
         "CLOCK_FAR",
         "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be estimated and "
         "subtracted",
-        remedy="set that clock right; this recording: --restamp log (recording times)",
+        remedy="set that clock; to use the recording times of this bag instead: --restamp log",
     ),
     # declarations of a recording
     reject(
@@ -282,7 +282,7 @@ DISCOVERIES = on_page(
         means="Satellites go first, then a simulator's truth, then an INS.",
     ),
     accept("FRAME_NOT_IN_TREE", "no transform for the DVL's frame {frame!r}; using frame {other!r} instead"),
-    accept("REFERENCE_FRAME_NOT_TOLD", "{topic}: its frame is unknown, and without an IMU the data do not show it"),
+    accept("REFERENCE_FRAME_NOT_TOLD", "{topic}: its frame is unknown, and not observable without an IMU"),
     accept(
         "MOUNTING_GUESSED",
         "mounting {mounting}, {why}: nothing in the bag says how the DVL is mounted (-p mounting_rpy:={option}){also}",

@@ -373,7 +373,7 @@ FINDINGS = (
     ),
     warning(
         "LEVER_ARM_CONTRADICTED",
-        "the data show another lever arm than the configured one: {axes}",
+        "the lever arm in the data differs from the configured one: {axes}",
         means="Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",
         remedy=(
             "measure the positions of DVL and reference point (lever_arm, reference_position), then check the IMU's "

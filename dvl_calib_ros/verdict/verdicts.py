@@ -141,11 +141,11 @@ MANOEUVRES = on_page(
         means="Another heading separates a current from the mounting.",
     ),
     accept("NEXT_AHEAD", "drive straight ahead", means="Motion ahead makes yaw, pitch and scale observable."),
-    accept("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", means="Angles show in proportion to the speed."),
-    accept("NEXT_SPEEDS", "speed up and slow down by half", means="Accelerations show a delay, two speeds a bias."),
-    accept("NEXT_CIRCLE", "circle to {side}", means="Turns show the lever arm and average earth-fixed errors."),
+    accept("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", means="An angle's error grows with the speed."),
+    accept("NEXT_SPEEDS", "speed up and slow down by half", means="Accelerations separate a delay, two speeds a bias."),
+    accept("NEXT_CIRCLE", "circle to {side}", means="Turns separate the lever arm and average earth-fixed errors."),
     accept("NEXT_EIGHT", "drive a figure eight", means="Turns to both sides separate lever arm and yaw."),
-    accept("NEXT_DIVE", "dive and rise by 10° of pitch", means="Pitching shows the vertical axis."),
+    accept("NEXT_DIVE", "dive and rise by 10° of pitch", means="Pitching makes the vertical axis observable."),
     accept("NEXT_REFERENCE", "surface: {model} learns only with the reference"),
     accept("NEXT_WAIT", "keep on: nothing is learnt yet"),
     accept("NEXT_REJECTED", "nothing: the findings say why this calibration is not to be used"),
@@ -187,7 +187,7 @@ SELECTIONS = on_page(
     accept(
         "CALIBRATION_KEPT",
         "the calibration with the reference so far stays in use",
-        means="The mounting is known from the data with a reference.",
+        means="The mounting was estimated while there was a reference.",
     ),
     accept(
         "ARM_LOOKS_LIKE_ANGLE",
@@ -357,9 +357,9 @@ UNPAIRED = on_page(
     ),
     marginal(
         "SIMULATOR_NOT_SHOWN",
-        "these recordings show no difference in effects, and could not have shown some that matter",
+        "no difference in effects is observable in these recordings, but some that matter would not be, either",
     ),
-    accept("SIMULATOR_ALIKE", "the simulator lacks no effect that these recordings show"),
+    accept("SIMULATOR_ALIKE", "the simulator lacks no effect that is observable in these recordings"),
     marginal("SIMULATOR_NOISE", "the noise differs in {names}"),
     marginal(
         "SIMULATOR_UNKNOWN_REST",

@@ -203,7 +203,7 @@ def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(ahead, tmp_path):
         ({"lever_arm": {"xm": 0.5}}, "did you mean 'x_m'"),
         ({"lever_arm": {"x_m": "far"}}, "is no number"),
         ({"lever_arm": {}}, "does nothing"),
-        (["lever_arm"], "effects are by name"),
+        (["lever_arm"], "give effects by name"),
     ):
         with pytest.raises(dc.InputError, match=message):
             dc.simulate(tmp_path / "none", effects=wrong)
