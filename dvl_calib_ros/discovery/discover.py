@@ -421,7 +421,7 @@ class _Search:
         if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
             residual = self._readings.registered(reading, np.eye(3)).left
             turned_left, rotation, *_ = self._readings.registered(reading, None)
-            if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(residual):
+            if self._readings.without_noise(turned_left) < CLEARLY * self._readings.without_noise(residual):
                 agree = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)
@@ -435,7 +435,7 @@ class _Search:
         if self._is_given("gnss_aided_std") or self._is_given("use_message_covariance"):
             return
         says_nothing = "use_message_covariance" in self._values
-        if self._readings.beside_noise(chosen.best_left) > FITS:
+        if self._readings.without_noise(chosen.best_left) > FITS:
             return
         is_position = VELOCITY_TYPES[reference.msgtype].position is not None
         measured_std = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0

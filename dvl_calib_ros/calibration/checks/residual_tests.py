@@ -71,9 +71,9 @@ OUTLYING, ROUNDS = 4.0, 3
 # Smallest noise of the residual, m/s.
 QUIETEST_MPS = 1e-3
 # Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion.
-FORGOTTEN_S, SLOWEST_S = (0.5, 1.0, 3.0), 0.3
-# Samples to either side that predict one; innovations beyond NEW_AT_MOST σ are outliers.
-FORETOLD_BY, NEW_AT_MOST = 12, 4.0
+FILTER_MEMORIES_S, LONGEST_INTERVAL_S = (0.5, 1.0, 3.0), 0.3
+# Samples to either side that predict one; innovations beyond OUTLYING_INNOVATION σ are outliers.
+NEIGHBOURS, OUTLYING_INNOVATION = 12, 4.0
 # σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
 OF_WAVES = 0.015
 # Delay of a reference that a filter explains: within this factor of the filter's time constant, and at least this, s.
@@ -90,8 +90,8 @@ class ResidualTrend(NamedTuple):
     tilt, tilt_std: (2,) share of roll and pitch missing in the DVL's velocity: 0 if correct, 1 if levelled, ±2 for a
     wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
     of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
-    circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: memory, s, the most
-    significant of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
+    circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: the most significant
+    of `FILTER_MEMORIES_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
     heading; 0 if the residual holds less than half of it. turned, turned_std: rad, change of the heading error from
     start to end.
     """
@@ -182,9 +182,9 @@ def residual_trend(
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
-    beside = _nuisance_columns(_beside(time, moving, starts), rates, slope, body_from_enu)
-    by_heading = beside[:, :, -1, None] * around[:, None]
-    columns = np.concatenate([_means(each, starts) for each in (beside, by_heading, constant)], axis=2)
+    known = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
+    by_heading = known[:, :, -1, None] * around[:, None]
+    columns = np.concatenate([_means(each, starts) for each in (known, by_heading, constant)], axis=2)
     likely = np.concatenate([NUISANCE_STD, BY_HEADING, CONSTANT])
     means = _means(time, starts), columns, _means(error, starts)
     slow = _fitted(*means, likely, LASTING)
@@ -210,7 +210,7 @@ def residual_trend(
     smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
     return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_circular(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
+        *_noise_in_reference(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
         float(slow.x[-4]), float(slow.std[-4]),
     )  # fmt: skip
 
@@ -227,7 +227,7 @@ def _nuisance_columns(moving: Array, rates: Array, slope: Array, body_from_enu: 
     return known
 
 
-def _beside(time: Array, values: Array, starts: Index) -> Array:
+def _neighbouring_means(time: Array, values: Array, starts: Index) -> Array:
     """Return for each value (N, 3) the mean of the neighbouring stretches, or of its own if these are far in time."""
     at, of_each = _means(time, starts), _means(values, starts)
     near = (np.diff(at) < 2.0 * MEAN_S).astype(float)[:, None]
@@ -384,9 +384,9 @@ def _fitted(
     each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
     told = np.sum(each_axis, axis=0)
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
-    beside = p[:, : len(NUISANCE_STD)] * (prior * likely)[: len(NUISANCE_STD)]
+    by_prior = p[:, : len(NUISANCE_STD)] * (prior * likely)[: len(NUISANCE_STD)]
     std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T, together)
-    return _Fit(x, np.sqrt(std**2 + (beside**2).sum(axis=1)), p, weight, starts)
+    return _Fit(x, np.sqrt(std**2 + (by_prior**2).sum(axis=1)), p, weight, starts)
 
 
 def _std(scatter: Array, together: Sequence[int]) -> Array:
@@ -396,26 +396,26 @@ def _std(scatter: Array, together: Sequence[int]) -> Array:
     return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
-def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
+def _noise_in_reference(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
     """Return the share of the DVL's noise that the reference keeps, its σ, and the memory, s. dvl: (N, 3) m/s, body.
 
     The innovation of a velocity, given its neighbours, holds its noise. The same filter is applied to the residual, so
     both hold the same noise. Nuisance columns hold DVL noise themselves, so the residual is not corrected by them.
     """
     step = float(median(np.diff(time)))
-    if step > SLOWEST_S or len(time) < 4 * FORETOLD_BY:
+    if step > LONGEST_INTERVAL_S or len(time) < 4 * NEIGHBOURS:
         return 0.0, math.inf, 0.0
-    new, rest = (np.zeros_like(dvl) for _ in range(2))
+    innovation, rest = (np.zeros_like(dvl) for _ in range(2))
     for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):
-        shares = _not_foretold(values)
-        for filtered, each in ((new, values), (rest, error[:, axis])):
-            filtered[FORETOLD_BY:-FORETOLD_BY, axis] = np.correlate(each, shares, "valid")
-    most = NEW_AT_MOST * robust_std(new)
+        shares = _innovation_filter(values)
+        for filtered, each in ((innovation, values), (rest, error[:, axis])):
+            filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
+    limit = OUTLYING_INNOVATION * robust_std(innovation)
     # gaps break the prediction
     is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
-    new[np.convolve(is_gap, np.ones(2 * FORETOLD_BY), "same") > 0.5] = 0.0
-    noise = np.clip(new, -most, most)
-    weight = fit.weight * ((new == noise) & (new != 0.0)).all(axis=1)  # neither clipped, nor at an end
+    innovation[np.convolve(is_gap, np.ones(2 * NEIGHBOURS), "same") > 0.5] = 0.0
+    noise = np.clip(innovation, -limit, limit)
+    weight = fit.weight * ((innovation == noise) & (innovation != 0.0)).all(axis=1)  # neither clipped, nor at an end
 
     def without_columns(values: Array) -> Array:
         weighted = fit.weight[:, None] * values
@@ -428,9 +428,9 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
         return np.asarray(values - now * (np.einsum("n,ni,ni->i", weight, now, values) / level))
 
     rest, found = without_now(rest), []
-    for seconds in FORGOTTEN_S:
+    for seconds in FILTER_MEMORIES_S:
         for late in (0.0, seconds):  # the lag may have been corrected as a delay
-            past = without_now(without_columns(_followed(noise, step, seconds, late)))
+            past = without_now(without_columns(_filtered_noise(noise, step, seconds, late)))
             square = float(np.einsum("n,ni,ni->", weight, past, past))
             if square <= 0.0:
                 continue
@@ -440,7 +440,7 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
     return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
 
 
-def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
+def _filtered_noise(noise: Array, step: float, seconds: float, late: float) -> Array:
     """Return a filter's output from earlier noise (N, 3). seconds: memory. late: lag that is corrected, s."""
     kernel = np.exp(-np.arange(math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
     ahead = int(late / step + 1e-6)
@@ -449,13 +449,13 @@ def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
     return np.asarray(made[ahead : ahead + len(noise)])
 
 
-def _not_foretold(values: Array) -> Array:
-    """Return coefficients (2 `FORETOLD_BY` + 1,) of a sample's prediction error by its neighbours, from values (N,)."""
-    around = np.lib.stride_tricks.sliding_window_view(values, 2 * FORETOLD_BY + 1)
-    own, others = around[:, FORETOLD_BY], np.delete(around, FORETOLD_BY, axis=1)
+def _innovation_filter(values: Array) -> Array:
+    """Return coefficients (2 `NEIGHBOURS` + 1,) of a sample's prediction error by its neighbours, from values (N,)."""
+    around = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
+    own, others = around[:, NEIGHBOURS], np.delete(around, NEIGHBOURS, axis=1)
     square = others.T @ others
-    level = 1e-9 * float(np.trace(square)) / FORETOLD_BY + 1e-18  # simulated values may be exactly predictable
-    return np.insert(-np.linalg.solve(square + level * np.eye(2 * FORETOLD_BY), others.T @ own), FORETOLD_BY, 1.0)
+    level = 1e-9 * float(np.trace(square)) / NEIGHBOURS + 1e-18  # simulated values may be exactly predictable
+    return np.insert(-np.linalg.solve(square + level * np.eye(2 * NEIGHBOURS), others.T @ own), NEIGHBOURS, 1.0)
 
 
 def _mean(time: Array, values: Array, seconds: float) -> Array:

@@ -348,8 +348,8 @@ class JointFit:
         for at in reversed(suspicious):
             fewer = block.without(np.array([at]))
             (times, before), (also, after) = (self._misfits(day, each, x) for each in (block, fewer))
-            beside = np.abs(times - x[REFERENCE_DELAY] + x[DELAY] - block.dvl.times[at]) < block.interval_s
-            both = beside & np.isin(times, also, assume_unique=True)
+            near = np.abs(times - x[REFERENCE_DELAY] + x[DELAY] - block.dvl.times[at]) < block.interval_s
+            both = near & np.isin(times, also, assume_unique=True)
             left = after[np.searchsorted(also, times[both])].sum()
             if before[both].sum() - left > LEAST_GAIN and left < SHARE_LEFT * before[both].sum():
                 self._left_out += int(block.from_s <= block.dvl.times[at] < block.end_s)

@@ -204,7 +204,7 @@ def _lasting(scatter: Array, lasts: float) -> Array:
     m = scatter.shape[-1]
     if m < LASTING_FROM:
         return np.ones(scatter.shape[:-1])
-    beside = (scatter[..., 1:] * scatter[..., :-1]).sum(axis=-1) / np.maximum((scatter**2).sum(axis=-1), 1e-300)
-    rho = np.clip((beside + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MOST_LASTING)
+    correlation = (scatter[..., 1:] * scatter[..., :-1]).sum(axis=-1) / np.maximum((scatter**2).sum(axis=-1), 1e-300)
+    rho = np.clip((correlation + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MOST_LASTING)
     more = (1.0 + rho) / (1.0 - rho)
-    return np.asarray(np.where(beside > lasts / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))
+    return np.asarray(np.where(correlation > lasts / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))

@@ -167,7 +167,7 @@ class Readings:
         """Return the number of simultaneous velocities."""
         return len(self._at)
 
-    def beside_noise(self, left: float) -> float:
+    def without_noise(self, left: float) -> float:
         """Return a residual share without the white noise of the reference."""
         square = float(squared(self._dvl).mean())
         return math.sqrt(max(left**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
@@ -177,7 +177,7 @@ class Readings:
 
         Errors by lever arms, delays and waves are correlated, so few samples count (`INDEPENDENT`).
         """
-        return self.log_likelihood_registered(self.beside_noise(left))
+        return self.log_likelihood_registered(self.without_noise(left))
 
     @staticmethod
     def log_likelihood_registered(left: float) -> float:

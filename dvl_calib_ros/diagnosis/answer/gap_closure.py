@@ -195,19 +195,19 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     rows = len(fit.residual)
     calibration = np.linalg.qr(fit.columns[:, :, :6].reshape(-1, 6))[0]
 
-    def beside_calibration(values: Array) -> Array:
+    def without_calibration(values: Array) -> Array:
         flat = values.reshape(calibration.shape[0], -1)
         return np.asarray(flat - calibration @ (calibration.T @ flat))
 
     rng = np.random.default_rng(0)
     spread = np.sqrt(blocks / rng.chisquare(blocks, (RESAMPLES, 1)))  # the scatter of blocks is itself estimated
     moved = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
-    columns = beside_calibration(fit.columns[:, :, 6:])
+    columns = without_calibration(fit.columns[:, :, 6:])
     others = [rival for selected in selection.selected for rival in selected.rivals]
     if selection.wider is not None and len(selection.wider.effects) > len(fit.effects):
         others.append(selection.wider)
     residuals_of = [fit.residual, *(fitter.evaluated(each)[1] for each in others)]
-    truths = [beside_calibration(selection.base.residual - each)[:, 0] for each in residuals_of]
+    truths = [without_calibration(selection.base.residual - each)[:, 0] for each in residuals_of]
     corrected = truths[0]
     of_cause = rows * max(remainder(selection, residuals), gap.not_expected**2 if gap.fails_elsewhere else 0.0)
     gram = columns.T @ columns

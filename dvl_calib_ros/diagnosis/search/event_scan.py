@@ -42,7 +42,7 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
     basis: orthonormal (m, k) of the fit's whitened columns, with its prior rows. white: (m,) whitened residual of unit
     variance, orthogonal to it.
     """
-    found, beside, fading = [], _beside_known_times(problem, fit), fit.noise.fading
+    found, excluded, fading = [], _near_fitted_times(problem, fit), fit.noise.fading
     for about, (profiles_of, error_of) in EVENTS.items():
         error = error_of(problem, fit)
         if error is None:
@@ -59,7 +59,7 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
                 part = slice(max(rows.start, acts[0] - 1), min(rows.stop, acts[-1] + 1 + fading))
                 profile = profile[part.start - rows.start : part.stop - rows.start]
                 columns = error[part, :, None] * profile[:, None, :, None]
-                columns[beside[part]] = 0.0
+                columns[excluded[part]] = 0.0
                 log_p = _log_p(fit, basis, white, columns, part)
                 at = int(np.argmin(log_p))
                 if log_p[at] < best:
@@ -70,14 +70,14 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
     return found
 
 
-def _beside_known_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
+def _near_fitted_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     """Return (M,) bins next to the beginning or end of a fit's effects, which is known to some seconds."""
-    beside = np.zeros(len(problem.time), dtype=bool)
+    excluded = np.zeros(len(problem.time), dtype=bool)
     for effect in fit.effects:
         for rows, values in zip(problem.rows_of, fit.values[effect.name], strict=True):
             for spec in filter(is_time_of_run, effect.parameters):
-                beside[rows] |= np.abs(problem.time[rows] - values[spec.name]) < KNOWN_TO_S
-    return beside
+                excluded[rows] |= np.abs(problem.time[rows] - values[spec.name]) < KNOWN_TO_S
+    return excluded
 
 
 def _log_p(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) -> Array:

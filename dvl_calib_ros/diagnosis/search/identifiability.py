@@ -161,8 +161,8 @@ def _clock_or_arm(
     if arm is None or not clocks:
         return selected
     clock = min(clocks, key=lambda each: each.log_p)
-    beside = [each for each in clocks if each is not clock and each.effect not in called_for and not is_shown(each)]
-    selected = [each for each in selected if each not in beside]
+    dropped = [each for each in clocks if each is not clock and each.effect not in called_for and not is_shown(each)]
+    selected = [each for each in selected if each not in dropped]
     if is_shown(arm) and is_shown(clock):
         return selected
     if is_shown(clock) and clock.effect.name in known and arm.log_p > threshold:
