@@ -311,14 +311,14 @@ class NonlinearEstimators:
         return min((each.n_taken for each in self._all), default=NEVER)
 
     @property
-    def n_updates(self) -> tuple[int, ...]:
+    def n_told(self) -> tuple[int, ...]:
         """Counters, by estimator, that grow when it may have new results."""
-        return tuple(each.n_updates for each in self._all)
+        return tuple(each.n_told for each in self._all)
 
     @property
-    def pending_from_ns(self) -> int | None:
+    def told_until_ns(self) -> int | None:
         """Stamp of the first DVL sample that gathered blocks may still affect; None without any."""
-        return min((until for each in self._all if (until := each.pending_from_ns) is not None), default=None)
+        return min((until for each in self._all if (until := each.told_until_ns) is not None), default=None)
 
     @property
     def reference_claims(self) -> bool:

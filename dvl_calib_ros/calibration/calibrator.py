@@ -245,7 +245,7 @@ class Calibrator:
         rows, end = self._aligner.rows, self._aligner.partners.n_paired
         first = self._n_selected - rows.base
         stamps_ns = rows.stamps_ns[first : end - rows.base]
-        until_ns = self._further.pending_from_ns
+        until_ns = self._further.told_until_ns
         if until_ns is not None:
             stamps_ns = stamps_ns[: int(np.searchsorted(stamps_ns, until_ns))]
         if len(stamps_ns):
@@ -512,8 +512,8 @@ class Calibrator:
     @property
     def doubts_so_far(self) -> Sequence[Reason]:
         """`doubts` by the latest evaluation, recomputed (some milliseconds) only when its inputs have changed."""
-        clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_updates
-        of = (self.selected, *self._further.n_updates, *(each.code for each in clocks))
+        clocks = self.clock_objections(fresh=False)  # clocks too far apart to be paired do not raise n_told
+        of = (self.selected, *self._further.n_told, *(each.code for each in clocks))
         if self._doubted is None or self._doubted[0] != of:
             self._doubted = of, self._judge.doubts(self.selected, clocks, fresh=False)
         return self._doubted[1]

@@ -131,9 +131,9 @@ def _find_in_recording(
     if best is None or residual >= REGISTERED:
         return None
     registration, hypothesis = best
-    offsets = {} if given.intersection(OFFSETS) else registration.taken_off
+    offsets = {} if given.intersection(OFFSETS) else registration.corrections
     if registration.unsteady is not None and not given & MOVING:
-        offsets |= registration.unsteady.taken_off(epoch_ns)
+        offsets |= registration.unsteady.corrections(epoch_ns)
     return FoundClocks(registration, offsets, hypothesis)
 
 

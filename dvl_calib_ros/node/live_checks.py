@@ -64,8 +64,8 @@ class LateClocks:
         if self.stand or registration is None or registration is self._before:
             return None
         before, self._before = self._before, registration
-        late = registration.taken_off
-        if before is None or not late or not _are_alike(before.taken_off, late):
+        late = registration.corrections
+        if before is None or not late or not _are_alike(before.corrections, late):
             return None
         self.stand = True
         taken = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in late.items()}

@@ -23,7 +23,7 @@ from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..models import MODELS
 from ..models.parameters import Parameters
-from ..numerics.block_covariance import alike_of, of_few
+from ..numerics.block_covariance import effective_blocks, student_factor
 from ..numerics.frames import Array, cross, skew
 from ..numerics.robust import median, robust_std
 from ..numerics.samples import Index
@@ -382,10 +382,10 @@ def _fitted(
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
     # one axis at a time to save memory: hours of data would need a tenth of a gigabyte
     each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
-    told = np.sum(each_axis, axis=0)
+    contributions = np.sum(each_axis, axis=0)
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
     by_prior = p[:, : len(NUISANCE_STD)] * (prior * likely)[: len(NUISANCE_STD)]
-    std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T, together)
+    std = student_factor(effective_blocks(contributions[None])[0] - 1.0) * _std(p @ scores.T, together)
     return _Fit(x, np.sqrt(std**2 + (by_prior**2).sum(axis=1)), p, weight, starts)
 
 

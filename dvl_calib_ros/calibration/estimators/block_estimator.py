@@ -118,7 +118,7 @@ class FullEstimator(Estimator):
         return self._n_taken
 
     @property
-    def pending_from_ns(self) -> int | None:
+    def told_until_ns(self) -> int | None:
         """Stamp of the first DVL sample that a gathered block may still affect; None without any."""
         return self._gathered_ns[0] if self._gathered_ns else None
 
@@ -225,7 +225,7 @@ class FullEstimator(Estimator):
         return self._result_in_effect.suggestion
 
     @property
-    def n_updates(self) -> int:
+    def n_told(self) -> int:
         """Number of blocks in effect."""
         return self._n_updates
 

@@ -146,7 +146,7 @@ class Estimator(ABC):
         return None
 
     @property
-    def n_updates(self) -> int:
+    def n_told(self) -> int:
         """Counter that grows when there may be new results besides the state."""
         return self.counts.used
 
@@ -161,7 +161,7 @@ class Estimator(ABC):
         return NO_EVIDENCE
 
     @property
-    def pending_from_ns(self) -> int | None:
+    def told_until_ns(self) -> int | None:
         """Stamp of the first DVL sample that gathered blocks may still affect; None without any."""
         return None
 

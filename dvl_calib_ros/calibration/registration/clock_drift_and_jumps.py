@@ -88,7 +88,7 @@ class ClockChange:
         # converted to DVL stamps, midway between those before and after a forward step
         return replace(self, at=seconds + (float(x[DELTA]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
 
-    def taken_off(self, epoch_ns: int) -> dict[str, float]:
+    def corrections(self, epoch_ns: int) -> dict[str, float]:
         """Return the parameters that correct a change of the DVL clock. epoch_ns: stamp of time 0."""
         if self.whose != "dvl" or abs(self.drift) > MOST_DRIFT or abs(self.leap) > MOST_LEAP_S:
             return {}
@@ -96,7 +96,7 @@ class ClockChange:
             return {"dvl_clock_drift": round(self.drift, 7)}
         return {"dvl_time_jump": round(self.leap, 3), "dvl_time_jump_at": round(1e-9 * epoch_ns + self.at, 3)}
 
-    def steadied(self, motion: MotionStreams) -> MotionStreams:
+    def corrected(self, motion: MotionStreams) -> MotionStreams:
         """Return the motion with the change corrected."""
         m = motion
         if self.whose == "reference":

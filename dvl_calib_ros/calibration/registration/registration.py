@@ -146,7 +146,7 @@ class Registration:
         return {name: clock.delay_s for name, clock in clocks.items() if clock.is_shown}
 
     @property
-    def taken_off(self) -> dict[str, float]:
+    def corrections(self) -> dict[str, float]:
         """Delays (s) that a calibration corrects, by parameter; it estimates a small DVL delay itself."""
         found = {name: round(delay_s, 3) for name, delay_s in self.offsets.items()}
         is_little = found.keys() == {"dvl_time_offset"} and abs(found["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S
@@ -217,7 +217,7 @@ def _registered(
     if moves is None and best.inflation > STEADY:
         moves = _unsteady(motion, curves, lever_arm, rotation_body_from_dvl)
         if moves is not None:
-            found = _registered(moves.steadied(motion), rotation_body_from_dvl, lever_arm, moves)
+            found = _registered(moves.corrected(motion), rotation_body_from_dvl, lever_arm, moves)
             # several delays fit each stretch in waves; a real clock change lowers the total residual
             if found is not None and found.spread < best.level:
                 x = np.zeros(N)

@@ -189,7 +189,7 @@ def test_a_stretch_of_bad_velocities_is_no_clock_that_pushes_it_out_of_the_overl
     """Less was left of the rest there, and 42 s were taken off clocks that were in time."""
     found = register(leg_in_moving_water(0.1, 0), np.eye(3), np.zeros(3))
     assert found is not None
-    assert found.offsets == {} and found.taken_off == {}
+    assert found.offsets == {} and found.corrections == {}
     assert abs(found.dvl.delay_s) < 3.0 and abs(found.reference.delay_s) < 3.0
 
 
@@ -198,7 +198,7 @@ def test_nothing_is_taken_off_where_a_leg_does_not_show_its_clocks(seed):
     """A delay of 115 s was, which no parameter takes."""
     found = register(leg_in_moving_water(0.3, seed), np.eye(3), np.zeros(3))
     assert found is not None
-    assert not found.are_known and found.taken_off == {}
+    assert not found.are_known and found.corrections == {}
     assert max(abs(found.dvl.delay_s), abs(found.reference.delay_s)) <= LONGEST_S
 
 

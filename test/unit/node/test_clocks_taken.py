@@ -33,7 +33,7 @@ class Look:
     late: float
 
     @property
-    def taken_off(self):
+    def corrections(self):
         return {"reference_time_offset": self.late}
 
     def clock_reason(self, name: str) -> Reason:
