@@ -94,10 +94,8 @@ class BlockSolver:
 
     def outcome(self, has_rows: bool = False) -> Outcome:
         """Return the results of all blocks so far. has_rows: whether any reference has been used."""
-        fit = self.fit
-        counts = ModelCounts(
-            fit.used, fit.gated + self._spikes, fit.mean_misfit, mean_rows=3.0, restarted=self.restarted
-        )
+        fit, gated = self.fit, self.fit.gated + self._spikes
+        counts = ModelCounts(fit.used, gated, fit.mean_misfit, mean_rows=3.0, restarted=self.restarted)
         return Outcome(tuple(fit.states), counts, self._claims, has_rows)
 
     def suggestion(self, *, fresh: bool = True) -> Reason | None:
