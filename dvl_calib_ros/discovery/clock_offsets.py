@@ -123,7 +123,7 @@ def _find_in_recording(
             return None if nothing is None else FoundClocks(nothing, {}, parameters, far)
         mounting = rotation.T if knows_mounting or is_first else None
         found = register(motion, mounting, np.array(hypothesis.lever_arm))
-        if found is not None and (best is None or found.left < CLEARLY * best[0].left):
+        if found is not None and (best is None or found.residual < CLEARLY * best[0].residual):
             best, epoch_ns, residual = (found, hypothesis), motion.epoch_ns, _residual_without_noise(found, motion)
         if is_first and found is not None and _residual_without_noise(found, motion) < REGISTERED:
             recording.register_as(found, topics, parameters)
@@ -140,7 +140,7 @@ def _find_in_recording(
 def _residual_without_noise(found: Registration, motion: MotionStreams) -> float:
     """Return the residual of a registration without the reference's noise, as a share of the speed."""
     noise = 3.0 * white_noise(motion.reference) / max(found.speed, 1e-9) ** 2
-    return math.sqrt(max(found.left**2 - noise, 0.0))
+    return math.sqrt(max(found.residual**2 - noise, 0.0))
 
 
 def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Parameters]:
@@ -200,7 +200,7 @@ def difference_of(dvl: Look, reference: Look) -> float | None:
     if motion is None:
         return None
     found = Readings(motion, np.zeros(3)).agreements([Reading(VelocityFrame.BODY.value, None, False)], None)
-    return found[0].best_left if found else None
+    return found[0].best_residual if found else None
 
 
 def compared_motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStreams | None:

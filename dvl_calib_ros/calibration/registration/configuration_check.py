@@ -132,10 +132,10 @@ def fitting_configuration(
         directions.add((motion.dvl.velocity @ nominal.T)[known], rotation[known])
         if directions.turn_with_heading:
             return finding("DVL_TURNS_WITH_HEADING")
-    curves = Curves(motion)
-    as_given = 1.0
+    curves, as_given = Curves(motion), 1.0
     if given is not None:
-        as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
+        angle = _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std)
+        as_given = _with_turn(given.residual, given.scale, angle)
     if as_given < WRONG_FROM:
         assert given is not None
         return wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes, SIGNS)
@@ -154,8 +154,8 @@ def fitting_configuration(
     if not found:
         return None
     # of two similar fits the configured frame is likelier
-    best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
-    if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
+    best = min(found, key=lambda frame: found[frame].residual * (math.sqrt(0.5) if frame is declared else 1.0))
+    if found[best].residual > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
     wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
@@ -181,13 +181,13 @@ def nearest(
     return best
 
 
-def misfit(one: Fitted, nominal: Array, left: float | None = None) -> float:
+def misfit(one: Fitted, nominal: Array, residual: float | None = None) -> float:
     """Return the misfit with a mounting (3, 3) as a share of the speed; a rotation beyond misalignment counts.
 
-    left: residual share to use instead of the fit's own.
+    residual: share to use instead of the fit's own.
     """
     turned = _shown_turn(one.rotation_body_from_dvl, nominal, one.std[TURN])
-    return _left(one.left if left is None else left, float(one.x[SCALE]), turned)
+    return _with_turn(one.residual if residual is None else residual, float(one.x[SCALE]), turned)
 
 
 def _shown_turn(rotation: Array, nominal: Array, std: Array) -> float:
@@ -196,10 +196,10 @@ def _shown_turn(rotation: Array, nominal: Array, std: Array) -> float:
     return float(np.linalg.norm(np.maximum(about - Z_ONE_TEST * std, 0.0)))
 
 
-def _left(left: float, scale: float, turned: float) -> float:
+def _with_turn(residual: float, scale: float, turned: float) -> float:
     """Return the residual share, increased by rotation (rad) and scale if they exceed a misalignment."""
     is_misalignment = turned < MISALIGNED and abs(scale) < SCALED
-    return left if is_misalignment else math.hypot(left, 2.0 * math.sin(0.5 * turned), scale)
+    return residual if is_misalignment else math.hypot(residual, 2.0 * math.sin(0.5 * turned), scale)
 
 
 def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame) -> MotionStreams:

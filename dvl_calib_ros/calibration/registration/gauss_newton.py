@@ -108,7 +108,7 @@ class Fitted(NamedTuple):
         return float(_robust(self.squares[np.searchsorted(self.at, among)], self.axes, level).sum())
 
     @property
-    def left(self) -> float:
+    def residual(self) -> float:
         """Residual as a share of the speed."""
         return self.level * math.sqrt(3.0) / max(self.speed, 1e-9)
 

@@ -96,7 +96,7 @@ class Registration:
     and the reference is assumed synchronised. are_known: the data determine the delays.
 
     rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: DVL from the reference point,
-    body frame. scale, scale_std: DVL scale error, dimensionless. left: residual as a share of the speed; spread:
+    body frame. scale, scale_std: DVL scale error, dimensionless. residual: as a share of the speed; spread:
     residual per axis, m/s; speed: RMS, m/s. unsteady: clock drift or step; all other fields hold after its correction.
 
     open_std_s: σ (s) of the reference delay from the data alone. open_by: (7,) derivatives of the DVL's rotation (rad,
@@ -115,7 +115,7 @@ class Registration:
     lever_arm_std: Array
     scale: float
     scale_std: float
-    left: float
+    residual: float
     spread: float
     speed: float
     open_std_s: float
@@ -308,7 +308,7 @@ def _explained(
         lever_arm_std=std[ARM],
         scale=float(x[SCALE]),
         scale_std=float(std[SCALE]),
-        left=best.left,
+        residual=best.residual,
         spread=best.level,
         speed=best.speed,
         next_worse=next_worse,
