@@ -134,7 +134,7 @@ def test_values_that_no_data_support_are_marked_where_the_mounting_is_printed(ba
         (lambda run, to: dc.simulate(to, seconds="long"), "expected a number"),
         (lambda run, to: run.correct([1.0, 2.0]), "expected (..., 3)"),
         (lambda run, to: run.correct("abc"), "velocity_dvl"),
-        (lambda run, to: run.correct(np.zeros((2, 3)), np.zeros((4, 3))), "(4, 3); expected (2, 3)"),
+        (lambda run, to: run.correct(np.zeros((2, 3)), np.zeros((4, 3))), "(4, 3); velocity_dvl has (2, 3)"),
     ],
 )  # fmt: skip
 def test_a_wrong_argument_is_refused_with_what_is_expected(calibration, tmp_path, call, expected):
