@@ -125,7 +125,7 @@ def simulate(
     target, made = Path(bag), scenario or _scenario(scenario_fields)
     if effects is not None:
         if not isinstance(effects, Mapping):
-            raise InputError("simulate: effects are by name, such as {'lever_arm': {'x_m': 0.5}}")
+            raise InputError("simulate: give effects by name, such as {'lever_arm': {'x_m': 0.5}}")
         made = with_values(made, effects=tuple(injection_of(name, given) for name, given in effects.items()))
     write_bag(made, target, Storage.MCAP, Compression.NONE, with_truth=True)
     return target

@@ -33,7 +33,7 @@ def storage_and_compression(storage: str, compression: str) -> tuple[Storage, Co
         return Storage(storage), Compression(compression)
     except ValueError as error:
         known = (", ".join(each.value for each in kind) for kind in (Storage, Compression))
-        raise InputError("{}; storage is one of {}; compression of {}".format(error, *known)) from None
+        raise InputError("{}; storage is one of {}; compression is one of {}".format(error, *known)) from None
 
 
 def as_paths(bags: Bags) -> list[Path]:

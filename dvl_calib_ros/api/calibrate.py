@@ -146,7 +146,7 @@ def fleet(
     dask: str = "",
     **parameters: Any,
 ) -> Fleet:
-    """Calibrate all recordings below some places into a catalogue, as ``dvl-calib fleet``.
+    """Calibrate all recordings in the given places into a catalogue, as ``dvl-calib fleet``.
 
     Parameters
     ----------

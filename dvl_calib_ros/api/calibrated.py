@@ -211,7 +211,7 @@ class Calibration:
             return velocity
         turning = _vectors("angular_velocity", angular_velocity)
         if turning.shape not in ((3,), measured.shape):
-            raise InputError(f"angular_velocity: shape {turning.shape}; expected {measured.shape}, as of velocity_dvl")
+            raise InputError(f"angular_velocity: shape {turning.shape}; velocity_dvl has {measured.shape}")
         return velocity - np.cross(turning, self.mounting.xyz_m)
 
     def tables(self) -> dict[str, pandas.DataFrame]:

@@ -20,7 +20,7 @@ from .batches import BagMessage, Batch, batched, one_batch
 from .channels import Channel, Decoder, DecodingError
 from .files import ZSTD_MAGIC, files_of
 from .salvage.damage import LARGEST_RECORD
-from .sources import DAMAGE, Source, open_source, said
+from .sources import DAMAGE, Source, message_of, open_source
 
 if sys.version_info >= (3, 14):
     from compression import zstd
@@ -155,7 +155,7 @@ class BagReader:
         except DAMAGE as error:
             if not source.damage_noted:
                 self.notes.append(
-                    f"{source.path}: damaged ({said(error)}); read {read} whole messages, "
+                    f"{source.path}: damaged ({message_of(error)}); read {read} whole messages, "
                     f"{1e-9 * (newest_ns - start_ns):.1f} s"
                 )
         if lost:

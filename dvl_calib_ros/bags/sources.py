@@ -200,7 +200,7 @@ def _opened(
     try:
         source, why = by_index(path, shown, notes), ""
     except DAMAGE as error:
-        source, why = None, said(error)
+        source, why = None, message_of(error)
     return _in_ros2(source or _open_salvaged(path, shown, salvage, why, notes))
 
 
@@ -265,7 +265,7 @@ def _open_salvaged(path: Path, shown: Path, salvage: Salvage, why: str, notes: l
             in_order = in_order and log_ns >= last_ns
             first_ns, last_ns = min(first_ns, log_ns), max(last_ns, log_ns)
     except DAMAGE as error:
-        damage = said(error)
+        damage = message_of(error)
     total = counts.total()
     if not total and (damage or why):
         raise InputError(f"{shown}: damaged, and no whole message in it ({damage or why}); use another recording")
@@ -310,7 +310,7 @@ def _salvaging_after_damage(batches: Batches, path: Path, salvage: Salvage, coun
                 raise DamagedError(f"it announces {announced} messages, its index leads to {read}")
         except DAMAGE as error:
             damage, found = yield from _unread_messages(salvage(path), topics, _AlreadyRead(batches(topics), read))
-            raise DamagedError(damage or said(error), max(announced - read - found, 0)) from error
+            raise DamagedError(damage or message_of(error), max(announced - read - found, 0)) from error
 
     return all_batches
 
@@ -356,13 +356,13 @@ def _unread_messages(
                     yield message
         # salvaging does not see the index's messages, so its own count of lost ones is too high
         except DAMAGE as error:
-            damage = error.what if isinstance(error, DamagedError) else said(error)
+            damage = error.what if isinstance(error, DamagedError) else message_of(error)
 
     yield from batched(by_log_time(others()))
     return damage, found
 
 
-def said(error: Exception) -> str:
+def message_of(error: Exception) -> str:
     """Return an error of `DAMAGE` as text."""
     return str(error) if isinstance(error, DamagedError) else f"{type(error).__name__}: {error}"
 

@@ -98,7 +98,7 @@ class Calibrator:
         self._models = tuple(name for name in MODELS if name in models)
         # without positions the position model is not reported
         unknown = () if are_positions(parameters) else (POSITIONS.name,)
-        self._told = tuple(name for name in self._models if name not in unknown)
+        self._reported_models = tuple(name for name in self._models if name not in unknown)
         check_model(parameters)
         self._initial = initial
         self._block_size = block_size
@@ -350,12 +350,12 @@ class Calibrator:
 
     @property
     def first_ns(self) -> int | None:
-        """Stamp of the first DVL sample in order; None before."""
+        """Stamp of the first DVL sample, of those sorted by stamp; None before it."""
         return self._aligner.first_ns
 
     @property
     def last_ns(self) -> int | None:
-        """Stamp of the newest DVL sample in order; None before the first."""
+        """Stamp of the newest DVL sample, of those sorted by stamp; None before the first."""
         return self._aligner.last_ns
 
     @property
@@ -473,7 +473,7 @@ class Calibrator:
             selected=self.selected,
             iac_model=self.selection.iac_model(self.parameters),
             selected_because=self.selection.reason(self.parameters),
-            estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._told},
+            estimates={name: self._estimates.without_tilt(self.estimate(name)) for name in self._reported_models},
             segments=tuple(self.selection.segments),
             counts=self.counts,
             first_ns=self.first_ns,
@@ -489,7 +489,7 @@ class Calibrator:
     def _verifications(self, doubts: Sequence[Reason]) -> dict[str, Verification]:
         """Return verdicts by model; live, only of the selected model, with all reasons against it."""
         if self._verified:
-            return {name: self.verification(name) for name in self._told}
+            return {name: self.verification(name) for name in self._reported_models}
         if self._worker is None:
             return {}
         verification = self._judge.so_far(self.selected, fresh=True)

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
     written = "urdf" if arguments.output is None else "output"
     common.check_outputs(arguments, written, "params", "launch", "fusion", "settings")
     if arguments.instrument is None and (arguments.now or arguments.settings or arguments.send):
-        raise InputError("--now, --settings and --send go with --instrument; name that, too")
+        raise InputError("--now, --settings and --send need --instrument")
     if arguments.instrument is not None and (targets.paths or arguments.rollback):
         raise InputError(
             "--instrument corrects the error at its source; with --urdf, --params, --launch or --fusion the DVL "

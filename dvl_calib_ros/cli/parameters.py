@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Print the requested table."""
     if arguments.joint is not None and arguments.urdf is None:
-        raise InputError("--joint goes with --urdf; name that, too")
+        raise InputError("--joint needs --urdf")
     if arguments.effects:
         from ..effects.registry import effect_table
 

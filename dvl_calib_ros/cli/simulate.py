@@ -244,12 +244,12 @@ def check(arguments: argparse.Namespace, defaults: argparse.Namespace) -> None:
         if arguments.output is None:
             raise InputError("name a bag to write, or publish with --live")
         if arguments.follow is not None:
-            raise InputError("--follow goes with --live")
+            raise InputError("--follow needs --live")
         return
     if arguments.output is not None:
         raise InputError(f"{arguments.output}: --live publishes and writes no bag; leave the name out")
     if arguments.truth:
-        raise InputError("--truth goes with a bag; leave it out, or --live")
+        raise InputError("--truth needs a bag, and --live writes none; leave one of them out")
     if not SPEEDS[0] <= arguments.speed <= SPEEDS[1]:
         raise InputError(f"--speed: {arguments.speed:g} is outside {SPEEDS[0]:g} .. {SPEEDS[1]:g}")
     if arguments.follow is not None:

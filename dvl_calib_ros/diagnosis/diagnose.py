@@ -166,8 +166,8 @@ def _check_bounds(selection: EffectSelection) -> None:
         if isinstance(each.effect, ClockEffect) and abs(value) >= 0.999 * spec.high:
             name = selection.fitter.problem.recordings[each.recording or 0].name
             raise InputError(
-                f"{name}: {each.effect.name} comes out at {value:+.3g} {spec.unit}, the end of what can be diagnosed "
-                "and taken off: set that clock right, or take the times of recording (--restamp log)"
+                f"{name}: {each.effect.name} comes out at {value:+.3g} {spec.unit}, the largest that can be diagnosed "
+                "and subtracted: set that clock, or use the recording times (--restamp log)"
             )
 
 

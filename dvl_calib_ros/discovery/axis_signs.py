@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..calibration.models.parameters import FLU, FRD, Parameters
-from ..calibration.numerics.block_covariance import of_few
+from ..calibration.numerics.block_covariance import student_factor
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.robust import robust_std
-from ..calibration.numerics.tests import BY_CHANCE
+from ..calibration.numerics.tests import Z_ONE_TEST
 from ..calibration.registration.configuration_check import Directions
 from ..calibration.registration.frame_hypotheses import ImuFrame
 from ..calibration.streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
@@ -55,7 +55,7 @@ class SwaySign(NamedTuple):
         """1 or -1 if significant, else 0."""
         if self.turns < FEWEST_TURNS:
             return 0
-        least = BY_CHANCE * float(of_few(np.array(self.turns - 1.0))) * self.std
+        least = Z_ONE_TEST * float(student_factor(np.array(self.turns - 1.0))) * self.std
         return int(np.sign(self.slope)) if abs(self.slope) > least else 0
 
 

@@ -59,7 +59,7 @@ class FoundClocks:
             return self.far.reason
         moves = self.registration.unsteady
         is_left = moves is not None and not MOVING & self.offsets.keys()
-        return moves.reason if moves is not None and is_left else self.registration.not_told_apart
+        return moves.reason if moves is not None and is_left else self.registration.ambiguity
 
     def says(self) -> Iterator[str]:
         """Yield one sentence per clock with an offset: its delay, and the treatment."""
@@ -73,13 +73,13 @@ class FoundClocks:
             elif name == "dvl_time_offset" and abs(late) < LEFT_TO_CALIBRATION_S:
                 done = "left to the calibration, which estimates it"
             else:
-                done = "not taken off"
+                done = "not subtracted"
             which = "" if r.is_turned or name != "reference_time_offset" else ", or the DVL's as much early"
-            yield f"{r.told(name).says}{which}: {done}"
+            yield f"{r.clock_reason(name).says}{which}: {done}"
         if r.apart.is_shown and not (r.offsets or self.doubt):
             yield (
-                f"stamps of DVL and reference differ by {abs(r.apart.late):.2f} ± {r.apart.std:.2f} s; the data do "
-                f"not show whose clock is wrong: drive turns at two speeds"
+                f"stamps of DVL and reference differ by {abs(r.apart.delay_s):.2f} ± {r.apart.std:.2f} s; it is "
+                f"unknown whose clock is wrong: drive turns at two speeds"
             )
 
 
@@ -123,7 +123,7 @@ def _find_in_recording(
             return None if nothing is None else FoundClocks(nothing, {}, parameters, far)
         mounting = rotation.T if knows_mounting or is_first else None
         found = register(motion, mounting, np.array(hypothesis.lever_arm))
-        if found is not None and (best is None or found.left < CLEARLY * best[0].left):
+        if found is not None and (best is None or found.residual < CLEARLY * best[0].residual):
             best, epoch_ns, residual = (found, hypothesis), motion.epoch_ns, _residual_without_noise(found, motion)
         if is_first and found is not None and _residual_without_noise(found, motion) < REGISTERED:
             recording.register_as(found, topics, parameters)
@@ -131,16 +131,16 @@ def _find_in_recording(
     if best is None or residual >= REGISTERED:
         return None
     registration, hypothesis = best
-    offsets = {} if given.intersection(OFFSETS) else registration.taken_off
+    offsets = {} if given.intersection(OFFSETS) else registration.corrections
     if registration.unsteady is not None and not given & MOVING:
-        offsets |= registration.unsteady.taken_off(epoch_ns)
+        offsets |= registration.unsteady.corrections(epoch_ns)
     return FoundClocks(registration, offsets, hypothesis)
 
 
 def _residual_without_noise(found: Registration, motion: MotionStreams) -> float:
     """Return the residual of a registration without the reference's noise, as a share of the speed."""
     noise = 3.0 * white_noise(motion.reference) / max(found.speed, 1e-9) ** 2
-    return math.sqrt(max(found.left**2 - noise, 0.0))
+    return math.sqrt(max(found.residual**2 - noise, 0.0))
 
 
 def _hypotheses(parameters: Parameters, given: frozenset[str]) -> Iterator[Parameters]:
@@ -173,15 +173,14 @@ def _one_per_interval(block: SampleBlock) -> SampleBlock:
     return block.part(np.flatnonzero(np.diff(bins, prepend=-1)))
 
 
-def in_time(recording: Recording, topics: Topics, found: Registration) -> Survey:
-    """Return the three streams with stamps of the IMU's clock."""
+def on_imu_clock(recording: Recording, topics: Topics, found: Registration) -> Survey:
+    """Return the previewed streams with their stamps corrected to the IMU's clock by a registration."""
     seen = recording.whole(topics)
-    late = {topics.dvl: found.dvl.late, topics.gnss: found.reference.late}
-    if not found.is_turned:
-        late = {topics.dvl: found.apart.late}
-    # the clock offset by arrival times no longer applies
+    delays_s = {topics.dvl: found.dvl.delay_s, topics.gnss: found.reference.delay_s}
+    if not found.is_turned:  # without turns only the delay between DVL and reference is observable
+        delays_s = {topics.dvl: found.apart.delay_s}
     looks = {
-        name: replace(look, stamps_s=look.stamps_s - late.get(name, 0.0), ahead_s=0.0)
+        name: replace(look, stamps_s=look.stamps_s - delays_s.get(name, 0.0), ahead_s=0.0)
         for name, look in seen.looks.items()
     }
     if topics.dvl in looks:
@@ -201,7 +200,7 @@ def difference_of(dvl: Look, reference: Look) -> float | None:
     if motion is None:
         return None
     found = Readings(motion, np.zeros(3)).agreements([Reading(VelocityFrame.BODY.value, None, False)], None)
-    return found[0].best_left if found else None
+    return found[0].best_residual if found else None
 
 
 def compared_motion(dvl: Look, reference: Look, imu: Look | None) -> MotionStreams | None:

@@ -37,7 +37,7 @@ from ..recordings.topics import NONE, ORIENTATION, Topics
 from ..verdict.reasons import Reason, finding
 from . import topic_choice
 from .axis_signs import sign_findings
-from .clock_offsets import compared_motion, difference_of, in_time
+from .clock_offsets import compared_motion, difference_of, on_imu_clock
 from .discovery import (
     Discovery,
     Given,
@@ -87,7 +87,7 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
         return found
     if clocks.registration.offsets:
         # finding frames needs velocities of the same time
-        seen = in_time(recording, found.topics, clocks.registration)
+        seen = on_imu_clock(recording, found.topics, clocks.registration)
         seen = replace(seen, topics=recording.survey.topics, counts=recording.survey.counts)
         topics = found.topics
         imu = topics.imu if topics.imu in seen.topics else named.imu_topic
@@ -370,7 +370,7 @@ class _Search:
         if placed is not None and placed.source:
             return True
         fit = self._chosen  # a reference in the body frame agrees regardless of the IMU
-        return fit is not None and not fit.reading.in_body and fit.best_left < FITS
+        return fit is not None and not fit.reading.in_body and fit.best_residual < FITS
 
     def _fit(
         self,
@@ -404,7 +404,7 @@ class _Search:
             declared = declared.in_base(FRD if self._is_z_down else FLU)
         taken = DECLARED_FRAMES[reading.reference]
         # without an attitude only the body frame could be tried
-        if imu is None and declared is None and chosen.best_left >= FITS:
+        if imu is None and declared is None and chosen.best_residual >= FITS:
             self._notes.append(finding("REFERENCE_FRAME_NOT_TOLD", topic=reference.topic))
         elif taken != declared:
             name = self._values["gnss_frame"] = taken.name
@@ -418,30 +418,30 @@ class _Search:
                 self._contradictions.append(finding("REFERENCE_FRAME_OTHER", topic=reference.topic, **frame))
         elif declared is not None and parameters.gnss_frame == FROM_FRAME_ID and "base_frame" in self._values:
             self._values["gnss_frame"] = declared.name
-        if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_left < FITS:
-            residual = self._readings.registered(reading, np.eye(3)).left
-            turned_left, rotation, *_ = self._readings.registered(reading, None)
-            if self._readings.beside_noise(turned_left) < CLEARLY * self._readings.beside_noise(residual):
+        if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < FITS:
+            residual = self._readings.registered(reading, np.eye(3)).residual
+            turned_residual, rotation, *_ = self._readings.registered(reading, None)
+            if self._readings.without_noise(turned_residual) < CLEARLY * self._readings.without_noise(residual):
                 agree = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)
                 # a roll that is hardly observable on a level vehicle is set to zero, unless the data need it
                 level = (0.0, *rpy[1:])
                 level_left, *_ = self._readings.registered(reading, rotation_from_rpy(level).T)
-                self._mounting_found(level if BETTER * level_left <= turned_left else rpy, agree)
+                self._mounting_found(level if BETTER * level_left <= turned_residual else rpy, agree)
 
     def _measure_noise(self, chosen: Agreement, known: Array | None, dvl: Look, reference: Look) -> None:
         """Set the noise of a reference that claims none, far too little, or more than its velocities show."""
         if self._is_given("gnss_aided_std") or self._is_given("use_message_covariance"):
             return
         says_nothing = "use_message_covariance" in self._values
-        if self._readings.beside_noise(chosen.best_left) > FITS:
+        if self._readings.without_noise(chosen.best_residual) > FITS:
             return
         is_position = VELOCITY_TYPES[reference.msgtype].position is not None
         measured_std = math.sqrt(white_noise(reference.values)) if reference.rate_hz > WHITE_FROM_HZ else 0.0
         too_little = not is_position and measured_std > CLAIMS_TOO_LITTLE * reference.claimed_std
         # part of it is due to lever arm and delay, which are estimated later
-        least = 0.5 * chosen.best_left
+        least = 0.5 * chosen.best_residual
         per_axis = dvl.speed / (math.sqrt(3.0) * TRIMMED)
         claims = [reference.claimed_std] if is_position else [reference.claimed_std, dvl.claimed_std]
         claimed = math.hypot(*np.nan_to_num(claims))  # both are part of the predicted residual
@@ -453,7 +453,7 @@ class _Search:
         ):
             return
         best, *_ = self._readings.registered(chosen.reading, None if known is None else known.T)
-        shown = max(max(min(best, chosen.best_left), least) * per_axis, QUIETEST)
+        shown = max(max(min(best, chosen.best_residual), least) * per_axis, QUIETEST)
         too_much = may_claim_less and most > shown
         if not (too_much or too_little or claims_none or says_nothing):
             return

@@ -117,11 +117,11 @@ class _Tried:
         return self.agreement.reading
 
     @property
-    def left(self) -> float:
+    def residual(self) -> float:
         """Residual as a share of the speed, without the part that a misalignment explains."""
         of_best, known = self.agreement.rotation_dvl_from_body, self.mounting
         is_misaligned = known is not None and angle_between(of_best, known) < TURNED_FROM
-        return self.agreement.best_left if is_misaligned else self.agreement.left
+        return self.agreement.best_residual if is_misaligned else self.agreement.residual
 
     def odds(self, found: Array) -> float:
         """Return the log prior including travel direction and, if no mounting is known, the fitted mounting (3, 3)."""
@@ -299,7 +299,7 @@ class FrameChooser:
                 if angle_between(each.rotation_dvl_from_body, mounting) > TURNED_FROM
             ]
         first = {
-            each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.left)
+            each: each.odds(each.agreement.rotation_dvl_from_body) + readings.log_likelihood(each.residual)
             for each in tried
         }
         ranked = sorted(tried, key=lambda each: -first[each])
@@ -319,10 +319,10 @@ class FrameChooser:
         odds = {
             each: each.odds(fit.rotation_dvl_from_body)
             + (_arm_odds(fit) if arm_is_known else 0.0)
-            + readings.log_likelihood_registered(fit.left)
+            + readings.log_likelihood_registered(fit.residual)
             for each, fit in fits.items()
         }
-        if math.inf in (fit.left for fit in fits.values()):  # a failed registration is no evidence against a reading
+        if math.inf in (fit.residual for fit in fits.values()):  # a failed registration is no evidence
             odds = first
             turns = {each: each.agreement.rotation_dvl_from_body for each in fits}
             fits = {each: fit._replace(rotation_dvl_from_body=turns[each]) for each, fit in fits.items()}
@@ -424,12 +424,12 @@ def twist_axes(look: Look) -> str | None:
     moved = (place[after] - place[before]) / seconds
     steps = np.diff(times, prepend=times[0])[:, None]
 
-    def left(seen: Array) -> float:
+    def residual(seen: Array) -> float:
         way = np.cumsum(0.5 * steps * (seen + np.roll(seen, 1, axis=0)), axis=0)
         return float(np.sqrt((((way[after] - way[before]) / seconds - moved) ** 2).sum(axis=1).mean()))
 
     turned = {each: np.einsum("nij,nj->ni", rotation, velocity @ axes) for each, axes in _BODY_AXES.items()}
-    tried = {name: left(seen) for name, seen in {**turned, "enu": velocity, "ned": velocity @ ENU_FROM_NED}.items()}
+    tried = {name: residual(seen) for name, seen in {**turned, "enu": velocity, "ned": velocity @ ENU_FROM_NED}.items()}
     best, second = sorted(tried, key=tried.__getitem__)[:2]
     if tried[best] > FITS * look.speed or tried[best] > CLEARLY * tried[second]:
         return None

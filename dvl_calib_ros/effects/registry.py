@@ -94,7 +94,7 @@ def _plugged_in(point: EntryPoint) -> AnyEffect:
         _check_stage(effect)
     except Exception as error:  # any fault of a foreign package
         raise InputError(
-            f"{_named(point)}: cannot be used ({type(error).__name__}: {error}); mend or uninstall that package"
+            f"{_named(point)}: cannot be used ({type(error).__name__}: {error}); repair or uninstall that package"
         ) from error
     return effect
 

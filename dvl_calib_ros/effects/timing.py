@@ -100,7 +100,7 @@ class ReferenceTimeOffset(ClockEffect):
     confounded_with = ("dvl_time_offset", "reference_lag", "attitude_time_offset", "sideslip", "lever_arm")
 
     def trace(self, motion: EffectInput, values: Mapping[str, float]) -> Array:
-        """Return g(t) - g(t - τ), in the frame in which the reference was recorded, rotated to the body."""
+        """Return g(t) - g(t - τ) of the reference velocity g in its recorded frame, rotated to the body."""
         reference = _in_reference_frame(motion, motion.velocity_body)
         late = self.late(motion.elapsed, values)
         return _in_body(motion, reference - delayed(motion.time, reference, late))

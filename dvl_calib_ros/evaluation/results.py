@@ -254,16 +254,16 @@ class Evaluation(Answering):
         return (UNCALIBRATED, *self.models)
 
     def best(self, values: Array) -> dict[str, tuple[str, float]]:
-        """Return name and smallest of values (C,) among the models with GNSS, and among those without, if any."""
+        """Return, "with GNSS" and "without GNSS", the name and value of the model with the smallest of values (C,)."""
         found = {
-            words: [
+            aiding: [
                 (name, float(value))
                 for name, value in zip(self.columns, values, strict=True)
                 if name in MODELS and MODELS[name].aided == aided and np.isfinite(value)
             ]
-            for words, aided in (("with GNSS", True), ("without GNSS", False))
+            for aiding, aided in (("with GNSS", True), ("without GNSS", False))
         }
-        return {words: min(each, key=lambda pair: pair[1]) for words, each in found.items() if each}
+        return {aiding: min(each, key=lambda pair: pair[1]) for aiding, each in found.items() if each}
 
     def of_models(self, values: Array) -> Array:
         """Select the models' part (..., M) of values (..., C)."""

@@ -360,9 +360,9 @@ def _disagreement(discovery: Discovery, noise: float) -> list[Reason]:
 
     noise: of the reference per axis, as a share of the speed.
     """
-    if discovery.agreement is None or discovery.agreement.best_left**2 - 3.0 * noise**2 < FITS**2:
+    if discovery.agreement is None or discovery.agreement.best_residual**2 - 3.0 * noise**2 < FITS**2:
         return []
-    return [finding("DOCTOR_DISAGREE", left=discovery.agreement.best_left)]
+    return [finding("DOCTOR_DISAGREE", left=discovery.agreement.best_residual)]
 
 
 _NAMES = ("roll", "pitch", "yaw", "scale")

@@ -110,7 +110,7 @@ class CalibratedMounting:
     def check_applicable(self, force: bool) -> None:
         """Raise InputError for a calibration with objections, unless force is set."""
         if self.objections and not force:
-            raise InputError(f"{self.path}: {'; '.join(self.objections)}; to apply it all the same: --force")
+            raise InputError(f"{self.path}: {'; '.join(self.objections)}; to apply it anyway: --force")
 
     @property
     def static_transform(self) -> str:
@@ -156,7 +156,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         raise InputError(f"{path}: its mounting does not follow from its states; was it changed by hand? save it again")
     if parameters.dvl_frame not in ("", frames[1]):
         raise InputError(
-            f"{path}: its mounting is of {frames[1]!r}, its parameters of {parameters.dvl_frame!r}; save it again"
+            f"{path}: mounting is for frame {frames[1]!r}, parameters for {parameters.dvl_frame!r}; save it again"
         )
     doubts += _unobservable(model, state, parameters)
     delay = scale_and_delay(model, state, parameters).time_offset
@@ -237,7 +237,7 @@ def calibrated_urdf(
             f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(now))} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with mounting_rpy "
             f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
-            "or write the calibrated one all the same with --force"
+            "or write the calibrated one anyway with --force"
         )
     began_at = np.array(calibrated.parameters.lever_arm) + calibrated.parameters.reference_position
     if not is_there and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
@@ -273,7 +273,7 @@ def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: boo
             raise InputError(
                 f"{path}: sets {name} to {as_yaml(in_file.as_dict()[name])}, but {calibrated.path} began with "
                 f"{as_yaml(calibrated.parameters.as_dict()[name])}; calibrate with the file's, or write the calibrated "
-                "one all the same with --force"
+                "one anyway with --force"
             )
     return with_parameters(path, values)
 
@@ -434,7 +434,7 @@ class Targets:
 
     def __post_init__(self) -> None:
         if self.urdf is None and (self.output is not None or self.joint is not None or self.keep_position):
-            raise InputError("--output, --joint and --keep-position go with --urdf; name that, too")
+            raise InputError("--output, --joint and --keep-position need --urdf")
 
     @property
     def paths(self) -> list[Path]:

@@ -15,7 +15,7 @@ from ..disk.atomic import backups_of, own_stream
 from ..errors import InputError
 
 # files that SQLite keeps next to a recording
-_BESIDE = ("-wal", "-shm", "-journal")
+_SQLITE_SUFFIXES = ("-wal", "-shm", "-journal")
 _RECORDED = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 
 
@@ -66,7 +66,7 @@ class _Written:
     def hits(self, path: Path) -> bool:
         """Return whether this output would change an input."""
         real = os.path.realpath(path)
-        read = {os.path.realpath(f"{name}{end}") for name in (path, real) for end in ("", *_BESIDE)}
+        read = {os.path.realpath(f"{name}{end}") for name in (path, real) for end in ("", *_SQLITE_SUFFIXES)}
         if not {_entry(name) for name in read}.isdisjoint(map(_entry, self.places)):
             return True
         if self.files and not self.files.isdisjoint(_identities(read)):

@@ -386,7 +386,7 @@ def load_result(path: Path, of_recording: bool = False) -> tuple[dict[str, Any],
     known_as = content.get("format") if isinstance(content, dict) else None
     if known_as != FORMAT:
         if str(known_as).startswith(_ANY_FORMAT):
-            raise InputError(f"{path}: {known_as!r} is of another version of this software ({FORMAT!r}); update that")
+            raise InputError(f"{path}: {known_as!r} needs another version of this software, not {FORMAT!r}")
         raise InputError(f"{path}: not a result file of this software (no 'format: {FORMAT}')")
     models = content.get("models")
     if not isinstance(models, dict) or not models:
@@ -418,7 +418,7 @@ def _check_says_one_thing(path: Path, content: Mapping[str, Any]) -> None:
         return
     for name, one, other in places:
         if one != other:
-            raise InputError(f"{path}: its {name} is another in two places; was it changed by hand? save it again")
+            raise InputError(f"{path}: its {name} has two different values; was it changed by hand? save it again")
 
 
 def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequence[float] | None) -> None:

@@ -183,7 +183,7 @@ def _stored(place: str) -> _Files:
         found: Mapping[str, Mapping[str, Any]] = store.find(root, detail=True)
     except Exception as error:  # each store has its own errors
         raise InputError(
-            f"{place}: cannot be listed ({type(error).__name__}: {error}); see to address and access"
+            f"{place}: cannot be listed ({type(error).__name__}: {error}); check address and access rights"
         ) from error
     files: dict[str, list[StoredFile]] = {}
     for path, info in sorted(found.items()):

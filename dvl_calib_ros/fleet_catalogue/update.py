@@ -1,4 +1,4 @@
-"""Calibration of every recording below some places into a growing catalogue."""
+"""Calibration of every recording in the given places into a growing catalogue."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class Catalogue:
         except (OSError, KeyError, TypeError, ValueError, self._arrow.ArrowException) as error:
             raise InputError(f"{path}: was not written by this version of dvl-calib fleet") from error
         if path != self._path(part.recording):
-            raise InputError(f"{path}: belongs to {part.recording}, whose part has another name")
+            raise InputError(f"{path}: holds {part.recording}, which belongs in a file of another name")
         return part
 
     def _whole(self, path: Path) -> bytes:

@@ -29,7 +29,7 @@ from ..files.mounting import POSITION_UNKNOWN, CalibratedMounting
 from ..files.urdf import numbers
 
 # smallest remaining angle that is reported, rad
-SAID_FROM = math.radians(0.05)
+REPORTED_FROM_RAD = math.radians(0.05)
 # an autopilot's orientation is a multiple of a quarter turn, within this tolerance (rad)
 QUARTER, NEAR_QUARTER = 0.5 * math.pi, math.radians(20.0)
 # origin of a setting that was not given
@@ -210,7 +210,7 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tupl
             "quarter turns; set the rest in the DVL itself (--instrument waterlinked or cerulean)"
         )
     settings.append(Setting("VISO_ORIENT", now.get("VISO_ORIENT"), float(quarters % 4 * 2)))
-    if abs(off) > SAID_FROM:
+    if abs(off) > REPORTED_FROM_RAD:
         notes.append(
             f"{math.degrees(off):+.2f}° of yaw (clockwise) remain: VISO_ORIENT has only quarter turns. Set them in "
             "the DVL itself (--instrument waterlinked or cerulean)"
@@ -252,7 +252,7 @@ def _is_down(calibrated: CalibratedMounting) -> bool:
 def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
     roll_pitch = np.abs(rpy_from_rotation(swing)[:2])
     notes = ["URDF and parameters stay unchanged: do not write this result into them as well"]
-    if roll_pitch.max() <= SAID_FROM:
+    if roll_pitch.max() <= REPORTED_FROM_RAD:
         return notes
     axes = swing if _is_down(calibrated) else FLU_FROM_FRD @ swing @ FLU_FROM_FRD
     mounting = calibrated.parameters.rotation_dvl_from_body.T @ axes

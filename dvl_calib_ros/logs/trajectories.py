@@ -263,7 +263,7 @@ def import_files(
     if not dvl.is_dir():
         return {output: import_recording(dvl, gnss, attitude, output, options)}
     if gnss is not None or attitude is not None:
-        raise InputError("--gnss and --attitude go with a file; in a folder they are found by their names")
+        raise InputError("--gnss and --attitude need a file; in a folder they are found by their names")
     return import_folder(dvl, output, options)
 
 

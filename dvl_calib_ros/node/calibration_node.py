@@ -373,7 +373,7 @@ class CalibrationNode(AnsweringNode):
         self._estimate_publisher.publish(self._estimate)
 
     def _publish_iac(self) -> None:
-        """Publish the paper's own selection with its filter covariance, at most once a second."""
+        """Publish the model that the paper's criterion (IAC) selects, with its filter covariance."""
         calibrator = self._calibrator
         name = calibrator.selection.iac_model(calibrator.parameters)
         state_of = (name, calibrator.n_given(name))

@@ -64,13 +64,13 @@ class LateClocks:
         if self.stand or registration is None or registration is self._before:
             return None
         before, self._before = self._before, registration
-        late = registration.taken_off
-        if before is None or not late or not _are_alike(before.taken_off, late):
+        late = registration.corrections
+        if before is None or not late or not _are_alike(before.corrections, late):
             return None
         self.stand = True
         taken = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in late.items()}
         self.found = [
-            finding("CLOCK_TAKEN_OFF", clock=registration.told(name), parameter=name, value=seconds)
+            finding("CLOCK_TAKEN_OFF", clock=registration.clock_reason(name), parameter=name, value=seconds)
             for name, seconds in taken.items()
         ]
         return parameters.replace(**taken)
@@ -95,23 +95,23 @@ class Pauses:
     def __init__(self, now_s: float) -> None:
         self._last_s = now_s
         self._paused_s = 0.0
-        self._found: list[tuple[float, float]] = []
+        self._pauses: list[tuple[float, float]] = []
 
     def running_s(self, now_s: float) -> float:
-        """Register that the process runs. Return a clock (s) that excludes the pauses."""
+        """Take a reading of the steady clock, detect a pause before it, and return the time (s) without pauses."""
         gone_s = now_s - self._last_s
         self._last_s = now_s
         if gone_s > PAUSE_S:
             self._paused_s += gone_s
-            self._found.append((now_s - self._paused_s, gone_s))
+            self._pauses.append((now_s - self._paused_s, gone_s))
         return now_s - self._paused_s
 
     def within(self, seconds: float) -> list[float]:
         """Return the lengths (s) of pauses that ended within the last `seconds` of running."""
         running_s = self._last_s - self._paused_s
-        self._found = [each for each in self._found if running_s - each[0] <= seconds]
-        return [length for _, length in self._found]
+        self._pauses = [each for each in self._pauses if running_s - each[0] <= seconds]
+        return [length for _, length in self._pauses]
 
     def forget(self) -> None:
         """Forget all pauses before now."""
-        self._found.clear()
+        self._pauses.clear()

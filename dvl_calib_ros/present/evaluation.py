@@ -94,11 +94,11 @@ def evaluation(e: Evaluation) -> Document:
     uncalibrated = e.set_mean[e.columns.index(UNCALIBRATED)]
     published = e.best(e.published_of_these.mean(axis=0))
     found = [Number(UNCALIBRATED, f"{uncalibrated:.4f} m/s", note=f"Avg.VRMSE, {where}")]
-    for words, (name, value) in e.best(e.set_mean).items():
+    for aiding, (name, value) in e.best(e.set_mean).items():
         note = f"{name}, {100.0 * (1.0 - value / uncalibrated):.0f} % less than uncalibrated"
-        if words in published:
-            note += "; best published: {} with {:.4f} m/s".format(*published[words])
-        found.append(Number(f"best {words}", f"{value:.4f} m/s", note=note))
+        if aiding in published:
+            note += "; best published: {} with {:.4f} m/s".format(*published[aiding])
+        found.append(Number(f"best {aiding}", f"{value:.4f} m/s", note=note))
     return Document(
         title="Evaluation of the DVL calibration models",
         subtitle=e.source,

@@ -25,7 +25,7 @@ SHORT = 20
 # Tables of up to this number of columns break their row names before they are split into more than two.
 FEW = 6
 # two blanks and a line next to a column
-_BESIDE = 3
+_GAP_WIDTH = 3
 
 
 class Folding:
@@ -49,7 +49,7 @@ class Folding:
             names = table.columns[0]  # long names may break, so that more columns are next to each other
             names.no_wrap = False
             broken = (Measurement.get(console, options, cell).minimum for cell in (names.header, *names.cells))
-            groups = _groups(table.columns, [_BESIDE + max(broken), *needed[1:]], width - 1)
+            groups = _groups(table.columns, [_GAP_WIDTH + max(broken), *needed[1:]], width - 1)
         if turned is not None and sum(_keep_short(console, options, column) for column in turned.columns) + 1 <= width:
             yield turned
         elif groups is None:
@@ -67,7 +67,7 @@ def _keep_short(console: Console, options: ConsoleOptions, column: Column) -> in
     widest = max((size.maximum for size in sizes), default=0)
     broken = max((size.minimum for size in sizes), default=0)
     column.no_wrap = column.no_wrap or widest <= SHORT
-    return _BESIDE + (widest if column.no_wrap else max(broken, SHORT))
+    return _GAP_WIDTH + (widest if column.no_wrap else max(broken, SHORT))
 
 
 def _groups(columns: Sequence[Column], needed: Sequence[int], width: int) -> list[list[int]] | None:

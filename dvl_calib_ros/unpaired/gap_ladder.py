@@ -33,7 +33,7 @@ WINDOW_S, PERMUTATIONS = 10.0, 500
 # number of successive residuals per draw of a simulator's noise, to keep its colour
 STRETCH = 8
 # number of simulated references, and of frequency bands, for the colour of a vehicle's noise
-MADE_UP, BANDS = 8, 40
+SIMULATED, BANDS = 8, 40
 # errors are limited to this number of standard deviations: outliers are part of the noise comparison
 FAR = 5.0
 AS_IT_IS, ALL, NOISE = "as it is", "all effects", "all effects, and the vehicle's noise"
@@ -180,7 +180,7 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
 
 def _fold_of(problem: Problem, index: int) -> Array:
     """Return the fold (N,) of each DVL sample of a recording: stretches of time in turn; -1 outside the fit."""
-    time = problem.recordings[index].dvl.time - problem.grids[index].late
+    time = problem.recordings[index].dvl.time - problem.grids[index].delay_s
     of = problem.grids[index].bin_time
     fold = stretch_of(time) % SETTINGS.folds
     inside = (time >= of[0]) & (time <= of[-1]) if len(of) else np.zeros(len(time), dtype=bool)
@@ -188,7 +188,7 @@ def _fold_of(problem: Problem, index: int) -> Array:
 
 
 def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Generator) -> list[Array]:
-    """Return the slow noise (MADE_UP, N, 3) m/s per recording that simulated reference noise adds to the DVL.
+    """Return the slow noise (SIMULATED, N, 3) m/s per recording that simulated reference noise adds to the DVL.
 
     Fast reference noise is excluded, because `with_quiet_reference` subtracts it.
     """
@@ -200,7 +200,7 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
                 recordings=tuple(replace(one, reference=one.reference.shaken(rng)) for one in problem.recordings),
             )
         )
-        for _ in range(MADE_UP)
+        for _ in range(SIMULATED)
     ]
     return [
         np.stack([simulated(each, hypothesis, index) for each in noisy]) - simulated(quiet, hypothesis, index)

@@ -189,17 +189,17 @@ CONFIGURATIONS = on_page(
     reject(
         "CLOCKS_NOT_TOLD_APART",
         "the stamps of DVL and reference differ by {seconds:.2f} ± {std:.2f} s; it is unknown whose clock is wrong",
-        remedy="set the clocks by one source, or drive turns at two speeds",
+        remedy="synchronise the clocks, or drive turns at two speeds",
     ),
     reject(
         "CLOCK_DRIFTS",
         "{whose} clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
-        remedy="set the clocks by one source",
+        remedy="synchronise the clocks",
     ),
     reject(
         "CLOCK_DRIFTS_DVL",
         "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
-        remedy="set the clocks by one source, or dvl_clock_drift to {drift:.2g}",
+        remedy="synchronise the clocks, or dvl_clock_drift to {drift:.2g}",
     ),
     reject(
         "CLOCK_LEAPS",
@@ -210,7 +210,7 @@ CONFIGURATIONS = on_page(
         "CLOCK_FAR",
         "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be estimated and "
         "subtracted",
-        remedy="set that clock right; this recording: --restamp log (recording times)",
+        remedy="set that clock; to use the recording times of this bag instead: --restamp log",
     ),
     # declarations of a recording
     reject(
@@ -250,7 +250,7 @@ CONFIGURATIONS = on_page(
     ),
     marginal(
         "FRAMES_AMBIGUOUS",
-        "the data fit {taken} and, as well, {other}; the first is taken",
+        "the data fit {taken} and {other} equally well; the first is used",
         remedy="which side is port on the DVL, and which axes has the reference? Set the one that is right",
     ),
     reject("TWO_CONTRADICTIONS", "{one}; {other}"),
@@ -282,7 +282,7 @@ DISCOVERIES = on_page(
         means="Satellites go first, then a simulator's truth, then an INS.",
     ),
     accept("FRAME_NOT_IN_TREE", "no transform for the DVL's frame {frame!r}; using frame {other!r} instead"),
-    accept("REFERENCE_FRAME_NOT_TOLD", "{topic}: its frame is unknown, and without an IMU the data do not show it"),
+    accept("REFERENCE_FRAME_NOT_TOLD", "{topic}: its frame is unknown, and not observable without an IMU"),
     accept(
         "MOUNTING_GUESSED",
         "mounting {mounting}, {why}: nothing in the bag says how the DVL is mounted (-p mounting_rpy:={option}){also}",

@@ -52,7 +52,7 @@ FINDINGS = (
     ),
     warning(
         "DVL_NO_REFERENCE",
-        "no DVL sample has a reference velocity at its time, though both come",
+        "no DVL sample has a reference velocity at its time, though both arrive",
         means="Usually the DVL has its own clock.",
         remedy="compare the header stamps of both; a DVL with its own clock must be synchronised (NTP)",
     ),
@@ -101,7 +101,7 @@ FINDINGS = (
         "MODEL_RESTARTED",
         "{model}: the filter diverged {count} times and went on from its last good state",
         means="Data and parameters contradict each other, for instance a wrong mounting without a gate.",
-        remedy="check mounting_rpy and lever_arm, and leave gate_probability on",
+        remedy="check mounting_rpy and lever_arm, and do not switch the gate off (gate_probability 0 or 1)",
     ),
     # two publishers, wrong types, quality of service
     warning(
@@ -287,7 +287,7 @@ FINDINGS = (
     warning(
         "SAMPLES_GATED",
         "{model}: {gated} of {given} samples are gated",
-        remedy="check mounting_rpy and the frames before believing it: does the vehicle drive ahead in the DVL's x?",
+        remedy="check mounting_rpy and the frames before you use it: does the vehicle drive ahead in the DVL's x?",
     ),
     error(
         "CONFIGURATION_WRONG",
@@ -299,7 +299,7 @@ FINDINGS = (
         "the heading error changes with the heading: {rms:.1f}° ± {std:.1f}° rms, {most:+.1f}° at {most_at:.0f}° and "
         "{least:+.1f}° at {least_at:.0f}°; it costs {cost:.0f} m per km",
         means="A compass deviates with the heading, a gyro drifts.",
-        remedy="{first}calibrate the compass, or drive opposite headings and a box, over which it averages out",
+        remedy="{first}calibrate the compass, or average the deviation out on opposite headings and a box",
     ),
     warning(
         "HEADING_DRIFTS",
@@ -373,7 +373,7 @@ FINDINGS = (
     ),
     warning(
         "LEVER_ARM_CONTRADICTED",
-        "the data show another lever arm than the configured one: {axes}",
+        "the lever arm in the data differs from the configured one: {axes}",
         means="Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",
         remedy=(
             "measure the positions of DVL and reference point (lever_arm, reference_position), then check the IMU's "

@@ -111,7 +111,7 @@ VERDICTS = on_page(
     reject(
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
-        remedy="set the clocks by one source; by the recording times for this bag: --restamp log",
+        remedy="synchronise the clocks; to use the recording times of this bag instead: --restamp log",
     ),
     # several recordings
     reject(
@@ -141,11 +141,11 @@ MANOEUVRES = on_page(
         means="Another heading separates a current from the mounting.",
     ),
     accept("NEXT_AHEAD", "drive straight ahead", means="Motion ahead makes yaw, pitch and scale observable."),
-    accept("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", means="Angles show in proportion to the speed."),
-    accept("NEXT_SPEEDS", "speed up and slow down by half", means="Accelerations show a delay, two speeds a bias."),
-    accept("NEXT_CIRCLE", "circle to {side}", means="Turns show the lever arm and average earth-fixed errors."),
+    accept("NEXT_FASTER", "drive straight, at {speed:.1f} m/s", means="An angle's error grows with the speed."),
+    accept("NEXT_SPEEDS", "speed up and slow down by half", means="Accelerations separate a delay, two speeds a bias."),
+    accept("NEXT_CIRCLE", "circle to {side}", means="Turns separate the lever arm and average earth-fixed errors."),
     accept("NEXT_EIGHT", "drive a figure eight", means="Turns to both sides separate lever arm and yaw."),
-    accept("NEXT_DIVE", "dive and rise by 10° of pitch", means="Pitching shows the vertical axis."),
+    accept("NEXT_DIVE", "dive and rise by 10° of pitch", means="Pitching makes the vertical axis observable."),
     accept("NEXT_REFERENCE", "surface: {model} learns only with the reference"),
     accept("NEXT_WAIT", "keep on: nothing is learnt yet"),
     accept("NEXT_REJECTED", "nothing: the findings say why this calibration is not to be used"),
@@ -187,7 +187,7 @@ SELECTIONS = on_page(
     accept(
         "CALIBRATION_KEPT",
         "the calibration with the reference so far stays in use",
-        means="The mounting is known from the data with a reference.",
+        means="The mounting was estimated while there was a reference.",
     ),
     accept(
         "ARM_LOOKS_LIKE_ANGLE",
@@ -296,18 +296,18 @@ DIAGNOSES = on_page(
     ),
     marginal(
         "GAP_TOO_SHORT",
-        "this recording cannot show a gap: {samples} samples over {seconds:.0f} s are too few",
+        "no gap can be measured in this recording: {samples} samples over {seconds:.0f} s are too few",
         means="Samples with DVL, reference and attitude count.",
         remedy="record {wanted:.0f} s at least, better 600 s",
     ),
     marginal(
         "GAP_REFERENCE_CONSTANT",
-        "this recording cannot show a gap: the reference velocity is constant to the last digit",
+        "no gap can be measured in this recording: the reference velocity is constant to the last digit",
         remedy="check the receiver",
     ),
     marginal(
         "GAP_REFERENCE_VERTICAL",
-        "this recording cannot show a gap: the reference does not measure the horizontal velocity",
+        "no gap can be measured in this recording: the reference does not measure the horizontal velocity",
         remedy="record a horizontal reference velocity",
     ),
     accept("REST_UNEXPLAINED", "{rest:.1f} mm/s are not explained"),
@@ -319,7 +319,7 @@ DIAGNOSES = on_page(
     accept("NEXT_SHOW", "to see {name}: {manoeuvre}"),
     accept("NEXT_SAME_ROUTE", "the same route again, to see whether the residual follows place, time or motion"),
     accept("NEXT_RECORD", "record {needs} as well, to test {names}"),
-    accept("NEXT_NOTHING", "nothing: all effects show"),
+    accept("NEXT_NOTHING", "nothing: all effects are observable"),
     accept("NEXT_ANYTHING", "straight legs on several headings and at several speeds, with turns to both sides"),
 )
 
@@ -328,11 +328,11 @@ UNPAIRED = on_page(
     "troubleshooting.md#what-a-comparison-with-a-simulator-says",
     reject("SIMULATOR_LACKS", "the simulator lacks {names}"),
     reject("SIMULATOR_OTHER_SIZE", "the simulator has {names} of another size"),
-    reject("SIMULATOR_ALONE_HAS", "the simulator has {names} which the vehicle has not"),
+    reject("SIMULATOR_ALONE_HAS", "the simulator has {names}, which the vehicle lacks"),
     marginal("SIMULATOR_FRAME", "its DVL is mounted {simulator}, the vehicle's {vehicle}"),
     accept(
         "SIMULATOR_PUT_RIGHT",
-        "put right, its error on the vehicle's own motion falls from {before:.1f} to {after:.1f} mm/s, held out",
+        "corrected, its error on the vehicle's own motion falls from {before:.1f} to {after:.1f} mm/s, held out",
     ),
     accept(
         "SIMULATOR_ROUNDS",
@@ -341,7 +341,7 @@ UNPAIRED = on_page(
     ),
     marginal(
         "SIMULATOR_ROUNDS_IN_VAIN",
-        "put right, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
+        "corrected, the simulator comes no closer: its error on the vehicle's own motion stays {before:.1f} mm/s, "
         "held out; noise alone makes {floor:.1f}",
         means="No round is better than the simulator as recorded.",
     ),
@@ -352,14 +352,14 @@ UNPAIRED = on_page(
     ),
     accept(
         "SIMULATOR_NO_ROUNDS",
-        "nothing differs that could be put right, so no round was made",
+        "no difference can be corrected, so no round was made",
         means="The comparison claims no difference.",
     ),
     marginal(
         "SIMULATOR_NOT_SHOWN",
-        "these recordings show no difference in effects, and could not have shown some that matter",
+        "no difference in effects is observable in these recordings, but some that matter would not be, either",
     ),
-    accept("SIMULATOR_ALIKE", "the simulator lacks no effect that these recordings show"),
+    accept("SIMULATOR_ALIKE", "the simulator lacks no effect that is observable in these recordings"),
     marginal("SIMULATOR_NOISE", "the noise differs in {names}"),
     marginal(
         "SIMULATOR_UNKNOWN_REST",

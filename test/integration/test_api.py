@@ -134,7 +134,7 @@ def test_values_that_no_data_support_are_marked_where_the_mounting_is_printed(ba
         (lambda run, to: dc.simulate(to, seconds="long"), "expected a number"),
         (lambda run, to: run.correct([1.0, 2.0]), "expected (..., 3)"),
         (lambda run, to: run.correct("abc"), "velocity_dvl"),
-        (lambda run, to: run.correct(np.zeros((2, 3)), np.zeros((4, 3))), "(4, 3); expected (2, 3)"),
+        (lambda run, to: run.correct(np.zeros((2, 3)), np.zeros((4, 3))), "(4, 3); velocity_dvl has (2, 3)"),
     ],
 )  # fmt: skip
 def test_a_wrong_argument_is_refused_with_what_is_expected(calibration, tmp_path, call, expected):
@@ -203,7 +203,7 @@ def test_effects_are_simulated_by_name_and_a_wrong_one_is_told(ahead, tmp_path):
         ({"lever_arm": {"xm": 0.5}}, "did you mean 'x_m'"),
         ({"lever_arm": {"x_m": "far"}}, "is no number"),
         ({"lever_arm": {}}, "does nothing"),
-        (["lever_arm"], "effects are by name"),
+        (["lever_arm"], "give effects by name"),
     ):
         with pytest.raises(dc.InputError, match=message):
             dc.simulate(tmp_path / "none", effects=wrong)
@@ -280,7 +280,7 @@ def test_a_calibration_is_applied_to_all_files_or_none(calibration, tmp_path):
     with pytest.raises(dc.InputError, match="no such URDF"):
         dc.apply(saved, urdf=tmp_path / "none.urdf", launch=launch)
     assert not launch.exists()
-    with pytest.raises(dc.InputError, match="go with --urdf"):
+    with pytest.raises(dc.InputError, match="need --urdf"):
         dc.apply(saved, joint="dvl")
 
 

@@ -185,7 +185,7 @@ def test_a_result_of_two_frames_is_refused(tmp_path, result, capsys):
     found = replace(result[1], parameters=result[1].parameters | {"dvl_frame": "dvl_a"})
     mounting = result_document(found)["mounting"] | {"child_frame_id": "dvl_b"}
     path = change(tmp_path / "r.yaml", found, mounting=mounting)
-    assert "is of 'dvl_b', its parameters of 'dvl_a'" in refused(capsys, path, "--launch", tmp_path / "l")
+    assert "mounting is for frame 'dvl_b', parameters for 'dvl_a'" in refused(capsys, path, "--launch", tmp_path / "l")
 
 
 def test_a_calibration_that_starts_from_the_applied_urdf_finds_nothing_more(tmp_path, result, saved, capsys):
@@ -428,8 +428,8 @@ def test_rollback_touches_nothing_when_one_file_has_no_backup(tmp_path, saved, c
         (["result.yaml", "--fusion", "result.yaml"], "would write over the input result.yaml"),
         (["result.yaml", "--fusion", "x", "--launch", "x"], "names of their own"),
         (["result.yaml", "--urdf", "missing.urdf"], "missing.urdf: no such URDF"),
-        (["result.yaml", "-o", "x"], "name that, too"),
-        (["result.yaml", "--joint", "x"], "name that, too"),
+        (["result.yaml", "-o", "x"], "need --urdf"),
+        (["result.yaml", "--joint", "x"], "need --urdf"),
         (["result.yaml", "--launch", "missing/x"], "missing does not exist; create it"),
         (["--rollback"], "name the files again"),
     ],

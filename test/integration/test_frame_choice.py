@@ -114,7 +114,7 @@ def test_two_readings_that_fit_as_well_are_both_said_and_the_answer_is_marginal(
     bag = told.write(tmp_path / "bag")
     as_found = replay(bag)
     assert as_found.verdict == "marginal" and doctor(bag).verdict == "partly"
-    assert "dvl_axes frd and, as well, dvl_axes flu" in as_found.reasons[0]
+    assert "dvl_axes frd and dvl_axes flu equally well" in as_found.reasons[0]
     assert "which side is port on the DVL" in as_found.reasons[0]
     told_axes = replay(bag, dvl_axes="frd", gnss_frame="body")
     assert "FRAMES_AMBIGUOUS" not in codes(told_axes.discovery.contradictions)

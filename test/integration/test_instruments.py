@@ -120,7 +120,7 @@ def test_an_autopilot_takes_place_quarter_turns_and_delay(saved):
         (["--instrument", "waterlinked", "--launch", "tf.launch.xml"], "corrected twice"),
         (["--instrument", "cerulean", "--send", "192.0.2.1"], "--send is for waterlinked"),
         (["--instrument", "ardupilot", "--send", "host"], "--send is for waterlinked"),
-        (["--now", "speed_of_sound=1500"], "go with --instrument"),
+        (["--now", "speed_of_sound=1500"], "need --instrument"),
     ],
 )
 def test_what_cannot_be_set_is_said_in_one_line(saved, arguments, says, tmp_path, monkeypatch, capsys):

@@ -201,5 +201,5 @@ def test_clocks_are_looked_for_with_the_imu_turned_as_its_transform_says(bags):
     assert found.clocks is not None
     assert found.clocks.parameters.imu_rpy == found.parameters.imu_rpy != (0.0, 0.0, 0.0)
     registered = found.clocks.registration
-    assert registered.left < 0.15
+    assert registered.residual < 0.15
     assert np.degrees(np.abs(Rotation.from_matrix(registered.rotation_body_from_dvl).as_rotvec())).max() < 5.0

@@ -159,7 +159,7 @@ class _Pages:
         return _TableRow(number, _columns(self._payload(page, at, size)))
 
     def _payload(self, page: bytes, at: int, size: int) -> bytes:
-        """Return the content of a row; the part beyond its page is on a chain of overflow pages."""
+        """Return the content of a row, with its overflow pages (section 1.6 of https://sqlite.org/fileformat2.html)."""
         largest, least = self._usable - 35, (self._usable - 12) * 32 // 255 - 23
         if size <= largest:
             local = size

@@ -22,12 +22,12 @@ from ..checks.heading_deviation import HeadingDeviation, heading_deviation, head
 from ..checks.lever_arm_check import lever_arm_warnings
 from ..checks.residual_tests import (
     ResidualTrend,
+    confused_with_bias_std,
     is_insignificant,
     moving_bed,
     reference_lag_s,
     residual_trend,
     residual_warnings,
-    std_along,
 )
 from ..filters.observability import KM
 from ..models.parameters import Parameters
@@ -340,16 +340,16 @@ def in_words(navigation: Navigation) -> list[str]:
     """Return sentences that describe the drift."""
     n, before, after = navigation, navigation.before, navigation.after
     over = f"over stretches of {n.stretch_m:.0f} m" if n.stretches > 1 else f"over {n.distance_m:.0f} m"
-    said = [
+    reasons = [
         f"Dead reckoning on data held out, {over}: {metres(before.per_km)} m of drift per km as mounted "
         f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %). "
         f"Noise of reference, attitude and DVL alone may make {metres(n.noise_per_km)} m."
     ]
-    said.append(
+    reasons.append(
         f"After {n.distance_m:.0f} m it is {metres(before.end)} m off as mounted, {metres(after.end)} m corrected"
         + ("." if n.on_a_map else "; without headings, as on one course.")
     )
-    return said
+    return reasons
 
 
 def metres(value: float) -> str:
@@ -398,7 +398,7 @@ def doubts(
         are_positions(parameters),
         reference_lag_s(estimate, parameters),
         is_insignificant(estimate),
-        std_along(estimate, parameters),
+        confused_with_bias_std(estimate, parameters),
         None if is_large else navigation.beam,
         ACCEPTED_DRIFT * parameters.target_drift / KM,
     )

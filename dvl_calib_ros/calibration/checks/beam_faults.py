@@ -18,7 +18,7 @@ from ...verdict.reasons import Reason, finding
 from ..models.own import BIAS
 from ..numerics.block_covariance import TimeBlocks, inflations
 from ..numerics.frames import Array
-from ..numerics.tests import COVERED, FOUND
+from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS
 
 # Angle of the beams from the DVL's z axis (rad; 20° to 30° in use), and their azimuths from its x axis to port.
 BEAM_ANGLE, AZIMUTHS_DEG = math.radians(30.0), (45, 135, 225, 315, 0, 90, 180, 270)
@@ -64,8 +64,8 @@ class BeamFault(NamedTuple):
 
     @property
     def least(self) -> float:
-        """Return the error of the mean velocity by a beam that is better by `COVERED` σ."""
-        return self.off * (1.0 - COVERED * self.std / self.share)
+        """Return the error of the mean velocity by a beam that is better by `Z_95_PERCENT` σ."""
+        return self.off * (1.0 - Z_95_PERCENT * self.std / self.share)
 
 
 def most_significant(blocks: TimeBlocks, information: Array, vector: Array, mean: Array) -> BeamFault | None:
@@ -107,7 +107,7 @@ def beam_warning(found: BeamFault | None, accepted: float) -> list[Reason]:
 
     accepted: error of the velocity ahead, as a share of the speed, up to which a beam is not reported.
     """
-    if found is None or found.share < FOUND * found.std or found.least < accepted:
+    if found is None or found.share < Z_FIFTY_TESTS * found.std or found.least < accepted:
         return []
     percent, std = 100.0 * found.share, 100.0 * found.std
     return [finding("BEAM_OFF", percent=percent, std=std, azimuth=found.azimuth_deg).weighed(Severity.REJECT)]

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
-from ..numerics.tests import SURE
+from ..numerics.tests import Z_REPEATED_TEST
 from ..results.mounting_quantities import date
 from ..results.results import ARM, OFFSETS, Day, Estimate
 
@@ -23,11 +23,11 @@ SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
 OFTEN_OFF = 4.0
 # Constant reference error that is reported, m/s.
-OFFSET_SAID_FROM = 0.01
+OFFSET_REPORTED_FROM_MPS = 0.01
 # Share of the reference error that yaw absorbs, above which the two are not separable.
 NOT_SHOWN = 0.6
 # Uncertainty due to a clock offset that is reported: lever arm (m), delay (s), yaw (°).
-SAID_FROM_M, SAID_FROM_S, SAID_FROM_DEG = 0.05, 0.05, 0.1
+REPORTED_FROM_M, REPORTED_FROM_S, REPORTED_FROM_DEG = 0.05, 0.05, 0.1
 # GNSS losses from which reception is unstable.
 FLAPPING = 3
 
@@ -130,25 +130,25 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
     std = estimate.std_of(*OFFSETS)
     if std is None:
         return []
-    said = []
+    reasons = []
     open_std = np.sqrt(np.diag(estimate.left_open))
     if open_std.any():
         by_name = dict(zip(estimate.state_names, open_std.tolist(), strict=True))
         metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
-        if metres >= SAID_FROM_M or seconds >= SAID_FROM_S:
-            said.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
-        elif turn >= SAID_FROM_DEG:  # the lever arm is configured
-            said.append(finding("CLOCK_ON_TURN", degrees=turn))
+        if metres >= REPORTED_FROM_M or seconds >= REPORTED_FROM_S:
+            reasons.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
+        elif turn >= REPORTED_FROM_DEG:  # the lever arm is configured
+            reasons.append(finding("CLOCK_ON_TURN", degrees=turn))
     found = [
         (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
         for day in days
     ] or [("", np.array([estimate.state_of(name) for name in OFFSETS]), std)]
     for where, offset, own_std in found:
         size = float(np.linalg.norm(offset))
-        if size < OFFSET_SAID_FROM or (np.abs(offset) < SURE * own_std).all():
+        if size < OFFSET_REPORTED_FROM_MPS or (np.abs(offset) < Z_REPEATED_TEST * own_std).all():
             continue
         course = math.degrees(math.atan2(*offset)) % 360.0
-        said.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))
-    return said
+        reasons.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))
+    return reasons

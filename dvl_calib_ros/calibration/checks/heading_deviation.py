@@ -15,11 +15,11 @@ from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
-from ..numerics.tests import BY_CHANCE, chance_of, chi2_isf
+from ..numerics.tests import Z_ONE_TEST, chance_of, chi2_isf
 from ..results.results import Estimate
 
 # Reported from this rms (rad).
-SAID_FROM = math.radians(0.3)
+REPORTED_FROM_RAD = math.radians(0.3)
 # Rms (rad) from which the compass must be calibrated first (QRev's rule).
 FIRST = math.radians(3.0)
 # The same from GATED_FIRST (rad) if more than this share of samples is gated: the deviation affects these most, so it
@@ -58,7 +58,7 @@ def heading_deviation(yaw: Array, coefficients: GaussianState) -> HeadingDeviati
     rms = float(np.sqrt((shown**2).mean()))
     std = math.sqrt(max(float(np.einsum("ni,ij,nj->n", terms, coefficients.p, terms).mean()), 0.0))
     found = float(coefficients.x @ np.linalg.solve(coefficients.p, coefficients.x))
-    if rms < SAID_FROM or found < chi2_isf(chance_of(BY_CHANCE), len(coefficients.x)):
+    if rms < REPORTED_FROM_RAD or found < chi2_isf(chance_of(Z_ONE_TEST), len(coefficients.x)):
         return None
     most, least = int(np.argmax(shown)), int(np.argmin(shown))
     north = (0.5 * math.pi - yaw) % (2.0 * math.pi)
@@ -70,7 +70,7 @@ def heading_deviation(yaw: Array, coefficients: GaussianState) -> HeadingDeviati
 def severity_of(found: HeadingDeviation, estimate: Estimate) -> Severity:
     """Return the effect on the verdict: reject if the compass must be calibrated before the mounting."""
     is_cut = estimate.gated > GATED_FROM * (estimate.used + estimate.gated)
-    if (is_cut and found.rms > GATED_FIRST) or found.rms > max(FIRST, BY_CHANCE * found.std):
+    if (is_cut and found.rms > GATED_FIRST) or found.rms > max(FIRST, Z_ONE_TEST * found.std):
         return Severity.REJECT
     return Severity.MARGINAL if is_cut else Severity.WARNING
 
@@ -78,7 +78,7 @@ def severity_of(found: HeadingDeviation, estimate: Estimate) -> Severity:
 def heading_warnings(found: HeadingDeviation) -> Reason:
     """Word the deviation as a warning."""
     degrees = math.degrees
-    first = "calibrate the compass first: " if found.rms > max(FIRST, BY_CHANCE * found.std) else ""
+    first = "calibrate the compass first: " if found.rms > max(FIRST, Z_ONE_TEST * found.std) else ""
     return finding(
         "HEADING_DEVIATION",
         rms=degrees(found.rms),

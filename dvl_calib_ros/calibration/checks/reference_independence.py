@@ -20,7 +20,7 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..numerics.samples import Mask
-from ..numerics.tests import BY_CHANCE, FOUND
+from ..numerics.tests import Z_FIFTY_TESTS, Z_ONE_TEST
 
 # Longest sample intervals, s: of both streams, because slower differences hold waves; and of a reference next to a fast
 # DVL.
@@ -71,19 +71,19 @@ class SharedNoise:
         self._square += float((differences**2).sum())
         # at the slower stream's times, with the nearest samples of the faster one
         if reference_step > SLOWEST_S:
-            beside = np.column_stack([velocity, np.diff(velocity, 2, axis=0, prepend=np.nan, append=np.nan)])[2:-2]
-            seen = np.column_stack([beside, np.where(_evenly(times, step), fourth, np.nan)])
-            dvl, dvl_2, dvl_4 = np.split(_beside(reference_times, step, times[2:-2], seen, -SHIFTS_S), 3, axis=2)
+            columns = np.column_stack([velocity, np.diff(velocity, 2, axis=0, prepend=np.nan, append=np.nan)])[2:-2]
+            seen = np.column_stack([columns, np.where(_evenly(times, step), fourth, np.nan)])
+            dvl, dvl_2, dvl_4 = np.split(_nearest(reference_times, step, times[2:-2], seen, -SHIFTS_S), 3, axis=2)
             # equivalent to a difference with 70 κ N of the noise: v₄ + 70 / 6 Δ⁴d (r - d)
             other_4 = dvl_4 + 70.0 / 6.0 * _about_mean(reference - dvl)
         elif reference_step < step:
             even = _evenly(times, step)
             dvl_4 = np.where(even, fourth, np.nan)
             dvl_2 = np.diff(velocity, 2, axis=0)[1:-1]
-            other_4 = np.diff(_beside(times, step, reference_times, reference, SHIFTS_S), ORDER, axis=1)
+            other_4 = np.diff(_nearest(times, step, reference_times, reference, SHIFTS_S), ORDER, axis=1)
         else:
             other_4 = np.where(_evenly(reference_times, reference_step), np.diff(reference, ORDER, axis=0), np.nan)
-            dvl = _beside(reference_times, reference_step, times, velocity, -SHIFTS_S)
+            dvl = _nearest(reference_times, reference_step, times, velocity, -SHIFTS_S)
             dvl_4, dvl_2 = np.diff(dvl, ORDER, axis=1), np.diff(dvl, 2, axis=1)[:, 1:-1]
         known = np.isfinite(dvl_4) & np.isfinite(other_4)
         count = np.count_nonzero(known, axis=(1, 2))
@@ -106,12 +106,12 @@ class SharedNoise:
         std = np.sqrt(np.maximum(self._squares / n - mean**2, 0.0) / (n - 1.0))
         best = int(np.argmax(np.where(self._stretches >= ENOUGH, mean[:, 0], -math.inf)))
         c_4, v_4, steps = mean[best].tolist()
-        if steps < BY_CHANCE * float(std[best, 2]):
+        if steps < Z_ONE_TEST * float(std[best, 2]):
             steps = 0.0
         passed, own = c_4 - steps, v_4 - steps
         if own < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
             return 0.0
-        return passed / own if passed > max(SHARED_FROM * own, FOUND * float(std[best, 0])) else 0.0
+        return passed / own if passed > max(SHARED_FROM * own, Z_FIFTY_TESTS * float(std[best, 0])) else 0.0
 
     def contradiction(self) -> Reason | None:
         """Return the reason if the reference contains the DVL's noise."""
@@ -126,7 +126,7 @@ def _about_mean(values: Array) -> Array:
     return (values - np.where(known, values, 0.0).sum(axis=1, keepdims=True) / n) * (n / (n - 1.0))
 
 
-def _beside(times: Array, step: float, other_times: Array, other: Array, shifts: Array) -> Array:
+def _nearest(times: Array, step: float, other_times: Array, other: Array, shifts: Array) -> Array:
     """Return another stream's nearest samples (S, N, k) at times (N,) plus each shift (S,); nan if none is near."""
     wanted = times + shifts[:, None]
     after = np.searchsorted(other_times, wanted).clip(1, len(other_times) - 1)

@@ -23,11 +23,11 @@ from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..models import MODELS
 from ..models.parameters import Parameters
-from ..numerics.block_covariance import alike_of, of_few
+from ..numerics.block_covariance import effective_blocks, student_factor
 from ..numerics.frames import Array, cross, skew
 from ..numerics.robust import median, robust_std
 from ..numerics.samples import Index
-from ..numerics.tests import BY_CHANCE, COVERED, FOUND, SURE, SURE_AT_SEA
+from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
 from ..results.results import ARM, OFFSETS, Estimate
 from .beam_faults import BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
@@ -43,28 +43,27 @@ QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
 # about the earth's vertical (rad), which differs from yaw when the vehicle tilts. BY_HEADING: heading errors with one
 # and two cycles of the heading, and with a drift over the recording (rad), similar to a bias but not to fast signals.
-KNOWN: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
+NUISANCE_STD: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2 + [0.1])
-# Prior σ of the tested signals: shares of tilt, and second derivative (s²); DVL bias (m/s), tested on means over MEAN_S
-# (s).
-QUICK, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
+# Prior σ of the tested signals: shares of tilt, second derivative (s²); DVL bias (m/s), tested on means over MEAN_S.
+SIGNAL_STD, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
 # Smallest tilt (rad, rms) and second derivative (m/s²) for a test, and share of tilt that the residual must follow.
-LEAST_TILT, NOT_FOLLOWED, LEAST_BEND = math.radians(0.08), 0.6, 0.006
+LEAST_TILT, MISSING_TILT_SHARE, LEAST_BEND = math.radians(0.08), 0.6, 0.006
 # Prior σ of the bed's velocity, m/s: sediment in a flood, or a water layer. Below MOVES_FROM_MPS the reference may be
 # the cause: an inertial navigation at sea (recording T09) had an error of 0.054.
 BED_STD_MPS, MOVES_FROM_MPS = 1.0, 0.08
-# Columns of the reference error, east and north, in `KNOWN`.
+# Columns of the reference error, east and north, in `NUISANCE_STD`.
 OVER_GROUND = slice(10, 12)
 # Share of the second derivative that means over `MEAN_S` must keep for the smoothing test.
 LEAST_OF_BEND = 0.3
 # σ of the missing share of tilt above which it may be the whole tilt.
-TILT_SHOWN = 0.2
-# Bias of the DVL that occurs (m/s), and its σ (forward or port) from which the motion does not show it.
-SEEN_BIAS, BIAS_OPEN = 0.02, 0.008
+TILT_UNOBSERVABLE_STD = 0.2
+# Bias of a usual DVL (m/s), and its σ (forward or port) from which the motion does not make it observable.
+TYPICAL_BIAS_MPS, BIAS_UNOBSERVABLE_STD_MPS = 0.02, 0.008
 # Share of tilt from which a sign is wrong, instead of a levelled velocity.
-WRONG_SIGN_FROM = 1.6
+WRONG_SIGN_TILT_SHARE = 1.6
 # Mounting error (rad) from which it is reported.
-SAID_FROM = math.radians(0.2)
+REPORTED_FROM_RAD = math.radians(0.2)
 # Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 # Residual, relative to the median, beyond which it is an outlier; number of iterations.
@@ -72,18 +71,17 @@ OUTLYING, ROUNDS = 4.0, 3
 # Smallest noise of the residual, m/s.
 QUIETEST_MPS = 1e-3
 # Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion.
-FORGOTTEN_S, SLOWEST_S = (0.5, 1.0, 3.0), 0.3
-# Samples to either side that predict one; innovations beyond NEW_AT_MOST σ are outliers.
-FORETOLD_BY, NEW_AT_MOST = 12, 4.0
+FILTER_MEMORIES_S, LONGEST_INTERVAL_S = (0.5, 1.0, 3.0), 0.3
+# Samples to either side that predict one; innovations beyond OUTLYING_INNOVATION σ are outliers.
+NEIGHBOURS, OUTLYING_INNOVATION = 12, 4.0
 # σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
 OF_WAVES = 0.015
 # Delay of a reference that a filter explains: within this factor of the filter's time constant, and at least this, s.
-LAGS_WITHIN, LEAST_LAG_S = 2.0, 0.2
-# Corrections (rad, scale, m) below these, or below `BY_CHANCE` σ, count as none.
+LAG_FACTOR, LEAST_LAG_S = 2.0, 0.2
+# Corrections (rad, scale, m) below these, or below `Z_ONE_TEST` σ, count as none.
 NO_ANGLE, NO_SCALE, NO_ARM_M = math.radians(0.35), 0.005, 0.2
-# Smallest share of DVL noise for references from positions, whose windows hold motion on both sides, which looks
-# similar.
-FOLLOWED_BY_POSITIONS = 0.1
+# Smallest share of DVL noise in a reference from positions: the motion on both sides in its window looks similar.
+POSITIONS_NOISE_SHARE = 0.1
 
 
 class ResidualTrend(NamedTuple):
@@ -92,8 +90,8 @@ class ResidualTrend(NamedTuple):
     tilt, tilt_std: (2,) share of roll and pitch missing in the DVL's velocity: 0 if correct, 1 if levelled, ±2 for a
     wrong sign. bias, bias_std: (3,) m/s, of the DVL, body. smoothed, smoothed_std: s², half the squared time constant
     of the reference; negative for the DVL. lean: (2,) rad, mean roll and pitch. speed: m/s, rms. circular,
-    circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: memory, s, the most
-    significant of `FORGOTTEN_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
+    circular_std: share of the DVL's noise that the reference keeps after one sample; circular_s: the most significant
+    of `FILTER_MEMORIES_S`. over_ground, over_ground_std: (2,) m/s, reference minus DVL, east and north, on every
     heading; 0 if the residual holds less than half of it. turned, turned_std: rad, change of the heading error from
     start to end.
     """
@@ -179,15 +177,15 @@ def residual_trend(
     bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
     # linear interpolation loses this part of the second derivative on average
     bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
-    both = np.concatenate([_known(moving, rates, slope, body_from_enu), quick], axis=2)
-    fast = _fitted(time, both, bent, np.concatenate([KNOWN, QUICK]))
+    both = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), quick], axis=2)
+    fast = _fitted(time, both, bent, np.concatenate([NUISANCE_STD, SIGNAL_STD]))
     constant = np.broadcast_to(-np.eye(3), (n, 3, 3))
     starts = np.flatnonzero(np.diff(np.floor((time - time[0]) / MEAN_S), prepend=-1.0))
     # velocity of neighbouring means, because a mean's own noise would look like a scale, and so like a bias
-    beside = _known(_beside(time, moving, starts), rates, slope, body_from_enu)
-    by_heading = beside[:, :, -1, None] * around[:, None]
-    columns = np.concatenate([_means(each, starts) for each in (beside, by_heading, constant)], axis=2)
-    likely = np.concatenate([KNOWN, BY_HEADING, CONSTANT])
+    known = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
+    by_heading = known[:, :, -1, None] * around[:, None]
+    columns = np.concatenate([_means(each, starts) for each in (known, by_heading, constant)], axis=2)
+    likely = np.concatenate([NUISANCE_STD, BY_HEADING, CONSTANT])
     means = _means(time, starts), columns, _means(error, starts)
     slow = _fitted(*means, likely, LASTING)
     likely[OVER_GROUND] = BED_STD_MPS
@@ -212,14 +210,14 @@ def residual_trend(
     smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
     return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_circular(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
+        *_noise_in_reference(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
         float(slow.x[-4]), float(slow.std[-4]),
     )  # fmt: skip
 
 
-def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
+def _nuisance_columns(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> Array:
     """Return nuisance columns (N, 3, 14) from velocity, turn rate and acceleration (N, 3), body axes."""
-    known = np.zeros((len(moving), 3, len(KNOWN)))
+    known = np.zeros((len(moving), 3, len(NUISANCE_STD)))
     known[:, :, :3] = skew(moving)
     known[:, [0, 1, 2], [3, 4, 5]] = moving
     known[:, :, 6:9] = skew(rates)
@@ -229,7 +227,7 @@ def _known(moving: Array, rates: Array, slope: Array, body_from_enu: Array) -> A
     return known
 
 
-def _beside(time: Array, values: Array, starts: Index) -> Array:
+def _neighbouring_means(time: Array, values: Array, starts: Index) -> Array:
     """Return for each value (N, 3) the mean of the neighbouring stretches, or of its own if these are far in time."""
     at, of_each = _means(time, starts), _means(values, starts)
     near = (np.diff(at) < 2.0 * MEAN_S).astype(float)[:, None]
@@ -255,19 +253,19 @@ def is_insignificant(estimate: Estimate) -> bool:
     terms = MODELS[estimate.model].error_terms_from_state
     found = np.abs(terms @ estimate.state)
     std = np.sqrt(np.diag(terms @ estimate.recording_covariance @ terms.T))
-    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, BY_CHANCE * std)).any() or np.sort(std[:3])[1] > NO_ANGLE:
+    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, Z_ONE_TEST * std)).any() or np.sort(std[:3])[1] > NO_ANGLE:
         return False
     arm, own = estimate.std_of(*ARM), dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
-    return arm is None or not (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, BY_CHANCE * arm)).any()
+    return arm is None or not (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, Z_ONE_TEST * arm)).any()
 
 
-def std_along(estimate: Estimate, parameters: Parameters) -> Array:
-    """Return σ (3,) of the errors that a bias along body x, y and z imitates: scale, yaw (rad), pitch (rad)."""
+def confused_with_bias_std(estimate: Estimate, parameters: Parameters) -> Array:
+    """Return σ (3,) of scale, yaw and pitch (rad), which a bias along body x, y and z resembles at constant speed."""
     terms, dvl_from_body = MODELS[estimate.model].error_terms_from_state, parameters.rotation_dvl_from_body
     p = terms @ estimate.recording_covariance @ terms.T
-    ahead = dvl_from_body[:, 0] ** 2
-    turned = np.diag(dvl_from_body.T @ p[:3, :3] @ dvl_from_body)
-    return np.sqrt([float(ahead @ p[3:, 3:] @ ahead), turned[2], turned[1]])
+    weights = dvl_from_body[:, 0] ** 2
+    angles = np.diag(dvl_from_body.T @ p[:3, :3] @ dvl_from_body)
+    return np.sqrt([float(weights @ p[3:, 3:] @ weights), angles[2], angles[1]])
 
 
 def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None:
@@ -278,7 +276,7 @@ def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None
     if found is None:
         return None
     size = float(np.linalg.norm(found.over_ground))
-    if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < SURE_AT_SEA * found.over_ground_std).all():
+    if size < MOVES_FROM_MPS or (np.abs(found.over_ground) < Z_SLOW_ERRORS * found.over_ground_std).all():
         return None
     own = [estimate.state_of(name) for name in OFFSETS]
     is_held = float(np.linalg.norm(found.over_ground - own)) < 0.5 * size
@@ -291,68 +289,70 @@ def residual_warnings(
     found: ResidualTrend | None,
     of_positions: bool = False,
     lag_s: float = 0.0,
-    is_nil: bool = False,
-    along: Sequence[float] | Array = (0.0, 0.0, 0.0),
+    finds_nothing: bool = False,
+    mounting_std: Sequence[float] | Array = (0.0, 0.0, 0.0),
     beam: BeamFault | None = None,
     accepted: float = 0.01,
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
-    of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, is_nil, along:
-    see `reference_lag_s`, `is_insignificant` and `std_along`. accepted: error of the mounting (rad, or share of the
-    distance) up to which a calibration is accepted; one that its own σ cover does not reject it either.
+    of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, finds_nothing,
+    mounting_std: see `reference_lag_s`, `is_insignificant`, `confused_with_bias_std`. accepted: error of the mounting
+    (rad, or share of the distance) that does not reject a calibration; nor does an error within its own 95 % interval.
     """
     if found is None:
         return []
-    least = FOLLOWED_BY_POSITIONS if of_positions else 0.0
+    smallest_share = POSITIONS_NOISE_SHARE if of_positions else 0.0
     seconds = math.sqrt(2.0 * abs(found.smoothed))
-    lags_so = lag_s > max(LEAST_LAG_S, seconds / LAGS_WITHIN) and lag_s < LAGS_WITHIN * seconds
-    # a filter both smooths and passes noise on: each may be less sure
-    is_filter = not of_positions and found.smoothed > COVERED * found.smoothed_std
-    if found.circular > max((BY_CHANCE if is_filter else SURE) * found.circular_std, least):
+    lag_fits_filter = lag_s > max(LEAST_LAG_S, seconds / LAG_FACTOR) and lag_s < LAG_FACTOR * seconds
+    # a filter smooths and passes noise on: with evidence for one, the other needs less
+    is_filter = not of_positions and found.smoothed > Z_95_PERCENT * found.smoothed_std
+    if found.circular > max((Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * found.circular_std, smallest_share):
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
-    if is_filter and lags_so and is_nil:
+    if is_filter and lag_fits_filter and finds_nothing:
         return [finding("FILTER_FINDS_NOTHING", late=lag_s).weighed(Severity.REJECT)]
-    is_ours = of_positions and found.smoothed > 0.0
-    is_smoothed = abs(found.smoothed) > SURE * found.smoothed_std
-    if is_smoothed and seconds > (TOO_SMOOTH_S if is_ours else SMOOTHED_FROM_S):
-        word = Severity.REJECT if seconds > TOO_SMOOTH_S and not is_ours else Severity.MARGINAL
+    by_position_window = of_positions and found.smoothed > 0.0
+    is_smoothed = abs(found.smoothed) > Z_REPEATED_TEST * found.smoothed_std
+    if is_smoothed and seconds > (TOO_SMOOTH_S if by_position_window else SMOOTHED_FROM_S):
+        severity = Severity.REJECT if seconds > TOO_SMOOTH_S and not by_position_window else Severity.MARGINAL
         # smoothing causes any other signal
-        return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(word)]
-    said = []
+        return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(severity)]
+    reasons = []
     for axis, name in enumerate(("roll", "pitch")):
         share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
-        if abs(share) > max(SURE_AT_SEA * std, NOT_FOLLOWED):
+        if abs(share) > max(Z_SLOW_ERRORS * std, MISSING_TILT_SHARE):
             off = abs(share * float(found.lean[axis]))
-            word = Severity.REJECT if off > accepted or abs(share) > WRONG_SIGN_FROM else Severity.MARGINAL
+            severity = Severity.REJECT if off > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
             found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))
-            said.append(found_tilt.weighed(word))
-        elif std > TILT_SHOWN and abs(float(found.lean[axis])) > accepted:
-            said.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
+            reasons.append(found_tilt.weighed(severity))
+        elif std > TILT_UNOBSERVABLE_STD and abs(float(found.lean[axis])) > accepted:
+            reasons.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
     # the heading at either end, relative to its mean
     off = 0.5 * abs(found.turned)
-    if off > SAID_FROM and off > BY_CHANCE * found.turned_std:
-        word = Severity.MARGINAL if off > max(accepted, COVERED * along[1]) else Severity.WARNING
+    if off > REPORTED_FROM_RAD and off > Z_ONE_TEST * found.turned_std:
+        severity = Severity.MARGINAL if off > max(accepted, Z_95_PERCENT * mounting_std[1]) else Severity.WARNING
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
-        said.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(word))
-    if all(each.severity is Severity.WARNING for each in said):  # a wrong tilt or heading looks like a beam
-        said += beam_warning(beam, accepted)
-    size = np.abs(found.bias)
-    shown = (size > FOUND * found.bias_std) & (size > SAID_FROM * found.speed)
+        reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(severity))
+    if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
+        reasons += beam_warning(beam, accepted)
+    magnitude = np.abs(found.bias)
+    shown = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
     if shown.any():
         axes = ", ".join(
             f"{axis} {1000.0 * found.bias[i]:+.0f} ± {1000.0 * found.bias_std[i]:.0f}"
             for i, axis in enumerate("xyz")
             if shown[i]
         )
-        turned = float(size[shown].max()) / found.speed
-        is_wrong = size - found.bias_std > np.maximum(accepted, COVERED * np.asarray(along)) * found.speed
-        word = Severity.REJECT if (shown & is_wrong).any() else Severity.MARGINAL
-        said.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(word))
-    elif float(found.bias_std[:2].max()) > BIAS_OPEN:
-        share = SEEN_BIAS / found.speed
-        said.append(finding("ONE_SPEED", off=SEEN_BIAS, degrees=math.degrees(share), percent=100.0 * share))
-    return said
+        turned = float(magnitude[shown].max()) / found.speed
+        is_wrong = (
+            magnitude - found.bias_std > np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * found.speed
+        )
+        severity = Severity.REJECT if (shown & is_wrong).any() else Severity.MARGINAL
+        reasons.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(severity))
+    elif float(found.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
+        share = TYPICAL_BIAS_MPS / found.speed
+        reasons.append(finding("ONE_SPEED", off=TYPICAL_BIAS_MPS, degrees=math.degrees(share), percent=100.0 * share))
+    return reasons
 
 
 def _smoothed_one(found: ResidualTrend) -> str:
@@ -382,11 +382,11 @@ def _fitted(
     scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
     # one axis at a time to save memory: hours of data would need a tenth of a gigabyte
     each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
-    told = np.sum(each_axis, axis=0)
+    contributions = np.sum(each_axis, axis=0)
     # nuisance errors of their prior size add to σ, as far as the data do not exclude them
-    beside = p[:, : len(KNOWN)] * (prior * likely)[: len(KNOWN)]
-    std = of_few(alike_of(told[None])[0] - 1.0) * _std(p @ scores.T, together)
-    return _Fit(x, np.sqrt(std**2 + (beside**2).sum(axis=1)), p, weight, starts)
+    by_prior = p[:, : len(NUISANCE_STD)] * (prior * likely)[: len(NUISANCE_STD)]
+    std = student_factor(effective_blocks(contributions[None])[0] - 1.0) * _std(p @ scores.T, together)
+    return _Fit(x, np.sqrt(std**2 + (by_prior**2).sum(axis=1)), p, weight, starts)
 
 
 def _std(scatter: Array, together: Sequence[int]) -> Array:
@@ -396,26 +396,26 @@ def _std(scatter: Array, together: Sequence[int]) -> Array:
     return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
-def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
+def _noise_in_reference(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
     """Return the share of the DVL's noise that the reference keeps, its σ, and the memory, s. dvl: (N, 3) m/s, body.
 
     The innovation of a velocity, given its neighbours, holds its noise. The same filter is applied to the residual, so
     both hold the same noise. Nuisance columns hold DVL noise themselves, so the residual is not corrected by them.
     """
     step = float(median(np.diff(time)))
-    if step > SLOWEST_S or len(time) < 4 * FORETOLD_BY:
+    if step > LONGEST_INTERVAL_S or len(time) < 4 * NEIGHBOURS:
         return 0.0, math.inf, 0.0
-    new, rest = (np.zeros_like(dvl) for _ in range(2))
+    innovation, rest = (np.zeros_like(dvl) for _ in range(2))
     for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):
-        shares = _not_foretold(values)
-        for filtered, each in ((new, values), (rest, error[:, axis])):
-            filtered[FORETOLD_BY:-FORETOLD_BY, axis] = np.correlate(each, shares, "valid")
-    most = NEW_AT_MOST * robust_std(new)
+        shares = _innovation_filter(values)
+        for filtered, each in ((innovation, values), (rest, error[:, axis])):
+            filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
+    limit = OUTLYING_INNOVATION * robust_std(innovation)
     # gaps break the prediction
     is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
-    new[np.convolve(is_gap, np.ones(2 * FORETOLD_BY), "same") > 0.5] = 0.0
-    noise = np.clip(new, -most, most)
-    weight = fit.weight * ((new == noise) & (new != 0.0)).all(axis=1)  # neither clipped, nor at an end
+    innovation[np.convolve(is_gap, np.ones(2 * NEIGHBOURS), "same") > 0.5] = 0.0
+    noise = np.clip(innovation, -limit, limit)
+    weight = fit.weight * ((innovation == noise) & (innovation != 0.0)).all(axis=1)  # neither clipped, nor at an end
 
     def without_columns(values: Array) -> Array:
         weighted = fit.weight[:, None] * values
@@ -428,9 +428,9 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
         return np.asarray(values - now * (np.einsum("n,ni,ni->i", weight, now, values) / level))
 
     rest, found = without_now(rest), []
-    for seconds in FORGOTTEN_S:
+    for seconds in FILTER_MEMORIES_S:
         for late in (0.0, seconds):  # the lag may have been corrected as a delay
-            past = without_now(without_columns(_followed(noise, step, seconds, late)))
+            past = without_now(without_columns(_filtered_noise(noise, step, seconds, late)))
             square = float(np.einsum("n,ni,ni->", weight, past, past))
             if square <= 0.0:
                 continue
@@ -440,7 +440,7 @@ def _circular(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) 
     return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
 
 
-def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
+def _filtered_noise(noise: Array, step: float, seconds: float, late: float) -> Array:
     """Return a filter's output from earlier noise (N, 3). seconds: memory. late: lag that is corrected, s."""
     kernel = np.exp(-np.arange(math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
     ahead = int(late / step + 1e-6)
@@ -449,13 +449,13 @@ def _followed(noise: Array, step: float, seconds: float, late: float) -> Array:
     return np.asarray(made[ahead : ahead + len(noise)])
 
 
-def _not_foretold(values: Array) -> Array:
-    """Return coefficients (2 `FORETOLD_BY` + 1,) of a sample's prediction error by its neighbours, from values (N,)."""
-    around = np.lib.stride_tricks.sliding_window_view(values, 2 * FORETOLD_BY + 1)
-    own, others = around[:, FORETOLD_BY], np.delete(around, FORETOLD_BY, axis=1)
+def _innovation_filter(values: Array) -> Array:
+    """Return coefficients (2 `NEIGHBOURS` + 1,) of a sample's prediction error by its neighbours, from values (N,)."""
+    around = np.lib.stride_tricks.sliding_window_view(values, 2 * NEIGHBOURS + 1)
+    own, others = around[:, NEIGHBOURS], np.delete(around, NEIGHBOURS, axis=1)
     square = others.T @ others
-    level = 1e-9 * float(np.trace(square)) / FORETOLD_BY + 1e-18  # simulated values may be exactly predictable
-    return np.insert(-np.linalg.solve(square + level * np.eye(2 * FORETOLD_BY), others.T @ own), FORETOLD_BY, 1.0)
+    level = 1e-9 * float(np.trace(square)) / NEIGHBOURS + 1e-18  # simulated values may be exactly predictable
+    return np.insert(-np.linalg.solve(square + level * np.eye(2 * NEIGHBOURS), others.T @ own), NEIGHBOURS, 1.0)
 
 
 def _mean(time: Array, values: Array, seconds: float) -> Array:

@@ -151,12 +151,12 @@ def cause_of_setting(water: Water | None) -> CauseOfScale | None:
     """Return the effect of the DVL's speed of sound on a scale that the motion does not show."""
     if water is None or water.speed is None or water.scale is None:
         return None
-    said = f"{_used(water)}; {_of_water(water, water.speed)}"
+    text = f"{_used(water)}; {_of_water(water, water.speed)}"
     if water.scale.least <= 0.0 <= water.scale.most:
-        return CauseOfScale(f"{_begun(said)}. They agree.", f"{water.used:.1f} m/s used, as this water has", math.nan)
+        return CauseOfScale(f"{_begun(text)}. They agree.", f"{water.used:.1f} m/s used, as this water has", math.nan)
     middle = 0.5 * (water.speed.least + water.speed.most)
     return CauseOfScale(
-        f"{_begun(said)}. That makes a scale of {_percent(water.scale)}: set the water's speed of sound.",
+        f"{_begun(text)}. That makes a scale of {_percent(water.scale)}: set the water's speed of sound.",
         f"{water.used:.1f} m/s used, but this water has {water.speed.least:.1f} to {water.speed.most:.1f}",
         math.nan if math.isnan(water.salinity) else middle,
     )
@@ -169,31 +169,31 @@ def cause(water: Water | None, scale: float, std: float) -> CauseOfScale | None:
     speed, explained = water.speed, water.scale
     found = Between(scale - 2.0 * std, scale + 2.0 * std)
     parts = ["" if math.isnan(water.used) else _used(water), "" if speed is None else _of_water(water, speed)]
-    said = f"Scale {100.0 * scale:+.2f} ± {200.0 * std:.2f} % (2σ): {'; '.join(filter(None, parts))}"
+    text = f"Scale {100.0 * scale:+.2f} ± {200.0 * std:.2f} % (2σ): {'; '.join(filter(None, parts))}"
     new = water.used / (1.0 + scale)
     if speed is None:
         return CauseOfScale(
-            f"{said}. Set to {new:.1f} m/s, it would read right.",
+            f"{text}. Set to {new:.1f} m/s, it would read right.",
             f"set to {new:.1f} m/s it would read right (the DVL used {water.used:.1f})",
             new,
         )
     if explained is None:
         was = [each * (1.0 + end) for each, end in zip(speed, found, strict=True)]
         return CauseOfScale(
-            f"{said}. The speed of sound explains the scale if the DVL was set to {was[0]:.0f} to {was[1]:.0f} m/s.",
+            f"{text}. The speed of sound explains the scale if the DVL was set to {was[0]:.0f} to {was[1]:.0f} m/s.",
             f"{speed.least:.1f} to {speed.most:.1f} m/s here; what the DVL used is not known",
             math.nan,
         )
     if not explained.meets(found):
         return CauseOfScale(
-            f"{said}. That explains {_percent(explained)}; the rest has another cause, such as beam angles or the "
+            f"{text}. That explains {_percent(explained)}; the rest has another cause, such as beam angles or the "
             f"reference. Set to {new:.1f} m/s, the DVL would read right in this water.",
             f"explains {_percent(explained)} of the scale, not the rest",
             new,
         )
     if found.least <= 0.0 <= found.most:
         return CauseOfScale(
-            f"{said}. The setting agrees with the scale that was found.",
+            f"{text}. The setting agrees with the scale that was found.",
             f"the DVL's {water.used:.1f} m/s agrees with the scale",
             math.nan,
         )
@@ -202,7 +202,7 @@ def cause(water: Water | None, scale: float, std: float) -> CauseOfScale | None:
         needed = water.salinities(Between(water.used / (1.0 + found.most), water.used / (1.0 + found.least)))
         condition = f" if the salinity is {needed.least:.0f} to {needed.most:.0f} PSU"
     return CauseOfScale(
-        f"{said}. That explains the scale{condition}: set the speed of sound to {new:.1f} m/s.",
+        f"{text}. That explains the scale{condition}: set the speed of sound to {new:.1f} m/s.",
         f"{new:.1f} m/s would take the scale out (the DVL used {water.used:.1f})",
         new,
     )
@@ -223,5 +223,5 @@ def _percent(scale: Between) -> str:
     return f"{100.0 * scale.least:+.2f} to {100.0 * scale.most:+.2f} %"
 
 
-def _begun(said: str) -> str:
-    return said[:1].upper() + said[1:]
+def _begun(text: str) -> str:
+    return text[:1].upper() + text[1:]

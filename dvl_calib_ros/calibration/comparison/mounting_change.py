@@ -23,7 +23,7 @@ from ...verdict.answering import Answering
 from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array, near_angles
-from ..numerics.tests import CHANCE, COVERED, FOUND, chance_of, chi2_sf, holm, smallest_found
+from ..numerics.tests import CHANCE, Z_95_PERCENT, Z_FIFTY_TESTS, chance_of, chi2_sf, holm, smallest_found
 from ..results.extrinsics import (
     ANGLES,
     COMPONENTS,
@@ -42,7 +42,7 @@ from ..results.mounting_quantities import date
 
 # False-alarm rates of one comparison, for any numbers of quantities and instants: of a mounting that has moved, and of
 # one that is suspicious. `CHANCE` is that of scale and delay.
-MOVED, SUSPICIOUS = chance_of(FOUND), chance_of(COVERED)
+MOVED, SUSPICIOUS = chance_of(Z_FIFTY_TESTS), chance_of(Z_95_PERCENT)
 # Standard deviation of a lever arm between recordings without a movement, m: the phase centre of a GNSS antenna wanders
 # by one to two centimetres with the satellites in view (IGS antenna calibrations)
 ARM_WANDERS_M = 0.015
@@ -150,7 +150,7 @@ class Comparison(Answering):
     pairs
         All pairs.
     moved, suspicious
-        Changes of angles or lever arm beyond `FOUND` σ, and beyond `COVERED` σ.
+        Changes of angles or lever arm beyond `Z_FIFTY_TESTS` σ, and beyond `Z_95_PERCENT` σ.
     suspected
         Rejected calibrations that differ from the accepted one next to them.
     scale_changed, clock_changed
@@ -359,18 +359,18 @@ _ANGLE_NAMES = COMPONENTS[ANGLES]
 
 def reasons(comparison: Comparison) -> list[Reason]:
     """Return the findings, the mounting first."""
-    said = [*map(moved, comparison.moved), *map(suspicious, comparison.suspicious)]
-    said = [*said, *map(suspected, comparison.suspected)] or [_same(comparison)]
-    said += map(scale_changed, comparison.scale_changed)
+    findings = [*map(moved, comparison.moved), *map(suspicious, comparison.suspicious)]
+    findings = [*findings, *map(suspected, comparison.suspected)] or [_same(comparison)]
+    findings += map(scale_changed, comparison.scale_changed)
     for change in comparison.clock_changed:
         seconds, std = float(change.difference.value[TIME_OFFSET]), float(change.difference.std[TIME_OFFSET])
         way = "later" if seconds > 0.0 else "earlier"
-        said.append(finding("DELAY_CHANGED", seconds=abs(seconds), std=std, way=way, between=between(change)))
+        findings.append(finding("DELAY_CHANGED", seconds=abs(seconds), std=std, way=way, between=between(change)))
     scatter = comparison.scatter
     if scatter.freedom and scatter.p < CHANCE:
         code = "SCATTER_BESIDE_MOVES" if comparison.moved or comparison.suspicious else "SCATTER"
-        said.append(finding(code, by=math.sqrt(scatter.value / scatter.freedom)))
-    return said
+        findings.append(finding(code, by=math.sqrt(scatter.value / scatter.freedom)))
+    return findings
 
 
 def _same(comparison: Comparison) -> Reason:
@@ -464,13 +464,13 @@ def between(change: Change) -> str:
 
 def comparison_document(comparison: Comparison) -> dict[str, Any]:
     """Return plain data for `compare --json`, in SI units."""
-    said, remarked = reasons(comparison), remarks(comparison)
+    findings, remarked = reasons(comparison), remarks(comparison)
     return {
         "verdict": comparison.word,
         "same_mounting": comparison.same_mounting,
-        "says": [each.full_sentence for each in said],
+        "says": [each.full_sentence for each in findings],
         "remarks": [str(each) for each in remarked],
-        "findings": [each.as_dict() for each in (*said, *remarked)],
+        "findings": [each.as_dict() for each in (*findings, *remarked)],
         "calibrations": [
             {name: getattr(each, name) for name in ("name", "model", "first_ns", "last_ns", "used", "rejected")}
             | {"value": _named(each.value), "std": _named(each.std)}

@@ -90,14 +90,14 @@ class FullEstimator(Estimator):
         self._n_taken = 0  # aligned rows copied so far
         self._block_ns: int | None = None  # start of the next block
         self._day_starts_ns: list[int] = []  # start of the first block of each day after the first
-        self._last_told = self._solver.outcome()
-        self._n_told = 0
+        self._last_result = self._solver.outcome()
+        self._n_updates = 0
         self._together = given.together
         self._gathered: list[Block] = []
         # blocks being solved: stamp of effect, result, index in the result
         self._coming: deque[tuple[int, Future[list[Outcome]], int]] = deque()
         self._gathered_ns: list[int] = []  # stamps of effect of the gathered blocks
-        self._is_telling = self._is_settled = False
+        self._is_updating = self._is_settled = False
         self._recording: tuple[ThinnedBlock, ThinnedRecording] | None = None  # cached for each model's verification
         self._suggested: tuple[Outcome, Reason | None] | None = None
         self._remembered: list[tuple[int, GaussianState, int, float]] = []
@@ -107,10 +107,10 @@ class FullEstimator(Estimator):
     # ------------------------------------------------------------------ what is known
 
     @property
-    def _told(self) -> Outcome:
+    def _result_in_effect(self) -> Outcome:
         """Newest result in effect."""
         self.settle()
-        return self._last_told
+        return self._last_result
 
     @property
     def n_taken(self) -> int:
@@ -123,20 +123,20 @@ class FullEstimator(Estimator):
         return self._gathered_ns[0] if self._gathered_ns else None
 
     def settle(self) -> None:
-        """Solve the gathered blocks, and let due results take effect."""
-        if self._gathered and not self._is_telling:
+        """Solve the gathered blocks and put due results into effect; do nothing if called by that."""
+        if self._gathered and not self._is_updating:
             self._solve_gathered()
             self._let_take_effect(self._aligner.reached_ns)
 
     @property
     def counts(self) -> ModelCounts:
         """Samples used, outliers (spikes and rejected residuals), and mean squared residual."""
-        return self._told.counts
+        return self._result_in_effect.counts
 
     @property
     def claims(self) -> bool:
         """Return whether it has used any data."""
-        return bool(self._told.days)
+        return bool(self._result_in_effect.days)
 
     @property
     def heading_deviation(self) -> GaussianState | None:
@@ -145,7 +145,7 @@ class FullEstimator(Estimator):
 
     def state(self) -> GaussianState:
         """Return the state of the newest day."""
-        days = self._told.days
+        days = self._result_in_effect.days
         return days[-1] if days else self._prior
 
     def of_recording(self) -> GaussianState:
@@ -159,7 +159,7 @@ class FullEstimator(Estimator):
         found: Array = np.zeros((N_STATE, N_STATE))
         if not self.claims:
             return found
-        registration = self._solver.registration() if self._is_settled else self._told.looked.registration
+        registration = self._solver.registration() if self._is_settled else self._result_in_effect.looked.registration
         if registration is not None:
             own = np.eye(len(_OPEN))
             own[:3, :3] = -self._parameters.rotation_dvl_from_body  # rotation and misalignment have opposite signs
@@ -212,22 +212,22 @@ class FullEstimator(Estimator):
 
     def rest(self, *, fresh: bool) -> Rest | None:
         """See `Estimator`."""
-        return self._idle_solver().rest() if fresh else self._told.looked.rest
+        return self._idle_solver().rest() if fresh else self._result_in_effect.looked.rest
 
     @property
     def registration_so_far(self) -> Registration | None:
         """Registration by the newest result in effect."""
-        return self._told.looked.registration
+        return self._result_in_effect.looked.registration
 
     @property
     def suggestion_so_far(self) -> Reason | None:
         """Suggestion by the newest result in effect, so that messages do not wait for a block being solved."""
-        return self._told.suggestion
+        return self._result_in_effect.suggestion
 
     @property
     def n_told(self) -> int:
         """Number of blocks in effect."""
-        return self._n_told
+        return self._n_updates
 
     @property
     def evidence(self) -> Evidence:
@@ -259,7 +259,7 @@ class FullEstimator(Estimator):
 
     def remember(self, from_ns: int) -> None:
         """Keep the current state for `states_at`."""
-        used, _, mean_nis, _, _ = self._told.counts
+        used, _, mean_nis, _, _ = self._result_in_effect.counts
         self._remembered.append((from_ns, self.state(), used, used * mean_nis if used else 0.0))
 
     def states_at(self, trace: StateTrace, numbers: Numbers, stamps_ns: Stamps) -> tuple[GaussianState, Counts, Array]:
@@ -279,24 +279,24 @@ class FullEstimator(Estimator):
         if self._is_settled:
             yield
             return
-        told, solver, starts_ns = self._told, self._solver, [*self._day_starts_ns]
-        self._last_told, self._is_settled = self._newest(), True
+        before, solver, starts_ns = self._result_in_effect, self._solver, [*self._day_starts_ns]
+        self._last_result, self._is_settled = self._newest(), True
         try:
             if incomplete := [self._copied(block_ns, is_last=True) for block_ns in self._incomplete()]:
                 self._solver = copy.deepcopy(solver)
-                self._last_told = self._solver.solve(incomplete)[-1]
+                self._last_result = self._solver.solve(incomplete)[-1]
             yield
         finally:
-            self._last_told, self._is_settled = told, False
+            self._last_result, self._is_settled = before, False
             self._solver, self._day_starts_ns = solver, starts_ns
 
     def _newest(self) -> Outcome:
         """Wait for the last complete block and return its result."""
         if self._is_settled:
-            return self._last_told
+            return self._last_result
         self._solve_gathered()
         if not self._coming:
-            return self._last_told
+            return self._last_result
         _, solved, number = self._coming[-1]
         return solved.result()[number]
 
@@ -358,30 +358,30 @@ class FullEstimator(Estimator):
 
     def _solve_gathered(self) -> None:
         if self._gathered:
-            blocks, told_ns = self._gathered, self._gathered_ns
+            blocks, effect_ns = self._gathered, self._gathered_ns
             self._gathered, self._gathered_ns = [], []
-            self._solve(blocks, told_ns)
+            self._solve(blocks, effect_ns)
 
-    def _solve(self, blocks: list[Block], told_ns: list[int]) -> None:
-        """Submit blocks to the worker. told_ns: stamps from which their results take effect."""
+    def _solve(self, blocks: list[Block], effect_ns: list[int]) -> None:
+        """Submit blocks to the worker. effect_ns: stamps from which their results take effect."""
         solver = self._solver
         solved = self._worker.submit(lambda: solver.solve(blocks))
-        self._coming.extend((from_ns, solved, number) for number, from_ns in enumerate(told_ns))
+        self._coming.extend((from_ns, solved, number) for number, from_ns in enumerate(effect_ns))
 
     def _let_take_effect(self, reached_ns: int) -> None:
         """Let results take effect that are due at a stamp, waiting for the worker if necessary."""
         if not self._coming or self._coming[0][0] > reached_ns:
             return
-        self._is_telling = True
+        self._is_updating = True
         try:
             while self._coming and self._coming[0][0] <= reached_ns:
                 from_ns, solved, number = self._coming.popleft()
-                self._last_told = solved.result()[number]
-                self._n_told += 1
-                if self._last_told.has_rows:
+                self._last_result = solved.result()[number]
+                self._n_updates += 1
+                if self._last_result.has_rows:
                     self._on_block(from_ns)
         finally:
-            self._is_telling = False
+            self._is_updating = False
 
     def _copied(self, block_ns: int, *, is_last: bool = False) -> Block:
         """Copy a block with its margins from the aligner. is_last: whether the run has ended."""
@@ -461,7 +461,7 @@ class FullEstimator(Estimator):
     @property
     def reference_claims(self) -> bool:
         """Return whether the reference's noise comes from its messages instead of a parameter."""
-        return self._told.claims > 0
+        return self._result_in_effect.claims > 0
 
     @property
     def recording(self) -> tuple[ThinnedRecording, int] | None:
@@ -487,7 +487,7 @@ class FullEstimator(Estimator):
         """See `Estimator`."""
         nominal, days = self._parameters.dvl_time_offset, []
         known, offset = self._unknown.p[DELAY, DELAY], np.arange(N_STATE)[REFERENCE_ERROR][:2]
-        states = self._told.days if self._day_starts_ns else ()
+        states = self._result_in_effect.days if self._day_starts_ns else ()
         for begins_ns, (x, p) in zip(first_ns, states, strict=False):
             std = np.sqrt(np.diag(p))
             (east, north), (east_std, north_std) = x[offset].tolist(), std[offset].tolist()

@@ -27,7 +27,7 @@ from .block_preprocessing import Block, Cleaned, cleaned, seconds
 from .estimator import Rest
 from .full_fit import JointFit
 from .full_forward_model import FitBlock, spline_slopes
-from .registration_schedule import KeptClocks, Looked, ToldSoFar
+from .registration_schedule import FitSoFar, KeptClocks, Looked
 
 # DVL and IMU are kept this far beyond a block, s: the longest delay, and the end of a spline.
 MARGIN_S = LONGEST_DELAY_S + 0.8
@@ -93,9 +93,9 @@ class BlockSolver:
         self.restarted = 0
 
     def outcome(self, has_rows: bool = False) -> Outcome:
-        """Return the current results."""
-        fit = self.fit
-        counts = ModelCounts(fit.used, fit.gated + self._spikes, fit.mean_misfit, 3.0, self.restarted)
+        """Return the results of all blocks so far. has_rows: whether any reference has been used."""
+        fit, gated = self.fit, self.fit.gated + self._spikes
+        counts = ModelCounts(fit.used, gated, fit.mean_misfit, mean_rows=3.0, restarted=self.restarted)
         return Outcome(tuple(fit.states), counts, self._claims, has_rows)
 
     def suggestion(self, *, fresh: bool = True) -> Reason | None:
@@ -121,8 +121,8 @@ class BlockSolver:
         return self._clocks.looked(self._so_far).rest
 
     @property
-    def _so_far(self) -> ToldSoFar | None:
-        return None if not self.fit.has_data else ToldSoFar(self.fit, self.epoch_ns)
+    def _so_far(self) -> FitSoFar | None:
+        return None if not self.fit.has_data else FitSoFar(self.fit, self.epoch_ns)
 
     @property
     def is_level(self) -> bool:

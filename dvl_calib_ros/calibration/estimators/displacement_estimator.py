@@ -73,8 +73,8 @@ class Displacements(Estimator):
         self._first_ns: int | None = None
         self._next_ns = self._oriented_ns = 0
         self._coming: deque[tuple[int, Future[_Look]]] = deque()
-        self._told = NO_LOOK
-        self._n_told = 0
+        self._last_result = NO_LOOK
+        self._n_updates = 0
         self._newest: tuple[int, DisplacementFit | None] = (0, None)  # of all legs, with their number
         self._folds: tuple[int, tuple[Legs, Index, list[GaussianState]]] | None = None  # with the number of fixes
         self._is_settled = False
@@ -132,9 +132,9 @@ class Displacements(Estimator):
     def _let_take_effect(self, reached_ns: int) -> None:
         while self._coming and self._coming[0][0] <= reached_ns:
             from_ns, solved = self._coming.popleft()
-            self._told = solved.result()
-            self._n_told += 1
-            if self._told.fit is not None:
+            self._last_result = solved.result()
+            self._n_updates += 1
+            if self._last_result.fit is not None:
                 self._on_look(from_ns)
 
     def finish(self) -> None:
@@ -156,7 +156,7 @@ class Displacements(Estimator):
 
     def _fit(self) -> DisplacementFit | None:
         if not self._is_settled:
-            return self._told.fit
+            return self._last_result.fit
         self.take_rows()
         legs = self._reckoning.legs()
         if self._newest[0] != len(legs.seconds):
@@ -183,14 +183,14 @@ class Displacements(Estimator):
     @property
     def n_told(self) -> int:
         """Number of solutions in effect."""
-        return self._n_told
+        return self._n_updates
 
     @property
     def evidence(self) -> Evidence:
         """Evidence that positions are too noisy or too sparse for velocities, once D1 has a fit."""
-        if self._told.fit is None:
+        if self._last_result.fit is None:
             return NO_EVIDENCE
-        noise = self._told.noise_mps
+        noise = self._last_result.noise_mps
         return Evidence("POSITIONS_NOISY", {"noise": noise}) if noise < math.inf else Evidence("POSITIONS_SELDOM")
 
     def remember(self, from_ns: int) -> None:

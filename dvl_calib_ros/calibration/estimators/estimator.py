@@ -291,7 +291,7 @@ def kind_of(model: Model) -> Callable[[EstimatorSetup], Estimator]:
         if not (isinstance(kind, type) and issubclass(kind, Estimator)):
             raise TypeError(f"{name} is no subclass of Estimator")
     except Exception as error:  # a plugin may raise anything
-        says = f"model {model.name}: its estimator {name} cannot be used ({type(error).__name__}: {error}); mend or "
+        says = f"model {model.name}: its estimator {name} cannot be used ({type(error).__name__}: {error}); repair or "
 
         def refuse(_: EstimatorSetup) -> Estimator:
             raise ParameterError(f"{says}uninstall that package")

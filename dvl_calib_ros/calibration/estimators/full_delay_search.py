@@ -23,7 +23,7 @@ def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameter
     """Return the DVL delay (s) that fits significantly better than the current one, or the current one."""
     if len(blocks) > SEARCHED_BLOCKS:
         return delay
-    rows = [_beside(joined, parameters) for _, joined in joined_blocks(blocks)]
+    rows = [_dvl_at_delays(joined, parameters) for _, joined in joined_blocks(blocks)]
     squares = _left_by_delay(rows) if rows else None
     if squares is None:
         return delay
@@ -34,7 +34,7 @@ def better_delay(blocks: Sequence[FitBlock], delay: float, parameters: Parameter
     return float(DELAYS_S[best]) if is_clear and abs(DELAYS_S[best] - delay) > STEP_S else delay
 
 
-class _Beside(NamedTuple):
+class _DvlAtDelays(NamedTuple):
     """References and the DVL at every delay: body (J, 3) m/s, velocity (K, J, 3) m/s, rates (J, 3) rad/s."""
 
     body: Array
@@ -42,7 +42,7 @@ class _Beside(NamedTuple):
     rates: Array
 
 
-def _beside(joined: JoinedBlocks, parameters: Parameters) -> _Beside:
+def _dvl_at_delays(joined: JoinedBlocks, parameters: Parameters) -> _DvlAtDelays:
     """Return the comparable references of blocks with the DVL at every delay."""
     reference = joined.reference
     rotation, oriented, rates, _, turning_known = joined.attitude_at(reference.times, parameters.imu_timeout)
@@ -51,10 +51,10 @@ def _beside(joined: JoinedBlocks, parameters: Parameters) -> _Beside:
     known &= turning_known & joined.measured[:, :2].all(axis=1)
     onto = np.where(reference.in_body[:, None, None], np.eye(3), rotation.swapaxes(1, 2))
     body = product(onto, np.where(joined.measured, reference.velocity, 0.0))
-    return _Beside(body[known], velocity[:, known], rates[known])
+    return _DvlAtDelays(body[known], velocity[:, known], rates[known])
 
 
-def _left_by_delay(each: Sequence[_Beside]) -> Array | None:
+def _left_by_delay(each: Sequence[_DvlAtDelays]) -> Array | None:
     """Return the squared residuals (K,) of a linear fit of forward and port velocity; None for too few rows.
 
     Velocity and rates of three axes have free coefficients, which include mounting, scale and lever arm.

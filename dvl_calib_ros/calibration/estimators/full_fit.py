@@ -80,7 +80,7 @@ class _Section(NamedTuple):
 
 @dataclass
 class _Day:
-    """Blocks of one recording or day, and their normal equations about the point of linearisation.
+    """Blocks of one day (recordings with one DVL delay), and their normal equations about the point of linearisation.
 
     count: number of blocks so far. sections: of the blocks whose streams are kept. before: chains of older blocks, with
     all sections and without each fold. chain: of all blocks. white: (3,) variance of a bin of weight one. single: (3,)
@@ -207,7 +207,7 @@ class JointFit:
             raise
 
     def _add(self, day: _Day, block: FitBlock) -> None:
-        """Add a block to its day, and renew the point of linearisation if due."""
+        """Add a block to its day. Linearise all blocks anew if their number is a power of two or x moved."""
         day.blocks.append(block)
         day.count += 1
         self._forget()
@@ -348,8 +348,8 @@ class JointFit:
         for at in reversed(suspicious):
             fewer = block.without(np.array([at]))
             (times, before), (also, after) = (self._misfits(day, each, x) for each in (block, fewer))
-            beside = np.abs(times - x[REFERENCE_DELAY] + x[DELAY] - block.dvl.times[at]) < block.interval_s
-            both = beside & np.isin(times, also, assume_unique=True)
+            near = np.abs(times - x[REFERENCE_DELAY] + x[DELAY] - block.dvl.times[at]) < block.interval_s
+            both = near & np.isin(times, also, assume_unique=True)
             left = after[np.searchsorted(also, times[both])].sum()
             if before[both].sum() - left > LEAST_GAIN and left < SHARE_LEFT * before[both].sum():
                 self._left_out += int(block.from_s <= block.dvl.times[at] < block.end_s)

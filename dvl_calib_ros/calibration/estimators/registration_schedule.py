@@ -134,7 +134,7 @@ class _Registered:
         )
 
 
-class ToldSoFar(NamedTuple):
+class FitSoFar(NamedTuple):
     """The fit of all blocks so far, and the stamp (ns) of its time 0."""
 
     fit: JointFit
@@ -177,12 +177,12 @@ class KeptClocks:
         self._seen.clear()
         self._blocks, self._latest = 0, Looked()
 
-    def look_again(self, told: ToldSoFar | None) -> None:
-        """Repeat the registration if there is enough new data. told: the fit so far; None without data."""
+    def look_again(self, fit_so_far: FitSoFar | None) -> None:
+        """Repeat the registration if there is enough new data. fit_so_far: the fit so far; None without data."""
         if self._over is None and self._blocks >= max(AGAIN_FROM * self._latest.blocks, FIRST_LOOK):
-            self._latest = self._look(told)
+            self._latest = self._look(fit_so_far)
 
-    def looked(self, told: ToldSoFar | None = None, *, fresh: bool = True) -> Looked:
+    def looked(self, fit_so_far: FitSoFar | None = None, *, fresh: bool = True) -> Looked:
         """Return the registration of the blocks so far, or of an earlier day with a contradiction.
 
         fresh: use all blocks, else those of the latest `look_again`.
@@ -190,14 +190,14 @@ class KeptClocks:
         if self._over is not None:
             return self._over
         if fresh and self._blocks > self._latest.blocks:
-            self._latest = self._look(told)
+            self._latest = self._look(fit_so_far)
         return self._latest
 
     def contradiction(self, looked: Looked) -> Reason | None:
         """Return the clock settings that fit the registration, if the configured ones do not."""
         return None if looked.registration is None else looked.registration.contradiction(self._parameters)
 
-    def _look(self, told: ToldSoFar | None) -> Looked:
+    def _look(self, fit_so_far: FitSoFar | None) -> Looked:
         """Register the kept blocks, unless registration is known."""
         motion = self._seen.motion() if self._known is None and len(self._seen) >= ENOUGH else None
         if motion is None:
@@ -209,20 +209,20 @@ class KeptClocks:
             configuration = fitting_configuration(
                 motion, declared, nominal, lever_arm, found, self._parameters.dvl_axes
             )
-            rest = self._rest(told) if self._is_live and told is not None else None
+            rest = self._rest(fit_so_far) if self._is_live and fit_so_far is not None else None
             return Looked(self._blocks, found, configuration, rest)
         except np.linalg.LinAlgError:  # the fit diverged
             return Looked(self._blocks)
 
-    def _rest(self, told: ToldSoFar) -> Rest:
+    def _rest(self, fit_so_far: FitSoFar) -> Rest:
         """Return the residuals of all kept blocks, each corrected by the fit without its fold."""
         recording, p = self._seen.recording(), self._parameters
-        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + told.epoch_ns
-        without = [[states[-1]] for states in told.fit.without_folds()]
-        state = told.fit.states[-1]
+        stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + fit_so_far.epoch_ns
+        without = [[states[-1]] for states in fit_so_far.fit.without_folds()]
+        state = fit_so_far.fit.states[-1]
         terms = [Terms.of_state(state.x) for [state] in without]
         return Rest(
-            told.fit.held_out_error(),
+            fit_so_far.fit.held_out_error(),
             typical_error(recording, Terms.of_state(state.x), p),
             recording.judged(p),
             dead_reckoned(
@@ -230,10 +230,10 @@ class KeptClocks:
                 folds_of(stamps_ns, p),
                 terms,
                 p,
-                told.epoch_ns,
+                fit_so_far.epoch_ns,
                 deviation_of(state),
-                told.fit.slow_noise,
-                told.fit.beam_fault(),
+                fit_so_far.fit.slow_noise,
+                fit_so_far.fit.beam_fault(),
             ),
             not recording.reference.in_body.any(),
         )

@@ -39,7 +39,7 @@ class Standing(NamedTuple):
 class StateTrace:
     """States after every stride-th DVL sample in order; the stride doubles when the limit is exceeded.
 
-    limit: most rows. expected: number of DVL samples, if known.
+    limit: largest number of stored rows. expected: number of DVL samples in the recording, 0 if unknown.
     """
 
     def __init__(self, limit: int, expected: int = 0) -> None:

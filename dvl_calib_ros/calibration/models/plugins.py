@@ -53,7 +53,7 @@ def _loaded(name: str, value: str, known: Mapping[str, Model]) -> dict[str, Mode
             raise ValueError(f"there is a model {model.name!r} already; give it another name")
     except Exception as error:  # another package may raise any error
         raise InputError(
-            f"model {name!r} of an installed package: cannot be used ({type(error).__name__}: {error}); mend or "
+            f"model {name!r} of an installed package: cannot be used ({type(error).__name__}: {error}); repair or "
             "uninstall that package"
         ) from error
     return {model.name: model}

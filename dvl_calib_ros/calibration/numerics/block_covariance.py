@@ -161,13 +161,13 @@ def _inflations(scores: Array, parts: Array, p: Array, variance: Array, lasts: f
         m = scores.shape[1]
         scatter = p @ scores.swapaxes(1, 2)
         longer = _lasting(scatter, lasts)
-        alike = alike_of(parts)
+        alike = effective_blocks(parts)
         found = (scatter**2).sum(axis=2) * (alike / (alike - 1.0)) * longer
         by_chance = claimed * (chi2_isf(CHANCE, m - 1) / (m - 1))
         beyond = found - claimed
         if rarely is not None:
             surely = np.maximum(found - claimed * (chi2_isf(rarely, m - 1) / (m - 1)), 0.0)
-            beyond = beyond + surely * (of_few(alike - 1.0) ** 2 - 1.0)
+            beyond = beyond + surely * (student_factor(alike - 1.0) ** 2 - 1.0)
         # the prior part of P is not judged by the data
         more = 1.0 + beyond / np.maximum(variance, 1e-300)
         factor = np.maximum(factor, np.where(found > by_chance, np.sqrt(np.maximum(more, 1.0)), 1.0))
@@ -184,13 +184,13 @@ def _paired(values: Array) -> Array:
     return pairs
 
 
-def alike_of(parts: Array) -> Array:
+def effective_blocks(parts: Array) -> Array:
     """Return the equivalent number (S, r) of blocks with equal shares, from shares (S, m, r)."""
     number = parts.sum(axis=1) ** 2 / np.maximum((parts**2).sum(axis=1), 1e-300)
     return np.clip(number, FEWEST_ALIKE, parts.shape[1])
 
 
-def of_few(dof: Array) -> Array:
+def student_factor(dof: Array) -> Array:
     """Return the factor of 3 σ if σ has few degrees of freedom: Student's t (Cornish and Fisher)."""
     return np.asarray(1.0 + 2.5 / dof + 5.75 / dof**2)
 
@@ -204,7 +204,7 @@ def _lasting(scatter: Array, lasts: float) -> Array:
     m = scatter.shape[-1]
     if m < LASTING_FROM:
         return np.ones(scatter.shape[:-1])
-    beside = (scatter[..., 1:] * scatter[..., :-1]).sum(axis=-1) / np.maximum((scatter**2).sum(axis=-1), 1e-300)
-    rho = np.clip((beside + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MOST_LASTING)
+    correlation = (scatter[..., 1:] * scatter[..., :-1]).sum(axis=-1) / np.maximum((scatter**2).sum(axis=-1), 1e-300)
+    rho = np.clip((correlation + 1.0 / m) / (1.0 - 4.0 / m), 0.0, MOST_LASTING)
     more = (1.0 + rho) / (1.0 - rho)
-    return np.asarray(np.where(beside > lasts / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))
+    return np.asarray(np.where(correlation > lasts / np.sqrt(m), more / np.maximum(1.0 - more / m, 0.5), 1.0))

@@ -17,16 +17,16 @@ import numpy as np
 
 from .frames import Array
 
-# Within the answer's own interval (95 %).
-COVERED = 2.0
-# Not by chance, where a recording is tested once: 0.3 %.
-BY_CHANCE = 3.0
-# Found by one of the fifty tests of a recording: 1 % for all, 2e-4 each.
-FOUND = 3.7
-# Sure where tests are repeated with every block for hours: 6e-7 each.
-SURE = 5.0
-# Sure next to the slow errors of references, attitudes and clocks at sea, which no model holds entirely.
-SURE_AT_SEA = 6.0
+# Standard scores. Two-sided 95 %: an error within the interval that the answer states.
+Z_95_PERCENT = 2.0
+# A recording is tested once: 0.3 %.
+Z_ONE_TEST = 3.0
+# One of about fifty tests of a recording: 1 % for all, 2e-4 each.
+Z_FIFTY_TESTS = 3.7
+# Tests repeated with every block for hours: 6e-7 each.
+Z_REPEATED_TEST = 5.0
+# Tests next to slow errors of references, attitudes and clocks at sea, which no model holds entirely.
+Z_SLOW_ERRORS = 6.0
 
 # False-alarm rate of a comparison of two recordings, or of held-out errors with their prediction.
 CHANCE = 0.01

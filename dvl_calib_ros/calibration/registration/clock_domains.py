@@ -91,7 +91,7 @@ class StreamClocks:
         self._ahead: dict[Stream, _Spread] = {stream: _Spread() for stream in (Stream.REFERENCE, Stream.IMU)}
         self._newest: dict[Stream, int] = {}  # live: newest stamp by stream, and values to be added
         self._waiting: dict[Stream, list[int]] = {stream: [] for stream in self._ahead}
-        self._said: tuple[Parameters, list[Reason]] | None = None  # of all messages so far
+        self._cached: tuple[Parameters, list[Reason]] | None = None  # of all messages so far
 
     def arrived(self, stream: Stream, stamp_ns: int) -> None:
         """Add one live message of a stream."""
@@ -100,7 +100,7 @@ class StreamClocks:
             for other, waiting in self._waiting.items():
                 if (newest := self._newest.pop(other, None)) is not None:
                     waiting.append(newest - stamp_ns)
-                    self._said = None
+                    self._cached = None
                 if len(waiting) == AT_ONCE:
                     self._add_waiting(other)
 
@@ -110,7 +110,7 @@ class StreamClocks:
 
     def add(self, streams: Streams) -> None:
         """Add blocks of recorded messages, in order."""
-        self._said = None
+        self._cached = None
         dvl = _read(streams.dvl)
         for stream, block in ((Stream.REFERENCE, streams.reference), (Stream.IMU, streams.imu)):
             other = _read(block)
@@ -120,9 +120,9 @@ class StreamClocks:
 
     def objections(self, parameters: Parameters) -> list[Reason]:
         """Return findings of clock offsets beyond the range of every model."""
-        if self._said is None or self._said[0] is not parameters:
-            self._said = parameters, self._objections(parameters)
-        return self._said[1]
+        if self._cached is None or self._cached[0] is not parameters:
+            self._cached = parameters, self._objections(parameters)
+        return self._cached[1]
 
     def _objections(self, parameters: Parameters) -> list[Reason]:
         ahead = {Stream.DVL: 0.0}
@@ -130,10 +130,10 @@ class StreamClocks:
             self._add_waiting(stream)
             if len(spread.kept):
                 ahead[stream] = float(median(1e-9 * spread.kept))
-        said = []
+        reasons = []
         for each in arrival_offset(ahead, parameters):
             known = WELL_KNOWN.get(round(abs(each.ahead)))
-            said.append(
+            reasons.append(
                 finding(
                     "CLOCKS_APART",
                     whose=SPOKEN[each.stream],
@@ -143,7 +143,7 @@ class StreamClocks:
                     known=f" ({known})" if known else "",
                 )
             )
-        return said
+        return reasons
 
 
 class _Spread:

@@ -16,9 +16,9 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.samples import Index, Mask
-from ..numerics.tests import RULED_OUT, SURE_AT_SEA
+from ..numerics.tests import RULED_OUT, Z_SLOW_ERRORS
 from ..streams.interpolation import DvlColumns, ImuColumns, TurnRates
-from .gauss_newton import APART, ARM, LATE, Fitted, MotionFit, N
+from .gauss_newton import ARM, DELTA, RHO, Fitted, MotionFit, N
 from .motion_streams import MotionStreams
 
 # Change of (δ, ρ) of a fit per second of delay of a stream.
@@ -77,7 +77,7 @@ class ClockChange:
         if self.leap > 0.0 and len(holes) == 1:
             return replace(self, at=float(times[holes[0] : holes[0] + 2].mean()))
         after = x.copy()
-        after[[APART, LATE]] += self.leap * np.array(DIRECTIONS[self.whose or "dvl"])
+        after[[DELTA, RHO]] += self.leap * np.array(DIRECTIONS[self.whose or "dvl"])
         (at, before), (later, behind) = (fit.costs(each, rotation, level) for each in (x, after))
         shared, own, other = np.intersect1d(at, later, return_indices=True)
         near = np.abs(fit.times[shared] - self.at) <= reach
@@ -86,9 +86,9 @@ class ClockChange:
         place = int(np.argmin(np.cumsum((before[own] - behind[other])[near])))
         seconds = float(fit.times[shared][near][place])
         # converted to DVL stamps, midway between those before and after a forward step
-        return replace(self, at=seconds + (float(x[APART]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
+        return replace(self, at=seconds + (float(x[DELTA]) + max(0.5 * self.leap, 0.0)) * (self.whose == "dvl"))
 
-    def taken_off(self, epoch_ns: int) -> dict[str, float]:
+    def corrections(self, epoch_ns: int) -> dict[str, float]:
         """Return the parameters that correct a change of the DVL clock. epoch_ns: stamp of time 0."""
         if self.whose != "dvl" or abs(self.drift) > MOST_DRIFT or abs(self.leap) > MOST_LEAP_S:
             return {}
@@ -96,7 +96,7 @@ class ClockChange:
             return {"dvl_clock_drift": round(self.drift, 7)}
         return {"dvl_time_jump": round(self.leap, 3), "dvl_time_jump_at": round(1e-9 * epoch_ns + self.at, 3)}
 
-    def steadied(self, motion: MotionStreams) -> MotionStreams:
+    def corrected(self, motion: MotionStreams) -> MotionStreams:
         """Return the motion with the change corrected."""
         m = motion
         if self.whose == "reference":
@@ -159,7 +159,7 @@ def unsteady(
     if len(times) < 2 * EACH_SIDE:
         return None
     # a delay without acceleration looks like a lever arm, which is the same in all stretches
-    states = [*range(N)[ARM], APART, LATE]
+    states = [*range(N)[ARM], DELTA, RHO]
     seen = np.array([each.x[states] for each in stretches])
     lags = np.diag([0.0] * 3 + [LAGS_S**2] * 2)
     # a stretch has few time blocks, so the autocorrelation of its residuals estimates lasting noise
@@ -186,7 +186,7 @@ def unsteady(
     # noise as long as a stretch adds scatter, so all evidence is scaled down
     scatter = max(1.0, left / (seen.size - len(states) - 1.0))
     std *= math.sqrt(scatter)
-    is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > SURE_AT_SEA * std
+    is_shown = still - left > GAIN * scatter and abs(value) * length > SHOWN_FROM_S and abs(value) > Z_SLOW_ERRORS * std
     if not is_shown or left > min(but_one) + ANYTHING * scatter or scatter > LEFT:
         return None
     others = min((each[0] for each in found if each[3] != name), default=np.inf)

@@ -16,7 +16,7 @@ from ...verdict.reasons import Reason, finding
 from ..models.parameters import FLU, FRD
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
-from ..numerics.tests import BY_CHANCE, SURE
+from ..numerics.tests import Z_ONE_TEST, Z_REPEATED_TEST
 from ..streams.interpolation import attitude_at
 from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion_streams import GAP_S, Curves, MotionStreams
@@ -96,7 +96,7 @@ SCALED_ALONE = 0.2
 # Largest misalignment (rad) and scale error of a right configuration.
 MISALIGNED, SCALED = math.radians(10.0), 0.1
 # Initial DVL delays, s: the range of a calibration, in steps that are short compared to waves.
-LATE_S = (0.0, -1.2, 1.2, -2.4, 2.4)
+DELAYS_S = (0.0, -1.2, 1.2, -2.4, 2.4)
 # A fit that hardly improves is given up above this multiple of the largest useful residual.
 FAR_ABOVE = 2.0
 # Constraints of alternative configurations: synchronised reference, configured lever arm.
@@ -132,10 +132,10 @@ def fitting_configuration(
         directions.add((motion.dvl.velocity @ nominal.T)[known], rotation[known])
         if directions.turn_with_heading:
             return finding("DVL_TURNS_WITH_HEADING")
-    curves = Curves(motion)
-    as_given = 1.0
+    curves, as_given = Curves(motion), 1.0
     if given is not None:
-        as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
+        angle = _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std)
+        as_given = _with_turn(given.residual, given.scale, angle)
     if as_given < WRONG_FROM:
         assert given is not None
         return wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes, SIGNS)
@@ -154,8 +154,8 @@ def fitting_configuration(
     if not found:
         return None
     # of two similar fits the configured frame is likelier
-    best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
-    if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
+    best = min(found, key=lambda frame: found[frame].residual * (math.sqrt(0.5) if frame is declared else 1.0))
+    if found[best].residual > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
     wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
@@ -174,32 +174,32 @@ def nearest(
     held: rows of states held at zero. most: residual (m/s) above which a fit that hardly improves is given up.
     """
     best: Fitted | None = None
-    for late in LATE_S:
-        one = fit(0.0, late, rotation_body_from_dvl, held, most=most if best is None else min(most, best.level))
+    for delay_s in DELAYS_S:
+        one = fit(0.0, delay_s, rotation_body_from_dvl, held, most=most if best is None else min(most, best.level))
         if one is not None and np.isfinite(one.x).all() and (best is None or one.level < best.level):
             best = one
     return best
 
 
-def misfit(one: Fitted, nominal: Array, left: float | None = None) -> float:
+def misfit(one: Fitted, nominal: Array, residual: float | None = None) -> float:
     """Return the misfit with a mounting (3, 3) as a share of the speed; a rotation beyond misalignment counts.
 
-    left: residual share to use instead of the fit's own.
+    residual: share to use instead of the fit's own.
     """
     turned = _shown_turn(one.rotation_body_from_dvl, nominal, one.std[TURN])
-    return _left(one.left if left is None else left, float(one.x[SCALE]), turned)
+    return _with_turn(one.residual if residual is None else residual, float(one.x[SCALE]), turned)
 
 
 def _shown_turn(rotation: Array, nominal: Array, std: Array) -> float:
     """Return the significant angle (rad) between two mountings (3, 3). std: (3,) rad per body axis."""
     about = np.abs(turn_between(nominal, rotation))
-    return float(np.linalg.norm(np.maximum(about - BY_CHANCE * std, 0.0)))
+    return float(np.linalg.norm(np.maximum(about - Z_ONE_TEST * std, 0.0)))
 
 
-def _left(left: float, scale: float, turned: float) -> float:
+def _with_turn(residual: float, scale: float, turned: float) -> float:
     """Return the residual share, increased by rotation (rad) and scale if they exceed a misalignment."""
     is_misalignment = turned < MISALIGNED and abs(scale) < SCALED
-    return left if is_misalignment else math.hypot(left, 2.0 * math.sin(0.5 * turned), scale)
+    return residual if is_misalignment else math.hypot(residual, 2.0 * math.sin(0.5 * turned), scale)
 
 
 def _as_if(motion: MotionStreams, declared: VelocityFrame, frame: VelocityFrame) -> MotionStreams:
@@ -239,11 +239,11 @@ def wrong_axes(
         return None
     _, signs, near = min(found, key=lambda each: each[0])
     fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), MOST_ROWS)
-    fitted = fit(0.0, near.dvl_late, nominal, (REFERENCE,))
+    fitted = fit(0.0, near.dvl_delay_s, nominal, (REFERENCE,))
     if fitted is None or fitted.level > most:
         return None
     factors, std = fit.axis_factors(fitted, nominal)
-    is_shown, is_turned = factors > SURE * std, signs < 0.0
+    is_shown, is_turned = factors > Z_REPEATED_TEST * std, signs < 0.0
     if is_turned[ahead]:  # a mounting unless all signs are observable
         axis = "each of x, y and z" if is_turned.all() else "xyz"[ahead]
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None
@@ -257,7 +257,7 @@ def wrong_axes(
         if ahead:
             return _mounting_fits(nominal @ np.diag(np.where(np.arange(3) == ahead, 1.0, -1.0)))
         return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
-    too_small = np.where(is_shown, (factors - SURE * std) / factors[ahead] - SCALED_ALONE, 0.0)
+    too_small = np.where(is_shown, (factors - Z_REPEATED_TEST * std) / factors[ahead] - SCALED_ALONE, 0.0)
     if not is_turned.any() and too_small.max() > 1.0:
         at = int(np.argmax(too_small))
         factor = float(factors[ahead] / factors[at])

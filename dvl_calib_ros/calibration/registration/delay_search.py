@@ -73,8 +73,8 @@ def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> lis
             break
         place = ClockPlace(float(by_reference[r]), float(by_dvl[d]), float(misfit[r, d]))
         found.append(place)
-        beside = np.abs(by_reference - place.reference)[:, None] < APART_S
-        misfit[beside & (np.abs(by_dvl - place.dvl) < APART_S)] = np.inf
+        near = np.abs(by_reference - place.reference)[:, None] < APART_S
+        misfit[near & (np.abs(by_dvl - place.dvl) < APART_S)] = np.inf
     return found
 
 

@@ -51,7 +51,7 @@ FITS = 0.3
 # Largest residual ratio that justifies a rotation about the direction of travel.
 ROLLED = 0.8
 # Equivalent number of independent samples of a comparison, and smallest residual, as a share of the speed.
-INDEPENDENT, LEAST_LEFT = 4.0, 0.005
+INDEPENDENT, LEAST_RESIDUAL = 4.0, 0.005
 # Smallest mean sideways velocity of a vehicle that travels sideways, as a share of the speed.
 SIDEWAYS = 0.5
 # Smallest RMS turn rate that determines the axes, rad/s.
@@ -113,14 +113,14 @@ class Reading:
 class Agreement:
     """Agreement of DVL and reference under one reading.
 
-    left: RMS residual as a share of the speed, with the given mounting or else the best one. rotation_dvl_from_body:
-    (3, 3) best rotation; best_left: its residual. is_ahead: the vehicle mostly moves ahead or astern, not sideways.
+    residual: RMS as a share of the speed, with the given mounting or else the best one. rotation_dvl_from_body:
+    (3, 3) best rotation; best_residual: its residual. is_ahead: the vehicle mostly moves ahead or astern, not sideways.
     """
 
     reading: Reading
-    left: float
+    residual: float
     rotation_dvl_from_body: Array
-    best_left: float
+    best_residual: float
     is_ahead: bool
 
     @property
@@ -132,11 +132,11 @@ class Agreement:
 class Registered(NamedTuple):
     """Registration of a reading.
 
-    left: residual as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, lever arm beyond the
+    residual: as a share of the speed. rotation_dvl_from_body: (3, 3). arm, arm_std: (3,) m, lever arm beyond the
     configured one, and its σ.
     """
 
-    left: float
+    residual: float
     rotation_dvl_from_body: Array
     arm: Array
     arm_std: Array
@@ -167,22 +167,22 @@ class Readings:
         """Return the number of simultaneous velocities."""
         return len(self._at)
 
-    def beside_noise(self, left: float) -> float:
+    def without_noise(self, residual: float) -> float:
         """Return a residual share without the white noise of the reference."""
         square = float(squared(self._dvl).mean())
-        return math.sqrt(max(left**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
+        return math.sqrt(max(residual**2 - 3.0 * white_noise(self._motion.reference) / max(square, 1e-9), 0.0))
 
-    def log_likelihood(self, left: float) -> float:
+    def log_likelihood(self, residual: float) -> float:
         """Return the tempered log likelihood of a residual share, corrected for the reference noise.
 
         Errors by lever arms, delays and waves are correlated, so few samples count (`INDEPENDENT`).
         """
-        return self.log_likelihood_registered(self.beside_noise(left))
+        return self.log_likelihood_registered(self.without_noise(residual))
 
     @staticmethod
-    def log_likelihood_registered(left: float) -> float:
+    def log_likelihood_registered(residual: float) -> float:
         """Return the tempered log likelihood of a registration residual, noise included."""
-        return -3.0 * INDEPENDENT * math.log(max(left, LEAST_LEFT))
+        return -3.0 * INDEPENDENT * math.log(max(residual, LEAST_RESIDUAL))
 
     def agreements(self, readings: Sequence[Reading], rotation_dvl_from_body: Array | None) -> list[Agreement]:
         """Compare all possible readings with synchronised clocks. Return the best first.
@@ -210,13 +210,13 @@ class Readings:
             errors = squared(dvl - body @ best.T)
             kept = errors <= np.sort(errors)[int(KEPT_SHARE * (len(errors) - 1))]
             best = best_rotation(dvl[kept], body[kept], likely)
-            best_left = _rms(dvl - body @ best.T) / speed
-            left = best_left if known is None else _rms(dvl - body @ known.T) / speed
+            best_residual = _rms(dvl - body @ best.T) / speed
+            residual = best_residual if known is None else _rms(dvl - body @ known.T) / speed
             travel = np.abs(body.mean(axis=0) if known is None else (dvl @ known).mean(axis=0))
             is_ahead = bool(travel[1] < max(travel[0], SIDEWAYS * speed))
-            found.append(Agreement(reading, left, best, best_left, is_ahead))
+            found.append(Agreement(reading, residual, best, best_residual, is_ahead))
         # a small penalty prefers the smaller rotation; rounding makes ties stable (two inverted worlds fit equally)
-        return sorted(found, key=lambda each: round(each.left + (0.02 * each.angle if known is None else 0.0), 9))
+        return sorted(found, key=lambda each: round(each.residual + (0.02 * each.angle if known is None else 0.0), 9))
 
     def registered(self, reading: Reading, rotation_dvl_from_body: Array | None) -> Registered:
         """Register a reading with free lever arm and DVL delay.
@@ -235,17 +235,17 @@ class Readings:
             found = nearest(fit, nominal, (REFERENCE,)) if fit else None
             if found is None:
                 return NOT_REGISTERED
-            left = math.sqrt(float(_better(found.squares).mean())) / max(found.speed, 1e-9)
+            residual = math.sqrt(float(_better(found.squares).mean())) / max(found.speed, 1e-9)
             given = found.rotation_body_from_dvl if nominal is None else nominal
             rotation_found = turn @ found.rotation_body_from_dvl.T
-            return Registered(misfit(found, given, left), rotation_found, found.x[ARM], found.std[ARM])
+            return Registered(misfit(found, given, residual), rotation_found, found.x[ARM], found.std[ARM])
 
         if rotation_dvl_from_body is not None:
             return of(rotation_dvl_from_body)
         best = of(None)
         turned = of(best.rotation_dvl_from_body @ FLU_FROM_FRD)
         upright, other = sorted((best, turned), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
-        return other if other.left < CLEARLY * upright.left else upright
+        return other if other.residual < CLEARLY * upright.residual else upright
 
     def are_axes_mirrored(self, reading: Reading, found: Array, rotation_dvl_from_body: Array) -> bool:
         """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
@@ -261,7 +261,7 @@ class Readings:
         """Return a rotation (3, 3) without roll about the direction of travel, unless the data need it."""
         travel = (self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl).mean(axis=0)
         least = _least_turn(rotation_dvl_from_body.T @ travel, travel)
-        is_needed = ROLLED * self.agreements([found.reading], least)[0].left > found.best_left
+        is_needed = ROLLED * self.agreements([found.reading], least)[0].residual > found.best_residual
         return rotation_dvl_from_body if is_needed else least
 
     def is_in_body(self, found: Agreement) -> bool:

@@ -24,8 +24,8 @@ from ..numerics.tests import chi2_isf
 from ..streams.interpolation import attitude_at
 from .motion_streams import GAP_S, Curves, MotionStreams
 
-# States: turn (rad, body), scale, lever arm (m), δ (s), ρ (s).
-TURN, SCALE, ARM, APART, LATE = slice(0, 3), 3, slice(4, 7), 7, 8
+# States: rotation (rad, body), scale, lever arm (m), delays δ and ρ (s).
+TURN, SCALE, ARM, DELTA, RHO = slice(0, 3), 3, slice(4, 7), 7, 8
 N = 9
 # Rows whose product with the state is the delay of DVL or reference,
 DVL: Array = np.array([0.0] * 7 + [1.0, 1.0])
@@ -108,7 +108,7 @@ class Fitted(NamedTuple):
         return float(_robust(self.squares[np.searchsorted(self.at, among)], self.axes, level).sum())
 
     @property
-    def left(self) -> float:
+    def residual(self) -> float:
         """Residual as a share of the speed."""
         return self.level * math.sqrt(3.0) / max(self.speed, 1e-9)
 
@@ -123,14 +123,14 @@ class Fitted(NamedTuple):
         return np.asarray(of_white / of_white[state])
 
     @property
-    def dvl_late(self) -> float:
+    def dvl_delay_s(self) -> float:
         """DVL delay τ, s."""
-        return float(self.x[APART] + self.x[LATE])
+        return float(self.x[DELTA] + self.x[RHO])
 
     @property
     def dvl_std(self) -> float:
         """σ of the DVL delay τ, s."""
-        return float(np.sqrt(max(self.p[[APART, APART, LATE, LATE], [APART, LATE, APART, LATE]].sum(), 0.0)))
+        return float(np.sqrt(max(self.p[[DELTA, DELTA, RHO, RHO], [DELTA, RHO, DELTA, RHO]].sum(), 0.0)))
 
 
 class AxisFactors(NamedTuple):
@@ -196,7 +196,7 @@ class MotionFit:
         if rotation is None:
             return None
         x = np.zeros(N)
-        x[APART], x[LATE] = apart, reference
+        x[DELTA], x[RHO] = apart, reference
         nominal = rotation
         solved = None
         if not self.is_turned:
@@ -211,7 +211,7 @@ class MotionFit:
             if number >= ROUNDS_TO_FALL and level > max(most, HARDLY_LESS * left):
                 return None
             left = level
-            far = float(np.abs(step[[APART, LATE]]).max())
+            far = float(np.abs(step[[DELTA, RHO]]).max())
             step = step * min(1.0, FARTHEST_S / max(far, 1e-9))
             x = x + step
             rotation = rotation_of(step[TURN]) @ rotation
@@ -250,11 +250,11 @@ class MotionFit:
         axes = rows.residual.shape[1]
         weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_AT**2 * axes * fitted.level**2))
         own = self._axes_of_dvl(fitted, rows, rotation)
-        kept = [*range(N)[TURN], *range(N)[ARM], APART]
+        kept = [*range(N)[TURN], *range(N)[ARM], DELTA]
         h = np.concatenate([own, rows.jacobian[:, :, kept]], axis=2).reshape(-1, 3 + len(kept))
         w = np.repeat(weight, axes) / fitted.level**2
         from_prior = fitted.x.copy()
-        from_prior[TURN], from_prior[APART] = turn_between(nominal, rotation), 0.0
+        from_prior[TURN], from_prior[DELTA] = turn_between(nominal, rotation), 0.0
         prior = np.concatenate([np.full(3, WIDEST_FACTOR**-2.0), LIKELY[kept] ** -2.0])
         information = (h * w[:, None]).T @ h + np.diag(prior)
         vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), from_prior[kept]])
@@ -267,7 +267,7 @@ class MotionFit:
 
     def _axes_of_dvl(self, fitted: Fitted, rows: _Rows, rotation: Array) -> Array:
         """Return the derivative (J, A, 3) m/s of the residuals with respect to the axis factors."""
-        streams = self._streams(float(fitted.x[LATE]), float(fitted.x[APART]))
+        streams = self._streams(float(fitted.x[RHO]), float(fitted.x[DELTA]))
         assert streams is not None
         _, (_, _, velocity, _, attitude, _) = streams
         own = -(1.0 + fitted.x[SCALE]) * velocity[:, None, :] * rotation
@@ -303,7 +303,7 @@ class MotionFit:
         """Return a mask (J,) of references whose DVL samples and attitudes another fit compares, too."""
         there, shared = self.times[other.at], np.zeros(len(self.times), dtype=bool)
         shared[other.at] = True
-        for here, elsewhere in ((apart, float(other.x[APART])), (-reference, -float(other.x[LATE]))):
+        for here, elsewhere in ((apart, float(other.x[DELTA])), (-reference, -float(other.x[RHO]))):
             at = self.times + here
             shared &= (at >= there[0] + elsewhere) & (at <= there[-1] + elsewhere)
         return shared
@@ -319,7 +319,7 @@ class MotionFit:
 
     def _rows(self, x: Array, rotation: Array, among: Fitted | None) -> _Rows | None:
         """Linearise the residuals about a state, in the measured axes; None if too few overlap."""
-        streams = self._streams(float(x[LATE]), float(x[APART]), among)
+        streams = self._streams(float(x[RHO]), float(x[DELTA]), among)
         if streams is None:
             return None
         at, (body, rates, velocity, slope, attitude, gain) = streams
@@ -329,8 +329,8 @@ class MotionFit:
         jacobian[:, :, TURN] = skew(own)
         jacobian[:, :, SCALE] = -velocity @ rotation.T
         jacobian[:, :, ARM] = skew(rates)
-        jacobian[:, :, APART] = -(1.0 + x[SCALE]) * slope @ rotation.T
-        jacobian[:, :, LATE] = cross(rates, body)
+        jacobian[:, :, DELTA] = -(1.0 + x[SCALE]) * slope @ rotation.T
+        jacobian[:, :, RHO] = cross(rates, body)
         measured = np.array(self._motion.measured)
         if not measured.all():
             if self._motion.in_earth:
@@ -358,11 +358,11 @@ class MotionFit:
         weighted = (h * w[:, None]).T
         information = weighted @ h + np.diag(prior)
         # DVL noise in the slope counts as information on δ: subtract it, but less than the marginal information on δ
-        marginal = 1.0 / float(np.linalg.inv(information)[APART, APART])
-        information[APART, APART] -= min(float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * marginal)
+        marginal = 1.0 / float(np.linalg.inv(information)[DELTA, DELTA])
+        information[DELTA, DELTA] -= min(float(weight @ rows.of_noise) / level2, MOST_OF_NOISE * marginal)
         from_prior = x.copy()
         from_prior[TURN] = turn_between(nominal, rotation)
-        from_prior[[APART, LATE]] = 0.0
+        from_prior[[DELTA, RHO]] = 0.0
         vector = -weighted @ rows.residual.ravel() - prior * from_prior
         for row in in_time:
             information += HELD_STD_S**-2.0 * np.outer(row, row)
@@ -378,7 +378,7 @@ def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Cl
         w = np.repeat(weight[part], rows.residual.shape[1])[:, None] / level**2
         blocks.add(((h * w).T @ h)[None], (-(h * w).T @ rows.residual[part].ravel())[None], float(len(h)))
     factor = blocks.inflation(0, np.zeros(N), p, LASTS_BEYOND_DOUBT, None)
-    inflation = max(float(factor[[APART, LATE]].max()), _lasting(rows.residual))
+    inflation = max(float(factor[[DELTA, RHO]].max()), _lasting(rows.residual))
     return Claimed(p * np.outer(factor, factor), inflation, factor)
 
 

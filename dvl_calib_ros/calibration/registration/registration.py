@@ -16,19 +16,19 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
-from ..numerics.tests import FOUND, RULED_OUT
+from ..numerics.tests import RULED_OUT, Z_FIFTY_TESTS
 from .clock_drift_and_jumps import MOST_STRETCHES, STRETCH_S, ClockChange, stamps, unsteady
 from .delay_search import LONGEST_S, places
 from .gauss_newton import (  # fmt: skip
-    APART,
     ARM,
     BOTH_ALIKE,
+    DELTA,
     DVL,
     FEW_ROWS,
     HELD_STD_S,
-    LATE,
     MOST_ROWS,
     REFERENCE,
+    RHO,
     SCALE,
     TURN,
     Fitted,
@@ -39,7 +39,7 @@ from .motion_streams import Curves, MotionStreams
 
 # Smallest delay that is reported, s. It shifts a lever arm by a tenth of a second times the speed. Interpolated
 # attitudes and the filters of an INS have smaller delays (five real recordings: 0.03 to 0.07 s).
-SAID_FROM_S = 0.1
+REPORTED_FROM_S = 0.1
 # Chi-square that each additional delayed clock must gain.
 ONE_MORE = 12.0
 # Chi-square by which the next explanation must be worse for a refusal, if the σ of the calibration cover the delay. The
@@ -82,7 +82,7 @@ OPEN_FROM_RAD = math.radians(0.1)
 class Clock:
     """Delay (s) of stamps relative to the IMU, positive if late; its σ (s); whether it is significant."""
 
-    late: float
+    delay_s: float
     std: float
     is_shown: bool
 
@@ -96,10 +96,10 @@ class Registration:
     and the reference is assumed synchronised. are_known: the data determine the delays.
 
     rotation_body_from_dvl (3, 3), turn_std (3,) rad. lever_arm, lever_arm_std (3,) m: DVL from the reference point,
-    body frame. scale, scale_std: DVL scale error, dimensionless. left: residual as a share of the speed; spread:
+    body frame. scale, scale_std: DVL scale error, dimensionless. residual: as a share of the speed; spread:
     residual per axis, m/s; speed: RMS, m/s. unsteady: clock drift or step; all other fields hold after its correction.
 
-    open_late: σ (s) of the reference delay from the data alone. open_by: (7,) derivatives of the DVL's rotation (rad,
+    open_std_s: σ (s) of the reference delay from the data alone. open_by: (7,) derivatives of the DVL's rotation (rad,
     body), lever arm (m) and DVL delay (s) with respect to it. next_worse: chi-square margin to the next explanation.
     """
 
@@ -115,10 +115,10 @@ class Registration:
     lever_arm_std: Array
     scale: float
     scale_std: float
-    left: float
+    residual: float
     spread: float
     speed: float
-    open_late: float
+    open_std_s: float
     open_by: Array
     next_worse: float
     unsteady: ClockChange | None = None
@@ -129,7 +129,7 @@ class Registration:
 
         Zero if negligible. At one speed a delay looks like a lever arm, at one turn rate like a yaw.
         """
-        open_by = self.open_by * _with_prior(self.open_late)
+        open_by = self.open_by * _with_prior(self.open_std_s)
         turn, arm = (float(np.linalg.norm(part)) for part in (open_by[:3], open_by[3:6]))
         is_little = arm < OPEN_FROM_M and turn < OPEN_FROM_RAD
         return np.zeros((7, 7)) if is_little else np.outer(open_by, open_by)
@@ -138,26 +138,26 @@ class Registration:
     def offsets(self) -> dict[str, float]:
         """Significant delays (s) beyond the configured ones, by parameter name."""
         if self.imu.is_shown:
-            return {"imu_time_offset": self.imu.late}
-        if not self.is_turned and self.apart.is_shown and self.apart.late < 0.0:
+            return {"imu_time_offset": self.imu.delay_s}
+        if not self.is_turned and self.apart.is_shown and self.apart.delay_s < 0.0:
             # the delayed clock is not identifiable; late stamps are likelier than early ones
-            return {"reference_time_offset": -self.apart.late}
+            return {"reference_time_offset": -self.apart.delay_s}
         clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference}
-        return {name: clock.late for name, clock in clocks.items() if clock.is_shown}
+        return {name: clock.delay_s for name, clock in clocks.items() if clock.is_shown}
 
     @property
-    def taken_off(self) -> dict[str, float]:
+    def corrections(self) -> dict[str, float]:
         """Delays (s) that a calibration corrects, by parameter; it estimates a small DVL delay itself."""
-        found = {name: round(late, 3) for name, late in self.offsets.items()}
+        found = {name: round(delay_s, 3) for name, delay_s in self.offsets.items()}
         is_little = found.keys() == {"dvl_time_offset"} and abs(found["dvl_time_offset"]) < LEFT_TO_CALIBRATION_S
         return {} if is_little else found
 
-    def told(self, name: str) -> Reason:
+    def clock_reason(self, name: str) -> Reason:
         """Return the finding of the delay that a parameter corrects."""
         clocks = {"dvl_time_offset": self.dvl, "reference_time_offset": self.reference, "imu_time_offset": self.imu}
         if not self.is_turned and name == "reference_time_offset":
-            clocks[name] = replace(self.apart, late=-self.apart.late)
-        clock = clocks[name]
+            clocks[name] = replace(self.apart, delay_s=-self.apart.delay_s)
+        clock, whose = clocks[name], OFFSETS[name]
         if name == "imu_time_offset":
             against = "DVL and reference"
         else:
@@ -165,7 +165,7 @@ class Registration:
             if self.is_turned:
                 against = "IMU" if other.is_shown else f"{against} and IMU"
         return finding(
-            "CLOCK_OFF", whose=OFFSETS[name], seconds=abs(clock.late), std=clock.std, way=_way(clock), against=against
+            "CLOCK_OFF", whose=whose, seconds=abs(clock.delay_s), std=clock.std, way=_way(clock), against=against
         )
 
     def contradiction(self, parameters: Parameters) -> Reason | None:
@@ -174,23 +174,23 @@ class Registration:
             return self.unsteady.reason
         name, clock = ("imu_time_offset", self.imu) if self.imu.is_shown else ("reference_time_offset", self.reference)
         if not clock.is_shown or (self.next_worse < REFUSED_FROM and self._holds(clock)):
-            return self.not_told_apart
-        offset = round(getattr(parameters, name) + clock.late, 2)
-        off = {"seconds": abs(clock.late), "way": _way(clock), "parameter": name, "offset": offset}
+            return self.ambiguity
+        offset = round(getattr(parameters, name) + clock.delay_s, 2)
+        off = {"seconds": abs(clock.delay_s), "way": _way(clock), "parameter": name, "offset": offset}
         if clock is self.reference and self.dvl.is_shown:
-            return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.late), dvl_way=_way(self.dvl), **off)
+            return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.delay_s), dvl_way=_way(self.dvl), **off)
         return finding("CLOCK_LATE", whose=OFFSETS[name], **off)
 
     def _holds(self, clock: Clock) -> bool:
         """Return whether the σ of a calibration that assumes synchronisation cover the delay of a clock."""
-        return bool(self.left_open.any()) and abs(clock.late) < FAR_OPEN * _with_prior(self.open_late)
+        return bool(self.left_open.any()) and abs(clock.delay_s) < FAR_OPEN * _with_prior(self.open_std_s)
 
     @property
-    def not_told_apart(self) -> Reason | None:
+    def ambiguity(self) -> Reason | None:
         """Finding of a large relative delay whose clock is not identifiable, or None."""
-        if self.offsets or not self.apart.is_shown or abs(self.apart.late) < LEFT_TO_CALIBRATION_S:
+        if self.offsets or not self.apart.is_shown or abs(self.apart.delay_s) < LEFT_TO_CALIBRATION_S:
             return None
-        return finding("CLOCKS_NOT_TOLD_APART", seconds=abs(self.apart.late), std=self.apart.std)
+        return finding("CLOCKS_NOT_TOLD_APART", seconds=abs(self.apart.delay_s), std=self.apart.std)
 
 
 def register(motion: MotionStreams, rotation_body_from_dvl: Array | None, lever_arm: Array) -> Registration | None:
@@ -217,12 +217,12 @@ def _registered(
     if moves is None and best.inflation > STEADY:
         moves = _unsteady(motion, curves, lever_arm, rotation_body_from_dvl)
         if moves is not None:
-            found = _registered(moves.steadied(motion), rotation_body_from_dvl, lever_arm, moves)
+            found = _registered(moves.corrected(motion), rotation_body_from_dvl, lever_arm, moves)
             # several delays fit each stretch in waves; a real clock change lowers the total residual
             if found is not None and found.spread < best.level:
                 x = np.zeros(N)
                 x[SCALE], x[ARM] = found.scale, found.lever_arm - lever_arm
-                x[APART], x[LATE] = found.dvl.late - found.reference.late, found.reference.late
+                x[DELTA], x[RHO] = found.dvl.delay_s - found.reference.delay_s, found.reference.delay_s
                 return replace(found, unsteady=moves.timed(motion, fit, x, found.rotation_body_from_dvl, found.spread))
     in_time = _held(quick, best, rotation_body_from_dvl)
     if in_time[1] < NO_DOUBT:  # the full fit would add no evidence
@@ -230,13 +230,13 @@ def _registered(
         if not seen.left_open.any():
             return seen
         # more references determine the reference clock better
-        free = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
+        free = fit(float(best.x[RHO]), float(best.x[DELTA]), rotation_body_from_dvl)
         if free is None or not _is_possible(free):
             return seen
         if _held(fit, free, rotation_body_from_dvl)[1] < NO_DOUBT:
             return replace(seen, **_open(fit, free, 0.0, rotation_body_from_dvl))
         best = free
-    best = fit(float(best.x[LATE]), float(best.x[APART]), rotation_body_from_dvl)
+    best = fit(float(best.x[RHO]), float(best.x[DELTA]), rotation_body_from_dvl)
     if best is None or not _is_possible(best):
         return None
     return _explained(fit, best, _held(fit, best, rotation_body_from_dvl), rotation_body_from_dvl, lever_arm)
@@ -254,7 +254,7 @@ def _placed(motion: MotionStreams, quick: MotionFit, rotation: Array | None) -> 
     closest = min(fitted, key=lambda each: each.level)
     # repeated legs agree at several delays
     as_good = [each for each in fitted if _is_as_good(motion, quick, each, closest, rotation)]
-    return min(as_good, key=lambda each: abs(each.x[LATE]) + abs(each.dvl_late))
+    return min(as_good, key=lambda each: abs(each.x[RHO]) + abs(each.dvl_delay_s))
 
 
 def _unsteady(motion: MotionStreams, curves: Curves, lever_arm: Array, rotation: Array | None) -> ClockChange | None:
@@ -275,59 +275,59 @@ def _explained(
     fit: MotionFit, free: Fitted, in_time: tuple[Fitted | None, float], rotation: Array | None, lever_arm: Array
 ) -> Registration:
     """Explain a fit by the fewest delayed clocks: none (in_time, see `_held`), one of three, or DVL and reference."""
-    apart = float(free.x[APART])
+    apart = float(free.x[DELTA])
     early, too_early = (EARLY, 0.0) if apart < 0.0 else (0.0, EARLY)
     tried = {_Off.NONE: in_time}
     if tried[_Off.NONE][1] >= NO_DOUBT:
         tried |= {
             _Off.DVL: _held(fit, free, rotation, 0.0, apart, (REFERENCE,), ONE_MORE + early),
             _Off.REFERENCE: _held(fit, free, rotation, -apart, apart, (DVL,), ONE_MORE + too_early),
-            _Off.IMU: _held(fit, free, rotation, float(free.x[LATE]), 0.0, (BOTH_ALIKE,), ONE_MORE),
+            _Off.IMU: _held(fit, free, rotation, float(free.x[RHO]), 0.0, (BOTH_ALIKE,), ONE_MORE),
         }
     likeliest, (best, cost) = min(tried.items(), key=lambda each: each[1][1])
     # BOTH includes every other explanation, so it is no alternative
     next_worse = min((c for each, (_, c) in tried.items() if each is not likeliest), default=math.inf) - cost
     if best is None or cost > 2.0 * ONE_MORE:
         likeliest, best, next_worse = _Off.BOTH, free, math.inf
-    is_told_apart = next_worse > RULED_OUT
+    is_identified = next_worse > RULED_OUT
     x, p = best.x, best.p
     # an insignificant delay is set to zero, and σ must cover it
-    stays = likeliest in (_Off.NONE, _Off.DVL) or not (is_told_apart and _is_off(best, LATE))
-    late = 0.0 if stays else float(x[LATE])
+    stays = likeliest in (_Off.NONE, _Off.DVL) or not (is_identified and _is_off(best, RHO))
+    delay_s = 0.0 if stays else float(x[RHO])
     std = np.sqrt(np.maximum(np.diag(p), 0.0))
     return Registration(
-        dvl=Clock(best.dvl_late, best.dvl_std, is_told_apart and is_beyond_doubt(best.dvl_late, best.dvl_std)),
-        reference=Clock(float(x[LATE]), float(std[LATE]), is_told_apart and _is_off(best, LATE)),
-        imu=Clock(-float(x[LATE]), float(std[LATE]), likeliest is _Off.IMU and is_told_apart and _is_off(best, LATE)),
-        apart=Clock(float(x[APART]), float(std[APART]), likeliest is not _Off.NONE and _is_off(best, APART)),
+        dvl=Clock(best.dvl_delay_s, best.dvl_std, is_identified and is_beyond_doubt(best.dvl_delay_s, best.dvl_std)),
+        reference=Clock(float(x[RHO]), float(std[RHO]), is_identified and _is_off(best, RHO)),
+        imu=Clock(-float(x[RHO]), float(std[RHO]), likeliest is _Off.IMU and is_identified and _is_off(best, RHO)),
+        apart=Clock(float(x[DELTA]), float(std[DELTA]), likeliest is not _Off.NONE and _is_off(best, DELTA)),
         is_turned=fit.is_turned,
-        are_known=bool((free.std[[APART, LATE] if fit.is_turned else [APART]] < KNOWN_STD_S).all()),
+        are_known=bool((free.std[[DELTA, RHO] if fit.is_turned else [DELTA]] < KNOWN_STD_S).all()),
         rotation_body_from_dvl=best.rotation_body_from_dvl,
         turn_std=std[TURN],
         lever_arm=lever_arm + x[ARM],
         lever_arm_std=std[ARM],
         scale=float(x[SCALE]),
         scale_std=float(std[SCALE]),
-        left=best.left,
+        residual=best.residual,
         spread=best.level,
         speed=best.speed,
         next_worse=next_worse,
-        **_open(fit, free, late, rotation),
+        **_open(fit, free, delay_s, rotation),
     )
 
 
-def _open(fit: MotionFit, free: Fitted, late: float, rotation: Array | None) -> dict[str, Any]:
-    """Return open_late and open_by of a fit with free clocks. late: adopted reference delay, s."""
+def _open(fit: MotionFit, free: Fitted, delay_s: float, rotation: Array | None) -> dict[str, Any]:
+    """Return open_std_s and open_by of a fit with free clocks. delay_s: adopted reference delay, s."""
     if not fit.is_turned:
-        return {"open_late": 0.0, "open_by": np.zeros(7)}
-    std, by, off = float(free.std[LATE]), free.by(LATE), abs(float(free.x[LATE]) - late)
-    if off > FAR_OPEN * std and late == 0.0:
+        return {"open_std_s": 0.0, "open_by": np.zeros(7)}
+    std, by, off = float(free.std[RHO]), free.by(RHO), abs(float(free.x[RHO]) - delay_s)
+    if off > FAR_OPEN * std and delay_s == 0.0:
         std = off
-    if off > FAR_OPEN * IN_TIME_STD_S and late == 0.0:
+    if off > FAR_OPEN * IN_TIME_STD_S and delay_s == 0.0:
         # the free delay is so large that its sensitivities do not hold at zero delay
         near = fit(0.0, 0.0, rotation, (REFERENCE * (HELD_STD_S / IN_TIME_STD_S),))
-        std, by = max(std, off), by if near is None else near.by(LATE)
-    return {"open_late": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[APART]]])}
+        std, by = max(std, off), by if near is None else near.by(RHO)
+    return {"open_std_s": std, "open_by": np.concatenate([by[TURN], by[ARM], [1.0 + by[DELTA]]])}
 
 
 def _with_prior(std: float) -> float:
@@ -370,17 +370,17 @@ def _is_off(fitted: Fitted, index: int) -> bool:
 def is_beyond_doubt(seconds: float, std: float) -> bool:
     """Return whether a delay (s) with this σ (s) is significant and large enough to report."""
     is_known = std < min(max(KNOWN_STD_S, KNOWN_SHARE * abs(seconds)), KNOWN_AT_MOST_S)
-    return is_known and abs(seconds) > max(SAID_FROM_S, FOUND * std)
+    return is_known and abs(seconds) > max(REPORTED_FROM_S, Z_FIFTY_TESTS * std)
 
 
 def _is_possible(fitted: Fitted) -> bool:
     """Return whether the fitted delays are finite and within the search range."""
-    late = [fitted.x[LATE], fitted.dvl_late]
-    return bool(np.isfinite(fitted.x).all() and np.abs(late).max() <= LONGEST_S)
+    delays_s = [fitted.x[RHO], fitted.dvl_delay_s]
+    return bool(np.isfinite(fitted.x).all() and np.abs(delays_s).max() <= LONGEST_S)
 
 
 def _way(clock: Clock) -> str:
-    return "late" if clock.late > 0.0 else "early"
+    return "late" if clock.delay_s > 0.0 else "early"
 
 
 def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fitted, rotation: Array | None) -> bool:
@@ -389,13 +389,13 @@ def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fit
     A delay may lower the residual by moving a bad DVL stretch out of the overlap. Candidates with other DVL delays also
     sample other DVL noise; in periodic waves this alone makes a difference.
     """
-    is_read_elsewhere = abs(float(one.x[APART]) - float(closest.x[APART])) > ALIKE_S
+    is_read_elsewhere = abs(float(one.x[DELTA]) - float(closest.x[DELTA])) > ALIKE_S
     enough = GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
     if _gain(motion, one, closest) < enough:
         return True
     if closest.rows > AS_MANY * one.rows:
         return False
-    again = fit(float(one.x[LATE]), float(one.x[APART]), rotation, (), closest)
+    again = fit(float(one.x[RHO]), float(one.x[DELTA]), rotation, (), closest)
     if again is None:
         return False
     grown = again.cost(closest.level, again.at) - closest.cost(closest.level, again.at)

@@ -33,18 +33,18 @@ Series = NDArray[Any]  # complex
 
 
 class UnregistrableClocks(NamedTuple):
-    """Clock `whose` with a delay of about `late` s relative to `others`, beyond the search range."""
+    """Clock `whose` with a delay of about `delay_s` relative to `others`, beyond the search range."""
 
     whose: str
     others: str
-    late: float
+    delay_s: float
 
     @property
     def reason(self) -> Reason:
         """Finding that names the clock."""
-        way = "later" if self.late > 0.0 else "earlier"
+        way = "later" if self.delay_s > 0.0 else "earlier"
         return finding(
-            "CLOCK_FAR", whose=self.whose, seconds=abs(self.late), way=way, others=self.others, limit=LONGEST_S
+            "CLOCK_FAR", whose=self.whose, seconds=abs(self.delay_s), way=way, others=self.others, limit=LONGEST_S
         )
 
 

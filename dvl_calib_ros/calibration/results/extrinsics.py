@@ -122,13 +122,13 @@ def extrinsics_of(
     state: with the σ of its recording. A component is observable if its σ without bias is at most half of its prior σ.
     span_ns: stamps of the first and last sample. by_bias: (n, 3), `BiasCovariance.columns` of the state.
     """
-    beside = scale_and_delay(model, state, parameters)
+    others = scale_and_delay(model, state, parameters)
     value = np.array(
         [
             *corrected_rpy((model.error_terms_from_state @ state.x)[:3], parameters),
             *lever_arm(model, state, parameters.lever_arm),
-            beside.scale,
-            beside.time_offset,
+            others.scale,
+            others.time_offset,
         ]
     )
     jacobian = _jacobian(model, state, parameters)

@@ -21,7 +21,7 @@ from ..models.parameters import Parameters
 from ..numerics.error_model import corrected_mounting
 from ..numerics.frames import Array, whole_degrees
 from ..numerics.kalman import GaussianState
-from ..numerics.tests import BY_CHANCE, CHANCE, chi2_isf
+from ..numerics.tests import CHANCE, Z_ONE_TEST, chi2_isf
 from .results import Verification
 
 # Drift that an accepted calibration may leave open, in `target_drift`: 1 % of distance by default, which a mounting by
@@ -112,7 +112,7 @@ def shown_misalignment(model: Model, state: GaussianState, parameters: Parameter
     t = parameters.rotation_dvl_from_body
     about = t.T @ (model.error_terms_from_state @ state.x)[:3]
     std = body_angle_std(state.p, parameters)
-    shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > BY_CHANCE * std)
+    shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > Z_ONE_TEST * std)
     return np.where(shown, about, 0.0)
 
 
@@ -143,7 +143,7 @@ def _size_findings(model: Model, state: GaussianState, parameters: Parameters) -
     variance = np.diag(model.error_terms_from_state @ state.p @ model.error_terms_from_state.T)[3:]
     std = np.sqrt(variance)
     known = (variance > 0.0) & (
-        (std <= OBSERVED_SHARE * parameters.initial_std_scale) | (np.abs(errors[3:]) > BY_CHANCE * std)
+        (std <= OBSERVED_SHARE * parameters.initial_std_scale) | (np.abs(errors[3:]) > Z_ONE_TEST * std)
     )
     scale = float(np.abs(errors[3:][known]).max(initial=0.0))
     if scale > parameters.max_scale_error:

@@ -50,10 +50,10 @@ def quantities(result: Result) -> list[Quantity]:
         Quantity(name, float(nominal[i]), float(corrected[i]), float(std[i]), "°", bool(std[i] <= unknown))
         for i, name in enumerate(("roll", "pitch", "yaw"))
     ]
-    beside = scale_and_delay(MODELS[estimate.model], GaussianState(estimate.state, estimate.covariance), parameters)
-    if beside.scale_std is not None:
+    others = scale_and_delay(MODELS[estimate.model], GaussianState(estimate.state, estimate.covariance), parameters)
+    if others.scale_std is not None:
         shown = "scale" not in unseen
-        found.append(Quantity("scale", 0.0, 100.0 * beside.scale, 100.0 * beside.scale_std, " %", shown))
+        found.append(Quantity("scale", 0.0, 100.0 * others.scale, 100.0 * others.scale_std, " %", shown))
     if not _has_imu(result):
         return found
     arm_std = estimate.std_of("lever_arm_x", "lever_arm_y", "lever_arm_z")

@@ -19,7 +19,7 @@ from ..numerics.error_model import correct, corrected_mounting, correction_jacob
 from ..numerics.frames import FLU_FROM_FRD, Array, near_angles, rpy_from_rotation
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Mask
-from ..numerics.tests import SURE
+from ..numerics.tests import Z_REPEATED_TEST
 
 _SCALE_FIRST = [3, 4, 5, 0, 1, 2]
 NOT_ESTIMATED = -1.0  # variance of a component that the model does not estimate
@@ -461,4 +461,4 @@ def contradicts_configured_arm(model: Model, state: GaussianState, parameters: P
         return np.zeros(3, dtype=bool)
     at = [model.state_names.index(name) for name in ARM]
     away, std = np.abs(state.x[at]), np.sqrt(np.diag(state.p)[at])
-    return np.asarray(away > np.maximum(SURE * std, MEASURED_TO))
+    return np.asarray(away > np.maximum(Z_REPEATED_TEST * std, MEASURED_TO))

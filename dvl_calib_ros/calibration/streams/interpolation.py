@@ -106,7 +106,7 @@ def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> Array:
     if len(stamps) < 2:
         return np.full((len(times), 3), np.nan)
     smooth = local_fit(stamps, rates, times, reach_at(spacing_at(stamps, times), LEAST_REACH_S, MOST_REACH_S))
-    after, before, outside = _beside(stamps, times)
+    after, before, outside = _neighbours(stamps, times)
     outside |= stamps[after] - stamps[before] > gap_s
     value = smooth.value
     if not smooth.found.all():
@@ -117,7 +117,7 @@ def angular_velocity_at(turns: TurnRates, times: Array, gap_s: float) -> Array:
     return value
 
 
-def _beside(stamps: Array, times: Array) -> tuple[Index, Index, Mask]:
+def _neighbours(stamps: Array, times: Array) -> tuple[Index, Index, Mask]:
     """Return indices of the samples after and before J times, and a mask (J,) of times outside. stamps: (N > 1,) s."""
     after = np.minimum(np.maximum(np.searchsorted(stamps, times), 1), len(stamps) - 1)
     return after, after - 1, (times < stamps[0]) | (times > stamps[-1])
@@ -156,7 +156,7 @@ def attitude_at(imu: ImuColumns, times: Array, gap_s: float) -> tuple[Array, Mas
         stamps, quaternions = stamps[given], quaternions[given]
     if len(stamps) < 2:
         return np.broadcast_to(np.eye(3), (len(times), 3, 3)), np.zeros(len(times), dtype=bool)
-    after, before, outside = _beside(stamps, times)
+    after, before, outside = _neighbours(stamps, times)
     gap = np.maximum(stamps[after] - stamps[before], 1e-12)
     fraction = np.minimum(np.maximum((times - stamps[before]) / gap, 0.0), 1.0)
     between = slerps(quaternions.take(before, axis=0), quaternions.take(after, axis=0), fraction)

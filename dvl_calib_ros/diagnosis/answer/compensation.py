@@ -140,12 +140,12 @@ def _is_one_correction(diagnosis: Diagnosis, effect: FoundEffect) -> bool:
     if all(each.frame is VelocityFrame.BODY for each in selection.fitter.problem.recordings):
         return {effect.name, *effect.equivalent_to} <= {*TWO_CLOCKS}
     rivals = [rival for each in selection.selected if each.effect.name == effect.name for rival in each.rivals]
-    own, (_, low, high) = _beside_attitude(selection.fit.hypothesis), effect.parameters["seconds"]
-    alike = [each for each in rivals if np.all(np.abs(_beside_attitude(each) - own) < 0.5 * (high - low))]
+    own, (_, low, high) = _delays_from_attitude(selection.fit.hypothesis), effect.parameters["seconds"]
+    alike = [each for each in rivals if np.all(np.abs(_delays_from_attitude(each) - own) < 0.5 * (high - low))]
     return all(any(name in rival.values for rival in alike) for name in effect.equivalent_to)
 
 
-def _beside_attitude(hypothesis: Hypothesis) -> Array:
+def _delays_from_attitude(hypothesis: Hypothesis) -> Array:
     """Return the delays of DVL and reference relative to the attitude, s, (2, recordings)."""
     none = ({"seconds": 0.0},)
     dvl, reference, attitude = (

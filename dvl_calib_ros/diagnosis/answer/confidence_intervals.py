@@ -46,10 +46,10 @@ def with_unshown_turns(problem: Problem, fit: Fit, covariance: Array) -> Array:
     """
     if not any(isinstance(effect, MountingEffect) for effect in fit.effects):
         return covariance
-    beside, own = NuisanceFit.of_fit(problem, fit), np.arange(fit.columns.shape[2])
-    if len(beside.std) == len(own):
+    nuisances, own = NuisanceFit.of_fit(problem, fit), np.arange(fit.columns.shape[2])
+    if len(nuisances.std) == len(own):
         return covariance
-    both = beside.step(fit.noise, fit.residual)
+    both = nuisances.step(fit.noise, fit.residual)
     alone = both.part(own)
     moved = both.solution()[own] - alone.solution()
     return np.asarray(covariance + both.covariance()[np.ix_(own, own)] - alone.covariance() + np.outer(moved, moved))

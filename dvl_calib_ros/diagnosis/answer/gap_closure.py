@@ -195,19 +195,19 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     rows = len(fit.residual)
     calibration = np.linalg.qr(fit.columns[:, :, :6].reshape(-1, 6))[0]
 
-    def beside_calibration(values: Array) -> Array:
+    def without_calibration(values: Array) -> Array:
         flat = values.reshape(calibration.shape[0], -1)
         return np.asarray(flat - calibration @ (calibration.T @ flat))
 
     rng = np.random.default_rng(0)
     spread = np.sqrt(blocks / rng.chisquare(blocks, (RESAMPLES, 1)))  # the scatter of blocks is itself estimated
     moved = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
-    columns = beside_calibration(fit.columns[:, :, 6:])
+    columns = without_calibration(fit.columns[:, :, 6:])
     others = [rival for selected in selection.selected for rival in selected.rivals]
     if selection.wider is not None and len(selection.wider.effects) > len(fit.effects):
         others.append(selection.wider)
     residuals_of = [fit.residual, *(fitter.evaluated(each)[1] for each in others)]
-    truths = [beside_calibration(selection.base.residual - each)[:, 0] for each in residuals_of]
+    truths = [without_calibration(selection.base.residual - each)[:, 0] for each in residuals_of]
     corrected = truths[0]
     of_cause = rows * max(remainder(selection, residuals), gap.not_expected**2 if gap.fails_elsewhere else 0.0)
     gram = columns.T @ columns
@@ -261,26 +261,25 @@ def closure_alone(selection: EffectSelection, gap: Gap, name: str) -> float:
 def noise_floor(selection: EffectSelection, rest: Unexplained) -> Array:
     """Return the noise variance (F, 3), (m/s)², of each sample.
 
-    The residual is the noise, per sample: before and after share it, and their difference has the precision of the gap
-    rather than of the noise. Two parts of it are not: what an unknown cause explains, and what exceeds the fitted
-    noise, since it is slower. The part that the parameters have absorbed is added.
+    It is the squared residual, so that noise common to the errors before and after cancels in the gap. The energy of an
+    unknown cause, and of slow noise beyond its fitted level, is subtracted; that absorbed by parameters is added.
     """
     problem, fit = selection.fitter.problem, selection.fit
     left, measured = problem.errors(fit.seen), np.array(problem.measured)
     slow = SlowNoiseOfFit.of_fit(problem, fit)
-    noise, unfollowed, followed = slow.noise, slow.left, np.zeros(len(slow.left))
+    noise, slow_residual, explained = slow.noise, slow.left, np.zeros(len(slow.left))
     if matters(problem, fit, rest):
         *_, noise, without = slow.with_rest(problem, slow.noise, rest.clearest)
-        followed, unfollowed = (unfollowed**2 - without**2).sum(axis=1), without
-    usual = noise.energy
-    slower = (unfollowed**2).sum(axis=1) - usual
+        explained, slow_residual = (slow_residual**2 - without**2).sum(axis=1), without
+    expected = noise.energy
+    beyond_expected = (slow_residual**2).sum(axis=1) - expected
     floor, of_sample = left**2, problem.recording_of[problem.bin_of]
     for recording in range(len(problem.recordings)):
         of_bin, at = problem.recording_of == recording, of_sample == recording
         error = noise.energy_error / np.sqrt(of_bin.mean())
-        excess = float(slower[of_bin].mean())
-        systematic = max(0.0, float(followed[of_bin].mean()))
-        if excess > SETTINGS.noise_tolerance * error * float(usual[of_bin].mean()):
+        excess = float(beyond_expected[of_bin].mean())
+        systematic = max(0.0, float(explained[of_bin].mean()))
+        if excess > SETTINGS.noise_tolerance * error * float(expected[of_bin].mean()):
             systematic += excess
         energy = float(floor[at].sum(axis=1).mean())
         floor[at] *= max(0.0, energy - systematic) / max(energy, 1e-300)

@@ -26,7 +26,7 @@ HALVINGS = 5
 # The last step is rejected if it increases the misfit by this factor
 ASTRAY = 30.0
 # Standard deviations of the chance gain from other noise that are subtracted
-BY_CHANCE = 1.5
+CHANCE_GAIN_Z = 1.5
 # Prior σ of an effect's parameters, in typical sizes: wide, to act only on unobservable parameters
 PRIOR_IN_TYPICAL = 50.0
 # Bounds below which a fit is skipped as worse: deviance, plus a share of its first step's gain for nonlinearity
@@ -83,7 +83,7 @@ class Fit:
         Fits with different noise differ in deviance by a normal variable of this size under the null hypothesis.
         """
         other = self.own_noise - rest.own_noise
-        sure = rest.deviance - self.deviance - BY_CHANCE * 2.0 * float(np.sqrt(other @ other))
+        sure = rest.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
         return sure - max(rest.of_tails - self.of_tails, 0.0)
 
     @property
@@ -281,7 +281,7 @@ class Fitter:
         )
 
     def fit_kept(self, start: Hypothesis, noise: Noise) -> Fit:
-        """Return the cached `fit` of the same effects under the same noise."""
+        """Return `fit`, cached by effects, event times and noise; it starts at the best optimum under another noise."""
         windows = tuple(
             value[spec.name]
             for effect in start.effects
@@ -290,11 +290,11 @@ class Fitter:
             if is_time_of_run(spec)
         )
         of = sorted((effect.name, len(effect.parameters), effect.of_the_day) for effect in start.effects)
-        what = tuple(of), windows
-        key = (id(noise), *what)
+        model = tuple(of), windows
+        key = (id(noise), *model)
         if key not in self._fits:
             nearest, evaluated = start, self.evaluated(start)
-            for each in self.problem.fitted.get(what, []):  # optima under other noise are near
+            for each in self.problem.fitted.get(model, []):  # optima under other noise are near
                 at_end = self.evaluated(each)
                 if self._misfit(noise, at_end[1], each) < self._misfit(noise, evaluated[1], nearest):
                     nearest, evaluated = each, at_end
@@ -302,7 +302,7 @@ class Fitter:
             seen = SeenAgain(self.problem, found.hypothesis)
             made = partial(self.problem.all_columns, found.hypothesis, seen)
             self._fits[key] = replace(found, seen=seen, made=made)
-            self.problem.fitted[what] = [self._fits[key].hypothesis]
+            self.problem.fitted[model] = [self._fits[key].hypothesis]
         return self._fits[key]
 
     def straight_on(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:

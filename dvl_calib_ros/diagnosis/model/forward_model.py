@@ -328,7 +328,7 @@ class Problem:
     @cached_property
     def sample_time(self) -> Array:
         """Return (F,) s of every sample since the beginning of its recording, corrected by the initial guess."""
-        return np.concatenate([grid.stamps - grid.late for grid in self.grids])
+        return np.concatenate([grid.stamps - grid.delay_s for grid in self.grids])
 
     def errors(self, seen: Sequence[Seen]) -> Array:
         """Return e (F, 3) m/s per sample, ahead, to port and up; zero on unmeasured axes."""

@@ -27,18 +27,18 @@ class Grid:
     """Times of the comparison: the samples of the rougher stream, which avoids interpolating it.
 
     Interpolated noise depends on the phase, and motion between distant samples is lost. clock: of the rougher stream,
-    DVL_CLOCK or REFERENCE_CLOCK. stamps: (M * per_bin,) s, of that clock. late: its delay, s, from the initial guess.
+    DVL_CLOCK or REFERENCE_CLOCK. stamps: (M * per_bin,) s, of that clock. delay_s: its delay from the initial guess.
     """
 
     clock: ActsOn
     stamps: Array
     per_bin: int
-    late: float = 0.0
+    delay_s: float = 0.0
 
     @property
     def bin_time(self) -> Array:
         """Return (M,) s, centres of the bins, corrected by the initial guess."""
-        return self.stamps.reshape(-1, self.per_bin).mean(axis=1) - self.late
+        return self.stamps.reshape(-1, self.per_bin).mean(axis=1) - self.delay_s
 
     def averaged(self, values: Array) -> Array:
         """Average (F, ...) per bin, (M, ...)."""
@@ -97,32 +97,32 @@ def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
     settings = SETTINGS
     by_dvl = float(np.linalg.norm(recording.dvl.roughness)) > float(np.linalg.norm(recording.reference.roughness))
     base, clock = (recording.dvl, ActsOn.DVL_CLOCK) if by_dvl else (recording.reference, ActsOn.REFERENCE_CLOCK)
-    base_late = offsets.dvl if by_dvl else offsets.reference
+    base_delay_s = offsets.dvl if by_dvl else offsets.reference
     steps = np.diff(base.time)
     seconds = max(base.time[-1] - base.time[0] - steps[steps > PAUSE_S].sum(), base.interval)
     width = max(settings.bins_per_interval * base.interval, settings.shortest_bin, seconds / settings.max_bins)
     per_bin = max(2, round(width / base.interval))
     streams = (recording.dvl, offsets.dvl), (recording.reference, offsets.reference)
-    others = [(curve, own_late) for curve, own_late in streams if curve is not base]
+    others = [(curve, delay_s) for curve, delay_s in streams if curve is not base]
     complete = np.ones(len(base.time), dtype=bool)
-    for curve, own_late in (*others, *((each, 0.0) for each in (recording.attitude, recording.rates) if each)):
-        complete &= curve.is_complete_at(base.time - base_late + own_late)
+    for curve, delay_s in (*others, *((each, 0.0) for each in (recording.attitude, recording.rates) if each)):
+        complete &= curve.is_complete_at(base.time - base_delay_s + delay_s)
     stamps = base.time[complete]
-    true = stamps - base_late
+    true = stamps - base_delay_s
     known = np.ones(len(true), dtype=bool)
-    for curve, own_late in others:
-        for at in (base_late - own_late, -MARGIN_S, MARGIN_S):
-            known &= curve.covers(true + own_late + at)
+    for curve, delay_s in others:
+        for at in (base_delay_s - delay_s, -MARGIN_S, MARGIN_S):
+            known &= curve.covers(true + delay_s + at)
     if not by_dvl:  # the DVL has no samples while its clock repeats, whatever its delay
         for event in recording.set_back:
             of_dvl, around = true + offsets.dvl, event.by + MARGIN_S
             known &= (of_dvl < event.before - around) | (of_dvl > event.after + around)
     for oriented in (recording.attitude, recording.rates):
-        for at in (base_late, -MARGIN_S, MARGIN_S):
+        for at in (base_delay_s, -MARGIN_S, MARGIN_S):
             known &= True if oriented is None else oriented.covers(true + at)
     breaks = np.flatnonzero(np.diff(stamps) > settings.max_gap_intervals * base.interval) + 1
     kept = []
     for part in np.split(np.arange(len(true)), np.unique(np.concatenate([breaks, np.flatnonzero(np.diff(known)) + 1]))):
         if len(part) and known[part[0]]:
             kept.append(part[: len(part) // per_bin * per_bin])
-    return Grid(clock, stamps[np.concatenate(kept)] if kept else np.zeros(0), per_bin, base_late)
+    return Grid(clock, stamps[np.concatenate(kept)] if kept else np.zeros(0), per_bin, base_delay_s)

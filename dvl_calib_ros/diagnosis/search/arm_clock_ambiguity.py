@@ -44,10 +44,10 @@ class Combination:
 
 @dataclass(frozen=True)
 class OpenArm:
-    """Ambiguity of arm and reference clock: change (m) of arm parameters per second of delay. late: σ of that, s."""
+    """Ambiguity of arm and reference clock: change (m) of arm parameters per second of delay; σ (s) of the delay."""
 
     by: Mapping[str, float]
-    late: float
+    delay_std_s: float
 
 
 def lags_and_delays(fit: Fit, effects: Mapping[str, Effect]) -> list[dict[str, tuple[Values, ...]]]:
@@ -207,7 +207,7 @@ def with_open(fit: Fit, covariance: Array, opened: OpenArm | None) -> Array:
     for name, i in _places(fit, ARM).items():
         step[i] = opened.by[name]
     known = max(np.diag(covariance)[clock].tolist(), default=0.0)
-    return np.asarray(covariance + max(opened.late**2 - known, 0.0) * np.outer(step, step))
+    return np.asarray(covariance + max(opened.delay_std_s**2 - known, 0.0) * np.outer(step, step))
 
 
 def opened_combination(fit: Fit, covariance: Array, opened: OpenArm | None) -> Combination | None:

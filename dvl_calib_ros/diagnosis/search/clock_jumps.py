@@ -218,4 +218,4 @@ def _time(fitter: Fitter, ends: Array, part: int, by: float) -> float:
     problem = fitter.problem
     (grid,) = problem.grids
     at = float(problem.time[min(int(ends[part - 1]), len(problem.time) - 1)])
-    return max(0.0, at + grid.late - by) if grid.clock is ActsOn.DVL_CLOCK else max(0.0, at)
+    return max(0.0, at + grid.delay_s - by) if grid.clock is ActsOn.DVL_CLOCK else max(0.0, at)

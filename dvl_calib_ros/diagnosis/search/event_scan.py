@@ -1,4 +1,4 @@
-"""Scan of a residual for one event: a step that stays, or a passage that ends.
+"""Scan of a residual for one event: a step that stays, or a pulse that ends.
 
 A beam that drops out switches an error on or off. A magnetic anomaly rotates the heading while the vehicle passes. The
 slow noise absorbs such an error unless the time of the event is searched.
@@ -18,13 +18,13 @@ from ..model.forward_model import Problem
 from ..model.hypothesis import is_time_of_run
 from ..noise.whitened_least_squares import ScoreTest
 
-# Largest number of times of a step or of a passage of one length, so that an hour costs as much per sample as minutes;
+# Largest number of times of a step or of a pulse of one width, so that an hour costs as much per sample as minutes;
 # events whitened together, whose columns share one Gram matrix
 TIMES, BATCH = 150, 10
 # A time of the run is known to this, s: clocks and gaps move it
 KNOWN_TO_S = 4.0
-# Lengths of a passage, s
-LENGTHS_S = (8.0, 24.0, 72.0)
+# Half widths of triangular pulses, s
+HALF_WIDTHS_S = (8.0, 24.0, 72.0)
 
 
 class Event(NamedTuple):
@@ -37,29 +37,29 @@ class Event(NamedTuple):
 
 
 def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event]:
-    """Return the most significant step and passages of a residual.
+    """Return the most significant step and pulses of a residual.
 
     basis: orthonormal (m, k) of the fit's whitened columns, with its prior rows. white: (m,) whitened residual of unit
     variance, orthogonal to it.
     """
-    found, beside, fading = [], _beside_known_times(problem, fit), fit.noise.fading
-    for about, (courses_of, error_of) in EVENTS.items():
+    found, excluded, fading = [], _near_fitted_times(problem, fit), fit.noise.fading
+    for about, (profiles_of, error_of) in EVENTS.items():
         error = error_of(problem, fit)
         if error is None:
             continue
         best, tried, event = 0.0, 0, np.zeros((*error.shape[:2], error.shape[2]))
         for rows in problem.rows_of:
-            courses = courses_of(problem.time[rows])
-            tried += courses.shape[1]
-            for first in range(0, courses.shape[1], BATCH):
-                course = courses[:, first : first + BATCH]
-                acts = rows.start + np.flatnonzero(course.any(axis=1))
+            profiles = profiles_of(problem.time[rows])
+            tried += profiles.shape[1]
+            for first in range(0, profiles.shape[1], BATCH):
+                profile = profiles[:, first : first + BATCH]
+                acts = rows.start + np.flatnonzero(profile.any(axis=1))
                 if not len(acts):  # all within a gap
                     continue
                 part = slice(max(rows.start, acts[0] - 1), min(rows.stop, acts[-1] + 1 + fading))
-                course = course[part.start - rows.start : part.stop - rows.start]
-                columns = error[part, :, None] * course[:, None, :, None]
-                columns[beside[part]] = 0.0
+                profile = profile[part.start - rows.start : part.stop - rows.start]
+                columns = error[part, :, None] * profile[:, None, :, None]
+                columns[excluded[part]] = 0.0
                 log_p = _log_p(fit, basis, white, columns, part)
                 at = int(np.argmin(log_p))
                 if log_p[at] < best:
@@ -70,14 +70,14 @@ def events(problem: Problem, fit: Fit, basis: Array, white: Array) -> list[Event
     return found
 
 
-def _beside_known_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
+def _near_fitted_times(problem: Problem, fit: Fit) -> NDArray[np.bool_]:
     """Return (M,) bins next to the beginning or end of a fit's effects, which is known to some seconds."""
-    beside = np.zeros(len(problem.time), dtype=bool)
+    excluded = np.zeros(len(problem.time), dtype=bool)
     for effect in fit.effects:
         for rows, values in zip(problem.rows_of, fit.values[effect.name], strict=True):
             for spec in filter(is_time_of_run, effect.parameters):
-                beside[rows] |= np.abs(problem.time[rows] - values[spec.name]) < KNOWN_TO_S
-    return beside
+                excluded[rows] |= np.abs(problem.time[rows] - values[spec.name]) < KNOWN_TO_S
+    return excluded
 
 
 def _log_p(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) -> Array:
@@ -89,19 +89,19 @@ def _log_p(fit: Fit, basis: Array, white: Array, columns: Array, part: slice) ->
 
 
 def _steps(time: Array) -> Array:
-    """Return courses (m, K) of steps at equal intervals."""
+    """Return K unit steps (m, K) at equal intervals."""
     count = min(TIMES, len(time) // 2)
     return (time[:, None] >= np.linspace(time[0], time[-1], count + 2)[1:-1]).astype(float)
 
 
-def _passages(time: Array) -> Array:
-    """Return courses (m, K) of passages of every length, at half-overlapping times, or rarer in long recordings."""
+def _pulses(time: Array) -> Array:
+    """Return K triangular pulses (m, K) of height 1, spaced by half their half width, or more in long recordings."""
     each = []
-    for length in LENGTHS_S:
-        step = max(0.5 * length, float(time[-1] - time[0]) / TIMES)
-        each.append(np.arange(time[0] + 0.5 * length, time[-1] - 0.5 * length, step))
-    lengths = np.repeat(LENGTHS_S, [len(at) for at in each])
-    return np.asarray(np.maximum(1.0 - np.abs(time[:, None] - np.concatenate(each)) / lengths, 0.0))
+    for half_width in HALF_WIDTHS_S:
+        step = max(0.5 * half_width, float(time[-1] - time[0]) / TIMES)
+        each.append(np.arange(time[0] + 0.5 * half_width, time[-1] - 0.5 * half_width, step))
+    widths = np.repeat(HALF_WIDTHS_S, [len(at) for at in each])
+    return np.asarray(np.maximum(1.0 - np.abs(time[:, None] - np.concatenate(each)) / widths, 0.0))
 
 
 def _of_each_axis(problem: Problem, _: Fit) -> Array:
@@ -120,9 +120,9 @@ def _of_heading(problem: Problem, fit: Fit) -> Array | None:
     return np.concatenate(across)[:, np.array(problem.measured), None]
 
 
-# Courses over time and error of each event, by its name in the sentence on the residual
+# Time profiles and error of each event, by its name in the sentence on the residual
 EVENTS: dict[str, tuple[Callable[[Array], Array], Callable[[Problem, Fit], Array | None]]] = {
     "a step in time": (_steps, _of_each_axis),
-    "a stretch of time": (_passages, _of_each_axis),
-    "a passage that turns the heading": (_passages, _of_heading),
+    "a stretch of time": (_pulses, _of_each_axis),
+    "a passage that turns the heading": (_pulses, _of_heading),
 }

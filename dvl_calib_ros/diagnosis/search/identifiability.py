@@ -40,6 +40,9 @@ from .arm_clock_ambiguity import (
 from .candidates import combined, linearised
 from .initial_guess import FirstGuess
 
+# Share of an effect's deviance drop, less a margin, from which a substitute is fitted: linearisation errs by as much.
+SCREENED_SHARE, SCREENED_MARGIN = 0.7, 4.0 * SETTINGS.indistinguishable
+
 
 @dataclass(frozen=True)
 class Selected:
@@ -82,14 +85,14 @@ def identify_effects(
     if clocks:
         selected = [_with_equivalents(each, clocks) if each.effect.name == ARM else each for each in selected]
     if opened is not None and any(each.effect.name == ARM and REFERENCE_CLOCK in each.equivalent for each in selected):
-        opened = replace(opened, late=IN_TIME_STD_S)  # only their combination is observable
+        opened = replace(opened, delay_std_s=IN_TIME_STD_S)  # only their combination is observable
     if opened is not None:  # a lag differs from a delay by less than interpolation errors
         selected = [
             _with_equivalents(each, [*each.equivalent, REFERENCE_CLOCK]) if each.effect.name == LAG else each
             for each in selected
         ]
     fit, moved = (fit, moved_arm(fit, rivals)) if freed is None or freed is fit else (freed, moved_lag(fit, freed))
-    if any(each.registration is not None and each.registration.not_told_apart for each in guesses):
+    if any(each.registration is not None and each.registration.ambiguity for each in guesses):
         selected = [
             _with_equivalents(each, TWO_CLOCKS) if each.effect.name in TWO_CLOCKS else each for each in selected
         ]
@@ -99,8 +102,7 @@ def identify_effects(
 def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Effect]) -> Selected:
     """Test an effect given all others, and every other effect in its place.
 
-    An equally good substitute with more parameters could be the cause, even if less likely. A worse one could be if it
-    has fewer parameters, or chooses no time: a drifting clock was once named a clock jump at the best of nine times.
+    A substitute that fits worse is a possible cause, too, if it has fewer parameters or fewer times were tried for it.
     """
     rest = fit_without(fitter, fit, effect)
     log_p = log_p_in_place(fitter, fit, rest, effect)
@@ -113,9 +115,9 @@ def _selected(fitter: Fitter, fit: Fit, effect: Effect, effects: Mapping[str, Ef
     drops = {i: table.misfit(own) - table.misfit([*own, i]) for i in range(len(own), len(table.variants))}
     for index in sorted(drops, key=lambda i: -drops[i]):
         best_by_name.setdefault(table.variants[index].effect.name, index)
-    straight = drops.get(best_by_name.get(effect.name, -1), drop)
+    linear_drop = drops.get(best_by_name.get(effect.name, -1), drop)
     for name, index in best_by_name.items():
-        if name == effect.name or drops[index] < 0.7 * min(straight, drop) - 4.0 * SETTINGS.indistinguishable:
+        if name == effect.name or drops[index] < SCREENED_SHARE * min(linear_drop, drop) - SCREENED_MARGIN:
             continue
         rival = fitter.fit_kept(combined(fitter, rest, table, [*own, index]), fit.noise)
         behind = rival.deviance - fit.deviance
@@ -147,7 +149,7 @@ def _clock_or_arm(
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
 
     late = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
-    is_late = opened is None or max(late, default=0.0) >= OF_INTERVAL * opened.late
+    is_late = opened is None or max(late, default=0.0) >= OF_INTERVAL * opened.delay_std_s
 
     def is_shown(each: Selected) -> bool:
         if each.effect.name == REFERENCE_CLOCK and not is_late:
@@ -159,8 +161,8 @@ def _clock_or_arm(
     if arm is None or not clocks:
         return selected
     clock = min(clocks, key=lambda each: each.log_p)
-    beside = [each for each in clocks if each is not clock and each.effect not in called_for and not is_shown(each)]
-    selected = [each for each in selected if each not in beside]
+    dropped = [each for each in clocks if each is not clock and each.effect not in called_for and not is_shown(each)]
+    selected = [each for each in selected if each not in dropped]
     if is_shown(arm) and is_shown(clock):
         return selected
     if is_shown(clock) and clock.effect.name in known and arm.log_p > threshold:

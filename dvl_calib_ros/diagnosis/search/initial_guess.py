@@ -55,7 +55,7 @@ def first_guess(recording: RecordedStreams, rotation_dvl_from_body: Array, lever
     if found is None:
         return FirstGuess(Offsets(), np.zeros(3), np.zeros(3))
     phi = turn_between(rotation_dvl_from_body, found.rotation_body_from_dvl.T)
-    return FirstGuess(Offsets(found.dvl.late, found.reference.late), found.lever_arm - lever_arm, phi, found)
+    return FirstGuess(Offsets(found.dvl.delay_s, found.reference.delay_s), found.lever_arm - lever_arm, phi, found)
 
 
 def _motion(recording: RecordedStreams) -> MotionStreams | None:

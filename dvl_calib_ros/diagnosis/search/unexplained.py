@@ -162,7 +162,7 @@ def _score_tests(
     noise = fit.noise
     own = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
     known = NuisanceFit.of(problem, fit.hypothesis, seen, own)
-    q, white = _beside_prior(known, noise.whiten(known.columns), noise.whiten(residual))
+    q, white = _orthogonal_to_nuisances(known, noise.whiten(known.columns), noise.whiten(residual))
     white = white - q @ (q.T @ white)
     unshown = known.columns.shape[2] - own.shape[2]
     white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unshown))
@@ -176,7 +176,7 @@ def _score_tests(
     return score_tests, white, raw, q
 
 
-def _beside_prior(known: NuisanceFit, columns: Array, white: Array) -> tuple[Array, Array]:
+def _orthogonal_to_nuisances(known: NuisanceFit, columns: Array, white: Array) -> tuple[Array, Array]:
     """Return an orthonormal basis of whitened nuisance columns (M A, k) and a series, each with k prior rows.
 
     Without the prior, the scale of an insignificant sway, which is noise, would explain that noise.

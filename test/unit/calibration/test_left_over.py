@@ -9,7 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dvl_calib_ros.calibration.checks.residual_tests import moving_bed, residual_trend, residual_warnings, std_along
+from dvl_calib_ros.calibration.checks.residual_tests import (
+    confused_with_bias_std,
+    moving_bed,
+    residual_trend,
+    residual_warnings,
+)
 from dvl_calib_ros.calibration.models import MODELS
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import rotation_from_rpy
@@ -110,7 +115,7 @@ def test_a_heading_that_drifts_leaves_the_yaw_open(rng, drift_deg, word):
     assert math.degrees(found.turned) == pytest.approx(drift_deg, abs=0.4)
     (said,) = residual_warnings(found)
     assert said.code == "HEADING_DRIFTS" and said.severity is word
-    covered = residual_warnings(found, along=(0.0, math.radians(2.0), 0.0))
+    covered = residual_warnings(found, mounting_std=(0.0, math.radians(2.0), 0.0))
     assert [each.severity for each in covered] == [Severity.WARNING]
 
 
@@ -202,7 +207,7 @@ def test_a_bias_that_sigma_of_its_own_axis_holds_is_said_and_no_reject(rng, axis
     bias[axis] = 0.028
     found = Vehicle(rng).found()._replace(bias=bias, bias_std=np.full(3, 0.002), speed=1.6)
     along = [0.002, 0.0146, 0.002]
-    (said,) = [each for each in residual_warnings(found, along=along) if each.code == "DVL_BIAS"]
+    (said,) = [each for each in residual_warnings(found, mounting_std=along) if each.code == "DVL_BIAS"]
     assert said.severity is word
     (said,) = [each for each in residual_warnings(found) if each.code == "DVL_BIAS"]
     assert said.severity is Severity.REJECT
@@ -214,9 +219,9 @@ def test_what_a_bias_looks_like_is_by_the_axes_of_the_body():
     p = np.zeros((len(names), len(names)))
     p[0, 0], p[2, 2] = 0.01**2, 0.02**2
     estimate: Any = SimpleNamespace(model="full", recording_covariance=p)
-    turned = std_along(estimate, Parameters(mounting_rpy=(0.0, 0.0, math.pi / 2.0)))
+    turned = confused_with_bias_std(estimate, Parameters(mounting_rpy=(0.0, 0.0, math.pi / 2.0)))
     assert turned == pytest.approx([0.0, 0.02, 0.01], abs=1e-12)
-    assert std_along(estimate, Parameters()) == pytest.approx([0.0, 0.02, 0.0], abs=1e-12)
+    assert confused_with_bias_std(estimate, Parameters()) == pytest.approx([0.0, 0.02, 0.0], abs=1e-12)
 
 
 def test_a_reference_that_is_smoothed_is_named_with_how_long(rng):
@@ -275,9 +280,9 @@ def test_a_filter_that_finds_nothing_of_the_dvl_may_be_its_own(rng):
     vehicle.noise = 2.0 * vehicle.noise[0], vehicle.noise[1]
     found = made_by_a_filter(vehicle)._replace(circular=0.05, circular_std=0.05)
     assert [each.code for each in residual_warnings(found)] != ["FILTER_FINDS_NOTHING"]
-    assert [each.code for each in residual_warnings(found, lag_s=2.5, is_nil=True)] != ["FILTER_FINDS_NOTHING"]
+    assert [each.code for each in residual_warnings(found, lag_s=2.5, finds_nothing=True)] != ["FILTER_FINDS_NOTHING"]
     assert [each.code for each in residual_warnings(found, lag_s=0.45)] != ["FILTER_FINDS_NOTHING"]
-    (said,) = residual_warnings(found, lag_s=0.45, is_nil=True)
+    (said,) = residual_warnings(found, lag_s=0.45, finds_nothing=True)
     assert said.severity is Severity.REJECT and said.code == "FILTER_FINDS_NOTHING"
 
 

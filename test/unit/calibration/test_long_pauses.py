@@ -66,14 +66,14 @@ def peak(run) -> int:
 def test_clocks_that_are_far_apart_are_found_across_a_pause(pause_s):
     found = far_clocks(motion(200.0, pause_s), np.eye(3))
     assert found is not None
-    assert (found.whose, found.late) == ("the DVL's", pytest.approx(200.0, abs=1.0))
+    assert (found.whose, found.delay_s) == ("the DVL's", pytest.approx(200.0, abs=1.0))
     assert far_clocks(motion(0.0, pause_s), np.eye(3)) is None
 
 
 def test_how_far_a_clock_is_off_is_found_however_far():
     found = far_clocks(motion(-50 * YEAR_S, YEAR_S), np.eye(3))
     assert found is not None
-    assert found.late == pytest.approx(-50 * YEAR_S, abs=1.0)
+    assert found.delay_s == pytest.approx(-50 * YEAR_S, abs=1.0)
 
 
 @pytest.mark.parametrize(

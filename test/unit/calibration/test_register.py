@@ -15,10 +15,10 @@ from dvl_calib_ros.calibration.registration import registration
 from dvl_calib_ros.calibration.registration.configuration_check import fitting_configuration
 from dvl_calib_ros.calibration.registration.delay_search import LONGEST_S, _minima, places
 from dvl_calib_ros.calibration.registration.gauss_newton import (
-    APART,
+    DELTA,
     DVL,
-    LATE,
     REFERENCE,
+    RHO,
     MotionFit,
 )
 from dvl_calib_ros.calibration.registration.motion_streams import Curves, MotionStreams, make_motion
@@ -80,9 +80,9 @@ def registered(*args, **late) -> Registration:
 def test_a_late_clock_is_found_and_no_other(trajectory, rate, seconds, stream):
     found = registered(trajectory, rate, **{stream: seconds})
     other = "reference" if stream == "dvl" else "dvl"
-    assert getattr(found, stream).late == pytest.approx(seconds, abs=0.05 + 0.03 * seconds)
+    assert getattr(found, stream).delay_s == pytest.approx(seconds, abs=0.05 + 0.03 * seconds)
     assert getattr(found, stream).is_shown == (seconds > 0.0)
-    assert getattr(found, other).late == pytest.approx(0.0, abs=1e-3)
+    assert getattr(found, other).delay_s == pytest.approx(0.0, abs=1e-3)
     assert not getattr(found, other).is_shown and not found.imu.is_shown
     assert found.offsets.keys() == ({f"{stream}_time_offset"} if seconds else set())
     assert found.lever_arm[0] == pytest.approx(ARM, abs=5.0 * found.lever_arm_std[0] + 0.02)
@@ -93,15 +93,15 @@ def test_two_late_clocks_are_told_apart(seconds):
     dvl, reference = seconds
     found = registered("free", 5.0, dvl=dvl, reference=reference)
     assert found.dvl.is_shown and found.reference.is_shown
-    assert found.dvl.late == pytest.approx(dvl, abs=max(0.1, 4.0 * found.dvl.std))
-    assert found.reference.late == pytest.approx(reference, abs=max(0.1, 4.0 * found.reference.std))
+    assert found.dvl.delay_s == pytest.approx(dvl, abs=max(0.1, 4.0 * found.dvl.std))
+    assert found.reference.delay_s == pytest.approx(reference, abs=max(0.1, 4.0 * found.reference.std))
 
 
 @pytest.mark.parametrize("seconds", [-0.6, 0.5, 4.0])
 def test_where_dvl_and_reference_agree_it_is_the_imu(seconds):
     found = registered("free", 5.0, imu=seconds)
-    assert found.imu.is_shown and found.imu.late == pytest.approx(seconds, abs=0.1)
-    assert found.offsets == {"imu_time_offset": found.imu.late}
+    assert found.imu.is_shown and found.imu.delay_s == pytest.approx(seconds, abs=0.1)
+    assert found.offsets == {"imu_time_offset": found.imu.delay_s}
     said = found.contradiction(Parameters())
     assert said is not None and (said.code, said.numbers["parameter"]) == ("CLOCK_LATE", "imu_time_offset")
 
@@ -113,13 +113,13 @@ def test_a_reference_in_the_body_shows_only_the_difference_of_the_clocks():
         (td + 2.0, v), (tg, np.linalg.norm(g, axis=1)[:, None] * turned), False, (True,) * 3, ImuColumns(ti, q, w)
     )
     found = register(made, None, np.zeros(3))
-    assert found.apart.late == pytest.approx(2.0, abs=0.1) and not found.reference.is_shown
+    assert found.apart.delay_s == pytest.approx(2.0, abs=0.1) and not found.reference.is_shown
 
 
 @pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.7), (np.pi, 0.0, -2.0), (0.3, 0.5, 1.0)])
 def test_a_mounting_that_nobody_told_is_found_with_the_clock(rpy):
     found = register(motion("free", 5.0, reference=5.0, mounting=rpy), None, np.zeros(3))
-    assert found.reference.late == pytest.approx(5.0, abs=0.2)
+    assert found.reference.delay_s == pytest.approx(5.0, abs=0.2)
     away = found.rotation_body_from_dvl.T @ rotation_from_rpy(rpy)
     assert np.arccos(0.5 * (np.trace(away) - 1.0)) < 0.1
 
@@ -163,7 +163,7 @@ def leg_in_waves(seed: int) -> MotionStreams:
 @pytest.mark.parametrize("seed", [1, 11])
 def test_waves_that_repeat_with_other_noise_are_no_clock(seed):
     found = register(leg_in_waves(seed), np.eye(3), np.zeros(3))
-    assert found is not None and found.offsets == {} and found.not_told_apart is None
+    assert found is not None and found.offsets == {} and found.ambiguity is None
 
 
 def leg_in_moving_water(share: float, seed: int) -> MotionStreams:
@@ -189,8 +189,8 @@ def test_a_stretch_of_bad_velocities_is_no_clock_that_pushes_it_out_of_the_overl
     """Less was left of the rest there, and 42 s were taken off clocks that were in time."""
     found = register(leg_in_moving_water(0.1, 0), np.eye(3), np.zeros(3))
     assert found is not None
-    assert found.offsets == {} and found.taken_off == {}
-    assert abs(found.dvl.late) < 3.0 and abs(found.reference.late) < 3.0
+    assert found.offsets == {} and found.corrections == {}
+    assert abs(found.dvl.delay_s) < 3.0 and abs(found.reference.delay_s) < 3.0
 
 
 @pytest.mark.parametrize("seed", [0, 2])
@@ -198,8 +198,8 @@ def test_nothing_is_taken_off_where_a_leg_does_not_show_its_clocks(seed):
     """A delay of 115 s was, which no parameter takes."""
     found = register(leg_in_moving_water(0.3, seed), np.eye(3), np.zeros(3))
     assert found is not None
-    assert not found.are_known and found.taken_off == {}
-    assert max(abs(found.dvl.late), abs(found.reference.late)) <= LONGEST_S
+    assert not found.are_known and found.corrections == {}
+    assert max(abs(found.dvl.delay_s), abs(found.reference.delay_s)) <= LONGEST_S
 
 
 @pytest.mark.slow
@@ -226,7 +226,7 @@ def test_sigmas_of_the_clocks_and_the_arm_are_what_runs_scatter_by():
         found = register(
             make_motion((td, v), (tg + 3.0, g), True, (True,) * 3, ImuColumns(ti, q, w)), np.eye(3), np.zeros(3)
         )
-        z.append([(found.reference.late - 3.0) / found.reference.std,
+        z.append([(found.reference.delay_s - 3.0) / found.reference.std,
                   (found.lever_arm[0] - ARM) / found.lever_arm_std[0]])  # fmt: skip
     rms = np.sqrt((np.array(z) ** 2).mean(axis=0))
     assert (rms < 2.0).all() and (rms > 0.4).all()
@@ -339,10 +339,10 @@ def test_an_imu_too_little_late_to_be_shown_is_in_the_arm(late):
 def test_a_clock_that_is_not_told_apart_stays_in_time_and_is_open_by_what_the_data_have_it_late(monkeypatch):
     """An IMU 0.15 s late made an arm of 0.60 m ± 0.06 of one of 0.80, accepted: which clock was off was not told apart,
     and σ was that of a clock that had been taken off."""
-    assert registered("free", 5.0, imu=0.3).open_late < 0.1
+    assert registered("free", 5.0, imu=0.3).open_std_s < 0.1
     monkeypatch.setattr(registration, "RULED_OUT", 1e9)
     found = registered("free", 5.0, imu=0.3)
-    assert found.offsets == {} and found.open_late == pytest.approx(0.3, abs=0.1)
+    assert found.offsets == {} and found.open_std_s == pytest.approx(0.3, abs=0.1)
     assert np.sqrt(found.left_open[3, 3]) == pytest.approx(abs(found.open_by[3]) * 0.25, rel=0.3)
 
 
@@ -371,8 +371,8 @@ def test_what_noise_seems_to_tell_of_a_delay_leaves_a_covariance(seed):
 
 @pytest.mark.parametrize(
     ("at", "value", "is_possible"),
-    [(LATE, 0.0, True), (LATE, LONGEST_S - 1.0, True), (LATE, LONGEST_S + 1.0, False), (APART, LONGEST_S + 1.0, False),
-     (APART, np.nan, False), (0, np.inf, False)],
+    [(RHO, 0.0, True), (RHO, LONGEST_S - 1.0, True), (RHO, LONGEST_S + 1.0, False), (DELTA, LONGEST_S + 1.0, False),
+     (DELTA, np.nan, False), (0, np.inf, False)],
 )  # fmt: skip
 def test_a_fit_that_settles_beyond_a_minute_or_nowhere_is_none(at, value, is_possible):
     moved = motion("box", 5.0)
@@ -398,8 +398,8 @@ def test_a_clock_that_is_far_off_is_known_to_a_share_of_it():
 def test_clocks_that_are_far_apart_and_not_told_are_a_reason_against_a_calibration():
     in_time = Clock(0.0, 0.1, False)
     found = replace(registered("box", 5.0), dvl=in_time, reference=in_time, imu=in_time, apart=Clock(-50.0, 0.1, True))
-    assert found.not_told_apart is not None and found.not_told_apart.code == "CLOCKS_NOT_TOLD_APART"
-    assert found.contradiction(Parameters()) == found.not_told_apart
+    assert found.ambiguity is not None and found.ambiguity.code == "CLOCKS_NOT_TOLD_APART"
+    assert found.contradiction(Parameters()) == found.ambiguity
 
 
 @pytest.mark.parametrize(
@@ -411,7 +411,7 @@ def test_a_clock_that_is_told_apart_by_little_is_no_reason_against_a_calibration
     """Of all streams it was not told apart, so not taken off; of what was calibrated with it was, and rejected."""
     in_time, arm = Clock(0.0, 0.1, False), np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
     clocks = {"dvl": in_time, "imu": in_time, "reference": Clock(late, 0.02, True)}
-    found = replace(registered("box", 5.0), **clocks, open_late=0.15, open_by=arm, next_worse=next_worse)
+    found = replace(registered("box", 5.0), **clocks, open_std_s=0.15, open_by=arm, next_worse=next_worse)
     said = found.contradiction(Parameters())
     assert (said.code if said else None) == code
     without = replace(found, open_by=np.zeros(7)).contradiction(Parameters())

@@ -94,10 +94,10 @@ def test_what_looks_like_an_arm_of_its_own_in_each_stretch_is_told_by_the_arm_be
 def test_only_the_clock_of_the_dvl_is_put_right_and_what_is_left_is_said():
     of_dvl, of_reference = (registered("figure8", whose, leap=1.0) for whose in ("dvl", "reference"))
     assert of_dvl.unsteady is not None and of_reference.unsteady is not None
-    taken = of_dvl.unsteady.taken_off(10**18)
+    taken = of_dvl.unsteady.corrections(10**18)
     assert taken["dvl_time_jump"] == pytest.approx(1.0, abs=0.1)
     assert taken["dvl_time_jump_at"] == pytest.approx(1e9 + AT_S, abs=2.0)
-    assert not of_reference.unsteady.taken_off(10**18)
+    assert not of_reference.unsteady.corrections(10**18)
     said = of_reference.contradiction(Parameters())
     assert said is not None and said.code == "CLOCK_LEAPS"
     assert said.numbers["whose"] == "the reference's" and said.numbers["way"] == "ahead"

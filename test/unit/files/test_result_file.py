@@ -345,10 +345,10 @@ def change(path: Path, edit) -> Path:
 
 DAMAGE = {
     "newer format": (lambda c: c.update(format="dvl_calib_ros result 2"), "another version of this software"),
-    "top only": (lambda c: c.update(gated=7000), "its gated is another in two places"),
-    "top of before": (lambda c: c.update(state=[0.5]), "its state is another in two places"),
-    "below only": (lambda c: c["models"][c["model"]].update(used=7), "its used is another in two places"),
-    "nominal only": (lambda c: c["parameters"].update(mounting_rpy=[0.0, 0.0, 0.1]), "mounting is another in two"),
+    "top only": (lambda c: c.update(gated=7000), "its gated has two different values"),
+    "top of before": (lambda c: c.update(state=[0.5]), "its state has two different values"),
+    "below only": (lambda c: c["models"][c["model"]].update(used=7), "its used has two different values"),
+    "nominal only": (lambda c: c["parameters"].update(mounting_rpy=[0.0, 0.0, 0.1]), "mounting has two different"),
     "foreign format": (lambda c: c.update(format="other 2"), "not a result file of this software"),
     "no models": (lambda c: c.pop("models"), "holds no models"),
     "models a list": (lambda c: c.update(models=[1]), "holds no models"),

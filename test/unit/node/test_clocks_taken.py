@@ -33,10 +33,10 @@ class Look:
     late: float
 
     @property
-    def taken_off(self):
+    def corrections(self):
         return {"reference_time_offset": self.late}
 
-    def told(self, name: str) -> Reason:
+    def clock_reason(self, name: str) -> Reason:
         return finding("CLOCK_OFF", whose=name, seconds=self.late, std=0.01, way="late", against="IMU")
 
 

@@ -141,7 +141,10 @@ def test_data_that_says_nothing_gives_a_page_without_numbers_and_pictures(tmp_pa
     )  # fmt: skip
     page = page_of(tmp_path, found)
     assert page.images() == [] and page.rows == []
-    assert "insufficient excitation This recording cannot show a gap: 3 samples" in page.text and "nan" not in page.text
+    assert (
+        "insufficient excitation No gap can be measured in this recording: 3 samples" in page.text
+        and "nan" not in page.text
+    )
     assert found.next_manoeuvre in page.text
 
 
