@@ -20,13 +20,15 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..numerics.samples import Mask
-from ..numerics.tests import Z_FIFTY_TESTS, Z_ONE_TEST
+from ..numerics.tests import Z_FIFTY_TESTS, Z_ONE_TEST, chance_of, chi2_isf
 
 # Longest sample intervals, s: of both streams, because slower differences hold waves; and of a reference next to a fast
 # DVL.
 SLOWEST_S, SLOWEST_REFERENCE_S = 0.3, 1.2
 # Time shifts of the reference against the DVL, s, for the delay of a filter and its transport.
 SHIFTS_S: Array = 0.1 * np.arange(-2, 11)
+# Significance of the best of these shifts, σ (Bonferroni).
+Z_BEST_SHIFT = math.sqrt(chi2_isf(chance_of(Z_FIFTY_TESTS) / len(SHIFTS_S), 1.0))
 # Tolerances as shares of the interval: of the intervals in a difference, and of the time between the streams' samples.
 EVEN, NEAR = 0.25, 0.6
 # Noise below this, m/s, is rounding.
@@ -111,7 +113,7 @@ class SharedNoise:
         passed, own = c_4 - steps, v_4 - steps
         if own < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
             return 0.0
-        return passed / own if passed > max(SHARED_FROM * own, Z_FIFTY_TESTS * float(std[best, 0])) else 0.0
+        return passed / own if passed > max(SHARED_FROM * own, Z_BEST_SHIFT * float(std[best, 0])) else 0.0
 
     def contradiction(self) -> Reason | None:
         """Return the reason if the reference contains the DVL's noise."""
