@@ -160,7 +160,7 @@ def fitting_configuration(
     wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
-    return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
+    return _named(declared, best, found[best].rotation_body_from_dvl, nominal, dvl_axes, best in also_turned)
 
 
 def nearest(
@@ -256,7 +256,7 @@ def wrong_axes(
             return finding("DVL_LEFT_HANDED", axis="xyz"[mirrored], alike=alike)
         if ahead:
             return _mounting_fits(nominal @ np.diag(np.where(np.arange(3) == ahead, 1.0, -1.0)))
-        return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
+        return _axes_turned(nominal, dvl_axes)
     too_small = np.where(is_shown, (factors - SURE * std) / factors[ahead] - SCALED_ALONE, 0.0)
     if not is_turned.any() and too_small.max() > 1.0:
         at = int(np.argmax(too_small))
@@ -270,7 +270,7 @@ def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
 
 
 def _named(
-    declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, also_turned: bool
+    declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, dvl_axes: str, also_turned: bool
 ) -> Reason | None:
     """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
     same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
@@ -286,7 +286,7 @@ def _named(
     if not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
         return finding("IMU_LOOKS_NED")
     if angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
-        turned = finding("DVL_AXES_TURNED", axes="the other of flu and frd")
+        turned = _axes_turned(nominal, dvl_axes)
     else:
         turned = _mounting_fits(_as_drawn(rotation))
     if same_frame:
@@ -294,9 +294,22 @@ def _named(
     return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=turned)
 
 
+def _axes_turned(nominal: Array, dvl_axes: str) -> Reason:
+    """Return the finding of axes turned over; the mounting turns them back if only the messages tell the axes."""
+    axes = _OTHER_AXES.get(dvl_axes)
+    if axes is None:
+        return finding("DVL_AXES_TURNED", parameter="mounting_rpy", value=_as_list(nominal @ FLU_FROM_FRD))
+    return finding("DVL_AXES_TURNED", parameter="dvl_axes", value=axes)
+
+
 def _mounting_fits(rotation: Array) -> Reason:
     rpy = (round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(rotation))
     return finding("MOUNTING_FITS", **dict(zip(("roll", "pitch", "yaw"), rpy, strict=True)))
+
+
+def _as_list(rotation: Array) -> str:
+    """Return roll, pitch, yaw (rad) of a mounting (3, 3) as the value of a parameter."""
+    return "[" + ", ".join(f"{angle + 0.0:.4g}" for angle in rpy_from_rotation(rotation).round(4)) + "]"
 
 
 def _as_drawn(rotation: Array) -> Array:

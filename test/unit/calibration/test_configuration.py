@@ -72,7 +72,7 @@ def causes(found):
         ({"reference": ENU_FROM_NED}, "REFERENCE_LOOKS", {"name": "NED", "frame": "ned"}),
         ({"frame": VelocityFrame.NED}, "REFERENCE_LOOKS", {"name": "ENU", "frame": "enu"}),
         ({"attitude": (ENU_FROM_NED, FLU_FROM_FRD)}, "IMU_LOOKS_NED", {}),
-        ({"dvl": FLU_FROM_FRD}, "DVL_AXES_TURNED", {"axes": "the other of flu and frd"}),
+        ({"dvl": FLU_FROM_FRD}, "DVL_AXES_TURNED", {"parameter": "mounting_rpy", "value": "[3.142, 0, 0]"}),
     ],
     ids=["45 degrees", "NED called ENU", "ENU called NED", "attitude in NED", "flipped axes"],
 )
