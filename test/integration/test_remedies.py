@@ -82,7 +82,11 @@ CASES = {
     ("REFERENCE_LOOKS", "ENU, body claimed"): of_wrong("ENU, body claimed"),
     ("REFERENCE_LOOKS", "NED, body claimed"): of_wrong("NED, body claimed"),
     ("IMU_LOOKS_NED", "IMU in NED"): of_wrong("IMU in NED"),
+    ("CLOCK_LATE", "IMU"): late(imu=1.0),
     ("CLOCK_LATE", "reference"): late(reference=1.0),
+    ("CLOCK_LATE", "offset of the reference given"): Case(
+        with_nothing_wrong, {"reference_time_offset": 1.0}, is_discovered=True
+    ),
     ("CLOCK_LATE", "offset given"): Case(with_nothing_wrong, {"imu_time_offset": 1.0}, is_discovered=True),
     ("CLOCKS_LATE", "reference and DVL"): late(reference=0.6)._replace(given={"dvl_time_offset": 0.5}),
     ("CLOCK_DRIFTS_DVL", "drift given"): Case(with_nothing_wrong, {"dvl_clock_drift": 0.009}, is_discovered=True),

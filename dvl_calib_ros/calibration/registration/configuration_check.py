@@ -20,7 +20,7 @@ from ..numerics.tests import BY_CHANCE, SURE
 from ..streams.interpolation import attitude_at
 from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion_streams import GAP_S, Curves, MotionStreams
-from .registration import Registration
+from .registration import GAIN, INDEPENDENT_S, Registration
 
 # Detection of velocities in an earth frame: their direction rotates with the heading.
 # In its own axes a vehicle moves in much the same direction on every heading. DVL velocities that a driver rotated
@@ -89,7 +89,8 @@ DRAWN = math.pi / 4.0
 # that does not fit also the axis ahead mirrored, and all axes; the axis ahead and one other are a mounting.
 SIGNS: Sequence[Array] = [np.array([1.0, one, other]) for one in (1.0, -1.0) for other in (1.0, -1.0)]
 SIGNS_OF_AHEAD: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
-# Largest residual of an explanation as a multiple of the registered one, and an extra factor for few rows.
+# Largest residual of an explanation by signs as a multiple of the registered one, whose clocks are free, unless the
+# evidence for the clocks is enough; and an extra factor for few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
 # Smallest excess factor of one axis, above any error of the speed of sound.
 SCALED_ALONE = 0.2
@@ -138,7 +139,9 @@ def fitting_configuration(
         as_given = _left(given.left, given.scale, _shown_turn(given.rotation_body_from_dvl, nominal, given.turn_std))
     if as_given < WRONG_FROM:
         assert given is not None
-        return wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes, SIGNS)
+        independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
+        as_well = min(AS_WELL, math.exp(GAIN / (3.0 * max(independent, 1.0))))
+        return wrong_axes(motion, curves, nominal, lever_arm, as_well * given.spread, dvl_axes, SIGNS)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
