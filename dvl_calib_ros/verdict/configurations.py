@@ -84,8 +84,9 @@ CONFIGURATIONS = on_page(
     # the IMU
     reject(
         "IMU_LOOKS_NED",
-        "the IMU's orientation looks like NED, forward-right-down",
-        remedy="set imu_frame to ned and imu_rpy to [3.1416, 0, 0]",
+        "the IMU's orientation looks like {name}",
+        means="NED and forward-right-down for ENU and forward-left-up, or the reverse.",
+        remedy="set imu_frame to {frame} and imu_rpy to {rpy}",
     ),
     reject(
         "IMU_NO_RATES",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,6 +83,9 @@ CASES = {
     ("REFERENCE_LOOKS", "ENU, body claimed"): of_wrong("ENU, body claimed"),
     ("REFERENCE_LOOKS", "NED, body claimed"): of_wrong("NED, body claimed"),
     ("IMU_LOOKS_NED", "IMU in NED"): of_wrong("IMU in NED"),
+    ("IMU_LOOKS_NED", "IMU in ENU, NED given"): Case(
+        lambda path: write_bag(path, run()), {"imu_frame": "ned", "imu_rpy": (math.pi, 0.0, 0.0)}
+    ),
     ("CLOCK_LATE", "IMU"): late(imu=1.0),
     ("CLOCK_LATE", "reference"): late(reference=1.0),
     ("CLOCK_LATE", "offset of the reference given"): Case(

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..models.parameters import FLU, FRD
+from ..models.parameters import FLU, FRD, IMU_ENU, IMU_NED, Parameters
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
 from ..numerics.tests import BY_CHANCE, SURE
@@ -112,7 +112,7 @@ def fitting_configuration(
     nominal: Array,
     lever_arm: Array,
     given: Registration | None,
-    dvl_axes: str = "from_message",
+    parameters: Parameters,
 ) -> Reason | None:
     """Return the finding of a configuration that fits much better than the configured one, else None.
 
@@ -123,7 +123,7 @@ def fitting_configuration(
     nominal: (3, 3) configured rotation_body_from_dvl.
     lever_arm: (3,) m configured DVL position from the reference point, body frame.
     given: Registration of the motion as configured; None if it failed.
-    dvl_axes: The parameter of this name.
+    parameters: With the configured axes of DVL and IMU.
     """
     if not all(motion.measured):
         return None
@@ -141,7 +141,7 @@ def fitting_configuration(
         assert given is not None
         independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
         as_well = min(AS_WELL, math.exp(GAIN / (3.0 * max(independent, 1.0))))
-        return wrong_axes(motion, curves, nominal, lever_arm, as_well * given.spread, dvl_axes, SIGNS)
+        return wrong_axes(motion, curves, nominal, lever_arm, as_well * given.spread, parameters.dvl_axes, SIGNS)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
@@ -160,10 +160,10 @@ def fitting_configuration(
     best = min(found, key=lambda frame: found[frame].left * (math.sqrt(0.5) if frame is declared else 1.0))
     if found[best].left > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
-    wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
+    wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, parameters.dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
-    return _named(declared, best, found[best].rotation_body_from_dvl, nominal, dvl_axes, best in also_turned)
+    return _named(declared, best, found[best].rotation_body_from_dvl, nominal, parameters, best in also_turned)
 
 
 def nearest(
@@ -273,7 +273,12 @@ def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
 
 
 def _named(
-    declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, dvl_axes: str, also_turned: bool
+    declared: VelocityFrame,
+    best: VelocityFrame,
+    rotation: Array,
+    nominal: Array,
+    parameters: Parameters,
+    also_turned: bool,
 ) -> Reason | None:
     """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
     same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
@@ -287,14 +292,25 @@ def _named(
     if as_given:  # the frame alone explains the misfit
         return finding("REFERENCE_LOOKS", **frame)
     if not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
-        return finding("IMU_LOOKS_NED")
+        return _imu_turned(parameters)
     if angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
-        turned = _axes_turned(nominal, dvl_axes)
+        turned = _axes_turned(nominal, parameters.dvl_axes)
     else:
         turned = _mounting_fits(_as_drawn(rotation))
     if same_frame:
         return turned
     return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=turned)
+
+
+def _imu_turned(parameters: Parameters) -> Reason:
+    """Return the finding of an IMU in the other axes of world and body than those configured."""
+    is_ned = parameters.imu_frame != IMU_NED
+    return finding(
+        "IMU_LOOKS_NED",
+        name="NED, forward-right-down" if is_ned else "ENU, forward-left-up",
+        frame=IMU_NED if is_ned else IMU_ENU,
+        rpy=_as_list(FLU_FROM_FRD @ rotation_from_rpy(parameters.imu_rpy)),
+    )
 
 
 def _axes_turned(nominal: Array, dvl_axes: str) -> Reason:
@@ -312,7 +328,7 @@ def _mounting_fits(rotation: Array) -> Reason:
 
 def _as_list(rotation: Array) -> str:
     """Return roll, pitch, yaw (rad) of a mounting (3, 3) as the value of a parameter."""
-    return "[" + ", ".join(f"{angle + 0.0:.4g}" for angle in rpy_from_rotation(rotation).round(4)) + "]"
+    return "[" + ", ".join(f"{angle + 0.0:.5g}" for angle in rpy_from_rotation(rotation).round(4)) + "]"
 
 
 def _as_drawn(rotation: Array) -> Array:
