@@ -145,7 +145,7 @@ CONFIGURATIONS = on_page(
         "GRAVITY_UPSIDE_DOWN",
         "{topic}: gravity is upside down in the {where}",
         means="The IMU is upside down, or axes and orientation follow two conventions.",
-        remedy="set imu_rpy or imu_frame",
+        remedy="set {parameter} to {value}",
     ),
     reject(
         "GRAVITY_FITS_INVERTED",

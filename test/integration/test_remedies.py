@@ -98,7 +98,10 @@ CASES = {
     ("MOUNTING_CONTRADICTED", "declination of -60 degrees"): without_declination(-60.0),
 }
 # codes whose remedy another module executes
-ELSEWHERE = {"DVL_SIDE_INVERTED": "unit/discovery/test_axis_signs.py"}
+ELSEWHERE = {
+    "DVL_SIDE_INVERTED": "unit/discovery/test_axis_signs.py",
+    "GRAVITY_UPSIDE_DOWN": "unit/node/test_gravity_seen.py",
+}
 
 
 def judged(bag: Path, case: Case, **parameters: Any) -> Result:

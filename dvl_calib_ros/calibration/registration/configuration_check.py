@@ -14,7 +14,15 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import FLU, FRD, IMU_ENU, IMU_NED, Parameters
-from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
+from ..numerics.frames import (
+    ENU_FROM_NED,
+    FLU_FROM_FRD,
+    Array,
+    rotation_from_rpy,
+    rpy_from_rotation,
+    rpy_text,
+    turn_between,
+)
 from ..numerics.samples import VelocityFrame
 from ..numerics.tests import BY_CHANCE, SURE
 from ..streams.interpolation import attitude_at
@@ -309,7 +317,7 @@ def _imu_turned(parameters: Parameters) -> Reason:
         "IMU_LOOKS_NED",
         name="NED, forward-right-down" if is_ned else "ENU, forward-left-up",
         frame=IMU_NED if is_ned else IMU_ENU,
-        rpy=_as_list(FLU_FROM_FRD @ rotation_from_rpy(parameters.imu_rpy)),
+        rpy=rpy_text(FLU_FROM_FRD @ rotation_from_rpy(parameters.imu_rpy)),
     )
 
 
@@ -317,18 +325,13 @@ def _axes_turned(nominal: Array, dvl_axes: str) -> Reason:
     """Return the finding of axes turned over; the mounting turns them back if only the messages tell the axes."""
     axes = _OTHER_AXES.get(dvl_axes)
     if axes is None:
-        return finding("DVL_AXES_TURNED", parameter="mounting_rpy", value=_as_list(nominal @ FLU_FROM_FRD))
+        return finding("DVL_AXES_TURNED", parameter="mounting_rpy", value=rpy_text(nominal @ FLU_FROM_FRD))
     return finding("DVL_AXES_TURNED", parameter="dvl_axes", value=axes)
 
 
 def _mounting_fits(rotation: Array) -> Reason:
     rpy = (round(float(angle), 4) + 0.0 for angle in rpy_from_rotation(rotation))
     return finding("MOUNTING_FITS", **dict(zip(("roll", "pitch", "yaw"), rpy, strict=True)))
-
-
-def _as_list(rotation: Array) -> str:
-    """Return roll, pitch, yaw (rad) of a mounting (3, 3) as the value of a parameter."""
-    return "[" + ", ".join(f"{angle + 0.0:.5g}" for angle in rpy_from_rotation(rotation).round(4)) + "]"
 
 
 def _as_drawn(rotation: Array) -> Array:
