@@ -42,7 +42,8 @@ def test_a_situation_is_answered_right_or_rejected_with_its_cause_and_a_remedy_t
         assert cause.code == situation.cause and situation.remedy in cause.sentence
         typed = {}
         if "-p " in situation.remedy or "--" in situation.remedy:
-            typed = changes(cause.remedy, Parameters.from_mapping(calibration.replayed.result.parameters))
+            said = cause.sentence[cause.sentence.index(situation.remedy) :]
+            typed = changes(said, Parameters.from_mapping(calibration.replayed.result.parameters))
         else:
             bag = situation.write(tmp_path / "mended", False)
         calibration = dc.replay(bag, history=False, **typed)
