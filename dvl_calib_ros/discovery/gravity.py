@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.models.parameters import IMU_ENU, IMU_NED
-from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_quaternion, rpy_text
+from ..calibration.models.parameters import IMU_ENU, IMU_NED, rpy_text
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_quaternion
 from ..calibration.streams.screening import unit_quaternions
 from ..verdict.reasons import Reason, finding
 
@@ -71,8 +71,8 @@ class Gravity(NamedTuple):
             rpy = rpy_text(FLU_FROM_FRD @ rotation_body_from_imu)
             return finding("GRAVITY_UPSIDE_DOWN", topic=topic, where="body", parameter="imu_rpy", value=rpy)
         if up < -CLEARLY:
-            of_world = {"where": "world of its orientation", "value": IMU_ENU if world == IMU_NED else IMU_NED}
-            return finding("GRAVITY_UPSIDE_DOWN", topic=topic, parameter="imu_frame", **of_world)
+            frame, where = IMU_ENU if world == IMU_NED else IMU_NED, "world of its orientation"
+            return finding("GRAVITY_UPSIDE_DOWN", topic=topic, where=where, parameter="imu_frame", value=frame)
         if self.across > TILTED and self.inverted < CLEARLY * self.across:
             tilts = {"inverted": math.degrees(self.inverted), "given": math.degrees(self.across)}
             return finding("GRAVITY_FITS_INVERTED", topic=topic, **tilts)

@@ -85,7 +85,6 @@ CONFIGURATIONS = on_page(
     reject(
         "IMU_LOOKS_NED",
         "the IMU's orientation looks like {name}",
-        means="NED and forward-right-down for ENU and forward-left-up, or the reverse.",
         remedy="set imu_frame to {frame} and imu_rpy to {rpy}",
     ),
     reject(
@@ -247,11 +246,8 @@ CONFIGURATIONS = on_page(
     reject(
         "TRAVELS_ASTERN",
         "with the mounting {given} the vehicle travels astern; it goes ahead with {found}",
-        means=(
-            "Without a reference a vehicle that drives astern looks like a DVL that points astern. A mounting given "
-            "with -p is not questioned."
-        ),
-        remedy="try -p mounting_rpy:={option}; if the vehicle did drive astern, record it driving ahead",
+        means="A vehicle that drives astern looks the same; a mounting given with -p is not questioned.",
+        remedy="try -p mounting_rpy:={option}{also}; if the vehicle did drive astern, record it driving ahead",
     ),
     marginal(
         "FRAMES_AMBIGUOUS",

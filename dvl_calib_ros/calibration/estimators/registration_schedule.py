@@ -206,7 +206,7 @@ class KeptClocks:
         declared = FRAMES[int(self._declared.argmax())]
         try:
             found = register(motion, nominal, lever_arm)
-            configuration = fitting_configuration(motion, declared, nominal, lever_arm, found, self._parameters)
+            configuration = fitting_configuration(motion, declared, found, self._parameters)
             rest = self._rest(told) if self._is_live and told is not None else None
             return Looked(self._blocks, found, configuration, rest)
         except np.linalg.LinAlgError:  # the fit diverged

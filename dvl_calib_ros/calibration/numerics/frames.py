@@ -99,11 +99,6 @@ def rpy_from_rotation(rotation: ArrayLike) -> Array:
     return np.array([math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
 
 
-def rpy_text(rotation: Array) -> str:
-    """Return roll, pitch, yaw (rad) of a rotation (3, 3) as the value of a parameter."""
-    return "[" + ", ".join(f"{angle + 0.0:.5g}" for angle in rpy_from_rotation(rotation).round(4)) + "]"
-
-
 def near_angles(angles: ArrayLike, nominal: ArrayLike) -> Array:
     """Unwrap angles (...) rad to within half a turn of nominal ones."""
     angles = np.asarray(angles, dtype=float)

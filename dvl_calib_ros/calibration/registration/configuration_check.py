@@ -13,16 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..models.parameters import FLU, FRD, IMU_ENU, IMU_NED, Parameters
-from ..numerics.frames import (
-    ENU_FROM_NED,
-    FLU_FROM_FRD,
-    Array,
-    rotation_from_rpy,
-    rpy_from_rotation,
-    rpy_text,
-    turn_between,
-)
+from ..models.parameters import FLU, FRD, IMU_ENU, IMU_NED, Parameters, rpy_text
+from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
 from ..numerics.tests import BY_CHANCE, SURE
 from ..streams.interpolation import attitude_at
@@ -115,12 +107,7 @@ _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 
 def fitting_configuration(
-    motion: MotionStreams,
-    declared: VelocityFrame,
-    nominal: Array,
-    lever_arm: Array,
-    given: Registration | None,
-    parameters: Parameters,
+    motion: MotionStreams, declared: VelocityFrame, given: Registration | None, parameters: Parameters
 ) -> Reason | None:
     """Return the finding of a configuration that fits much better than the configured one, else None.
 
@@ -128,13 +115,12 @@ def fitting_configuration(
     ----------
     motion: Streams as configured.
     declared: Configured reference frame.
-    nominal: (3, 3) configured rotation_body_from_dvl.
-    lever_arm: (3,) m configured DVL position from the reference point, body frame.
     given: Registration of the motion as configured; None if it failed.
-    parameters: With the configured axes of DVL and IMU.
+    parameters: With the configured axes, mounting and lever arm.
     """
     if not all(motion.measured):
         return None
+    nominal, lever_arm = parameters.rotation_dvl_from_body.T, np.array(parameters.lever_arm)
     if motion.has_attitude:
         directions = Directions()
         rotation, known = attitude_at(motion.imu, motion.dvl.times, GAP_S)
@@ -171,7 +157,7 @@ def fitting_configuration(
     wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, parameters.dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
-    return _named(declared, best, found[best].rotation_body_from_dvl, nominal, parameters, best in also_turned)
+    return _named(declared, best, found[best].rotation_body_from_dvl, parameters, best in also_turned)
 
 
 def nearest(
@@ -281,14 +267,10 @@ def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
 
 
 def _named(
-    declared: VelocityFrame,
-    best: VelocityFrame,
-    rotation: Array,
-    nominal: Array,
-    parameters: Parameters,
-    also_turned: bool,
+    declared: VelocityFrame, best: VelocityFrame, rotation: Array, parameters: Parameters, also_turned: bool
 ) -> Reason | None:
     """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
+    nominal = parameters.rotation_dvl_from_body.T
     same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
     if same_frame and as_given:  # a large misalignment is left to the calibration
         return None
@@ -313,20 +295,15 @@ def _named(
 def _imu_turned(parameters: Parameters) -> Reason:
     """Return the finding of an IMU in the other axes of world and body than those configured."""
     is_ned = parameters.imu_frame != IMU_NED
-    return finding(
-        "IMU_LOOKS_NED",
-        name="NED, forward-right-down" if is_ned else "ENU, forward-left-up",
-        frame=IMU_NED if is_ned else IMU_ENU,
-        rpy=rpy_text(FLU_FROM_FRD @ rotation_from_rpy(parameters.imu_rpy)),
-    )
+    frame, name = (IMU_NED, "NED, forward-right-down") if is_ned else (IMU_ENU, "ENU, forward-left-up")
+    rpy = rpy_text(FLU_FROM_FRD @ rotation_from_rpy(parameters.imu_rpy))
+    return finding("IMU_LOOKS_NED", name=name, frame=frame, rpy=rpy)
 
 
 def _axes_turned(nominal: Array, dvl_axes: str) -> Reason:
     """Return the finding of axes turned over; the mounting turns them back if only the messages tell the axes."""
-    axes = _OTHER_AXES.get(dvl_axes)
-    if axes is None:
-        return finding("DVL_AXES_TURNED", parameter="mounting_rpy", value=rpy_text(nominal @ FLU_FROM_FRD))
-    return finding("DVL_AXES_TURNED", parameter="dvl_axes", value=axes)
+    axes, rpy = _OTHER_AXES.get(dvl_axes), rpy_text(nominal @ FLU_FROM_FRD)
+    return finding("DVL_AXES_TURNED", parameter="dvl_axes" if axes else "mounting_rpy", value=axes or rpy)
 
 
 def _mounting_fits(rotation: Array) -> Reason:
