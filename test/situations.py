@@ -6,8 +6,8 @@ The vehicles are those of `stacks`: the DVL is misaligned by `MISALIGNMENT`, and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from functools import cache
 from pathlib import Path
@@ -20,7 +20,6 @@ from stacks import FIX, GNSS_STD, IMU, LEVER_ARM, ODOMETRY, TWIST, Sample, Told,
 
 import dvl_calib_ros
 from dvl_calib_ros.calibration.numerics.frames import Array
-from dvl_calib_ros.messages.decode import RESTAMP_ALL
 from dvl_calib_ros.simulation.trajectories import Motion, make_motion
 
 DVL, REFERENCE = "/dvl/velocity", "/gnss/velocity"
@@ -68,6 +67,15 @@ def attitude_inverted(told: Told, wrong: bool) -> None:
 def astern_by_its_transform(told: Told, wrong: bool) -> None:
     """A DVL that is turned about, without a transform that says so, and nothing to compare with."""
     sound(told, reference=False, yaw=math.pi)
+
+
+def yaw_other_than_said(yaw_deg: float, said_deg: float = 0.0) -> Callable[[Path, bool], Path]:
+    """Write of a DVL at a yaw that its transform says otherwise."""
+
+    def tell(told: Told, wrong: bool) -> None:
+        sound(told, yaw=math.radians(yaw_deg), said_yaw=math.radians(said_deg))
+
+    return told_by(tell)
 
 
 def stamps_a_minute_and_a_half_ahead(told: Told, wrong: bool) -> None:
@@ -247,14 +255,13 @@ class Situation:
     """A recording with its right answer.
 
     write: makes the bag, with or without its fault. cause: code of the first reason against it; none: the recording is
-    usable. remedy: of the first reason, a part; parameters: by which that is done; none: it is done before recording.
+    usable. remedy: of the first reason, a part; with an option: this is typed, else it is done before recording.
     yaw_deg: of the DVL. verdicts: that are right of a usable recording.
     """
 
     write: Callable[[Path, bool], Path]
     cause: str = ""
     remedy: str = ""
-    parameters: Mapping[str, Any] = field(default_factory=dict)
     yaw_deg: float = 0.0
     verdicts: tuple[str, ...] = ("accept",)
 
@@ -290,8 +297,23 @@ SITUATIONS = {
         told_by(wrong_transform_without_reference),
         "TRAVELS_SIDEWAYS",
         "try -p mounting_rpy:=[0deg,0deg,-135deg]",
-        {"mounting_rpy": (0.0, 0.0, math.radians(-135.0))},
         yaw_deg=-135.0,
+        verdicts=NOISY,
+    ),
+    "large misalignment": Situation(
+        yaw_other_than_said(7.0), "MISALIGNMENT_LARGE", "-p mounting_rpy:=[", yaw_deg=7.0, verdicts=NOISY
+    ),
+    "wrong transform": Situation(
+        yaw_other_than_said(-135.0, 135.0),
+        "MOUNTING_CONTRADICTED",
+        "-p mounting_rpy:=[0deg,0deg,-135deg]",
+        yaw_deg=-135.0,
+    ),
+    "yaw that no drawing has": Situation(
+        yaw_other_than_said(37.0),
+        "MOUNTING_CONTRADICTED",
+        "try -p mounting_rpy:=[0deg,0deg,",
+        yaw_deg=37.0,
         verdicts=NOISY,
     ),
     "earth axes without reference": Situation(
@@ -320,16 +342,13 @@ SITUATIONS = {
         told_by(astern_by_its_transform),
         "TRAVELS_ASTERN",
         "try -p mounting_rpy:=[0deg,0deg,",
-        {"mounting_rpy": (0.0, 0.0, math.pi)},
         yaw_deg=180.0,
         verdicts=NOISY,
     ),
     "stamps a minute and a half ahead": Situation(
-        told_by(stamps_a_minute_and_a_half_ahead, long_motion), "CLOCK_FAR", "--restamp log", {"restamp": RESTAMP_ALL}
+        told_by(stamps_a_minute_and_a_half_ahead, long_motion), "CLOCK_FAR", "--restamp log"
     ),
-    "stamps an hour ahead": Situation(
-        told_by(stamps_an_hour_ahead), "CLOCKS_APART", "--restamp log", {"restamp": RESTAMP_ALL}
-    ),
+    "stamps an hour ahead": Situation(told_by(stamps_an_hour_ahead), "CLOCKS_APART", "--restamp log"),
     "alignment of an RDI": Situation(lambda path, _: ensembles(path, -45.0), yaw_deg=-45.0, verdicts=NOISY),
     "moving bed": Situation(lambda path, _: ensembles(path, bed_mps=np.array(BED_MPS)), verdicts=(*NOISY, "reject")),
     "text of a DVL": Situation(lambda path, _: lines(path), verdicts=NOISY),

@@ -59,14 +59,15 @@ class FoundClocks:
             return self.far.reason
         moves = self.registration.unsteady
         is_left = moves is not None and not MOVING & self.offsets.keys()
-        return moves.reason if moves is not None and is_left else self.registration.ambiguity
+        drift = self.parameters.dvl_clock_drift
+        return moves.reason(drift) if moves is not None and is_left else self.registration.ambiguity
 
     def says(self) -> Iterator[str]:
         """Yield one sentence per clock with an offset: its delay, and the treatment."""
         r = self.registration
         if r.unsteady is not None and not self.doubt:
             taken = ", ".join(f"{name} {self.offsets[name]:.13g}" for name in sorted(MOVING & self.offsets.keys()))
-            yield f"{r.unsteady.reason.says}: subtracted ({taken})"
+            yield f"{r.unsteady.reason(0.0).says}: subtracted ({taken})"
         for name, late in r.offsets.items():
             if name in self.offsets:
                 done = f"subtracted ({name} {late:.2f})"

@@ -505,8 +505,7 @@ class _Search:
                 given, fits = rpy_from_rotation(known) + 0.0, nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw)))
                 fields = {"given": in_degrees(given), "found": in_degrees(fits), "option": as_option(fits)}
                 code = "TRAVELS_SIDEWAYS" if is_sideways else "TRAVELS_ASTERN"
-                also = {"also": _other_axes(known, mean)} if is_sideways else {"confirmed": as_option(given)}
-                self._contradictions.append(finding(code, **fields, **also))
+                self._contradictions.append(finding(code, also=_other_axes(known, mean), **fields))
         elif abs(yaw) > OTHER_MOUNTING:
             self._mounting_found(nominal_rpy(rotation_from_rpy((0.0, 0.0, yaw))), "by the direction of travel")
 

@@ -11,7 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..calibration.numerics.frames import Array, rotation_from_quaternion
+from ..calibration.models.parameters import IMU_ENU, IMU_NED, rpy_text
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_quaternion
 from ..calibration.streams.screening import unit_quaternions
 from ..verdict.reasons import Reason, finding
 
@@ -66,9 +67,12 @@ class Gravity(NamedTuple):
         body_up, up = self._up_in_body(rotation_body_from_imu, z_down), self._up(world)
         if body_up < -CLEARLY and up < -CLEARLY:
             return finding("GRAVITY_SIGN", topic=topic)
-        if body_up < -CLEARLY or up < -CLEARLY:
-            where = "body" if body_up < -CLEARLY else "world of its orientation"
-            return finding("GRAVITY_UPSIDE_DOWN", topic=topic, where=where)
+        if body_up < -CLEARLY:
+            rpy = rpy_text(FLU_FROM_FRD @ rotation_body_from_imu)
+            return finding("GRAVITY_UPSIDE_DOWN", topic=topic, where="body", parameter="imu_rpy", value=rpy)
+        if up < -CLEARLY:
+            frame, where = IMU_ENU if world == IMU_NED else IMU_NED, "world of its orientation"
+            return finding("GRAVITY_UPSIDE_DOWN", topic=topic, where=where, parameter="imu_frame", value=frame)
         if self.across > TILTED and self.inverted < CLEARLY * self.across:
             tilts = {"inverted": math.degrees(self.inverted), "given": math.degrees(self.across)}
             return finding("GRAVITY_FITS_INVERTED", topic=topic, **tilts)

@@ -32,7 +32,7 @@ CONFIGURATIONS = on_page(
         "DVL_AXES_TURNED",
         "the DVL's axes look turned over: y and z point the other way",
         means="Forward-right-down for forward-left-up, or the reverse.",
-        remedy="set dvl_axes to {axes}",
+        remedy="set {parameter} to {value}",
     ),
     reject(
         "DVL_LEFT_HANDED",
@@ -84,8 +84,8 @@ CONFIGURATIONS = on_page(
     # the IMU
     reject(
         "IMU_LOOKS_NED",
-        "the IMU's orientation looks like NED, forward-right-down",
-        remedy="set imu_frame to ned and imu_rpy to [3.1416, 0, 0]",
+        "the IMU's orientation looks like {name}",
+        remedy="set imu_frame to {frame} and imu_rpy to {rpy}",
     ),
     reject(
         "IMU_NO_RATES",
@@ -144,7 +144,7 @@ CONFIGURATIONS = on_page(
         "GRAVITY_UPSIDE_DOWN",
         "{topic}: gravity is upside down in the {where}",
         means="The IMU is upside down, or axes and orientation follow two conventions.",
-        remedy="set imu_rpy or imu_frame",
+        remedy="set {parameter} to {value}",
     ),
     reject(
         "GRAVITY_FITS_INVERTED",
@@ -228,7 +228,8 @@ CONFIGURATIONS = on_page(
     reject(
         "REFERENCE_FRAME_OTHER",
         "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}, which is used",
-        remedy="-p gnss_frame:={declared} overrides this",
+        means="A gnss_frame that is given is not questioned.",
+        remedy="correct the frame in the reference's driver",
     ),
     reject(
         "MOUNTING_CONTRADICTED",
@@ -245,8 +246,8 @@ CONFIGURATIONS = on_page(
     reject(
         "TRAVELS_ASTERN",
         "with the mounting {given} the vehicle travels astern; it goes ahead with {found}",
-        means="Without a reference a vehicle that drives astern looks like a DVL that points astern.",
-        remedy="try -p mounting_rpy:={option}; if the vehicle did drive astern, -p mounting_rpy:={confirmed}",
+        means="A vehicle that drives astern looks the same; a mounting given with -p is not questioned.",
+        remedy="try -p mounting_rpy:={option}{also}; if the vehicle did drive astern, record it driving ahead",
     ),
     marginal(
         "FRAMES_AMBIGUOUS",

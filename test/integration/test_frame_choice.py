@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-import re
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from situations import DVL, long_motion, sound
-from stacks import IMU, LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, true_mounting
+from stacks import LEVER_ARM, ODOMETRY, TWIST, Sample, Told, motion, positions, true_mounting
 
 from dvl_calib_ros import doctor, replay
 from dvl_calib_ros.calibration.models.parameters import Parameters
@@ -135,58 +132,6 @@ def test_a_reference_in_north_west_up_is_turned_not_the_dvl(tmp_path):
     found = discover([bag], Parameters())
     assert found.parameters.gnss_frame == "nwu" and codes(found.contradictions) == ["REFERENCE_FRAME_OTHER"]
     assert is_right(replay(bag), truth_deg())
-
-
-@pytest.mark.spread(1)
-def test_a_yaw_of_the_wrong_sign_in_a_transform_is_named_and_its_remedy_works(tmp_path):
-    quarter = np.radians(135.0)
-    told = Told()
-    told.dvl("/dvl", TWIST, "dvl_link", (0.0, 0.0, -quarter))
-    told.imu("/imu", "base_link")
-    told.reference("/gps/velocity", TWIST, "map", "enu")
-    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, quarter), LEVER_ARM))
-    bag = told.write(tmp_path / "bag")
-    wrong = doctor(bag)
-    assert wrong.verdict == "no" and wrong.reasons[0].code == "MOUNTING_CONTRADICTED"
-    assert "mounting_rpy:=[0deg,0deg,-135deg]" in wrong.reasons[0].sentence
-    mended = replay(bag, mounting_rpy=(0.0, 0.0, -quarter))
-    assert mended.verdict != "reject"
-    assert is_right(mended, truth_deg((0.0, 0.0, -quarter)), (2.0, 2.0, 0.5))
-
-
-@pytest.mark.spread(1)
-def test_a_yaw_that_no_drawing_has_is_named_as_it_is_and_its_remedy_works(tmp_path):
-    """For 37 degrees 45 was proposed, of which the calibration rejected the rest as misalignment."""
-    yaw = math.radians(37.0)
-    told = Told()
-    told.dvl("/dvl", TWIST, "dvl_link", (0.0, 0.0, yaw))
-    told.imu("/imu", "base_link")
-    told.reference("/gps/velocity", TWIST, "map", "enu")
-    told.tf_static(told.transform("base_link", "dvl_link", (0.0, 0.0, 0.0), LEVER_ARM))
-    bag = told.write(tmp_path / "bag")
-    found = re.search(r"try -p mounting_rpy:=\[0deg,0deg,(.*?)deg\]", doctor(bag).reasons[0].sentence)
-    assert found is not None
-    mended = replay(bag, mounting_rpy=(0.0, 0.0, math.radians(float(found[1]))))
-    assert mended.verdict != "reject"
-    assert is_right(mended, truth_deg((0.0, 0.0, yaw)))
-
-
-@pytest.mark.spread(1)
-@pytest.mark.parametrize("degrees", [14.0, -60.0])
-def test_a_heading_without_its_declination_is_said_before_another_mounting_and_its_remedy_works(tmp_path, degrees):
-    declination, told = math.radians(degrees), Told()
-    sound(told)
-    for _, _, kind, message in told.rows:
-        if kind == IMU:
-            q = message.orientation
-            turned = Rotation.from_euler("z", -declination) * Rotation.from_quat([q.x, q.y, q.z, q.w])
-            q.x, q.y, q.z, q.w = turned.as_quat().tolist()
-    bag = told.write(tmp_path / "bag")
-    said = doctor(bag).reasons[0].sentence
-    found = re.search(r"set the declination of the compass, here -p heading_offset:=(.*?)deg; if the heading", said)
-    heading = float(found[1]) if found else 0.0
-    assert heading == pytest.approx(degrees, abs=3.0)  # the DVL's misalignment is in it
-    assert replay(bag, heading_offset=math.radians(heading)).verdict != "reject"
 
 
 def test_two_negated_axes_are_a_mounting_or_the_drivers(tmp_path):

@@ -102,6 +102,7 @@ def test_two_recordings_of_the_same_time_are_said_to_be(place, tmp_path):
     verification = checked_replay([place / "monday", other], Parameters()).result.verifications["M3"]
     assert verification.verdict is Severity.REJECT
     assert verification.reasons[0].code == "BAGS_OVERLAP"
+    assert checked_replay([other], Parameters()).result.verifications["M3"].verdict is Severity.ACCEPT  # by itself
 
 
 def test_a_recording_too_short_to_be_calibrated_alone_is_said_to_be_unchecked(place, tmp_path):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import heapq
-import json
 import math
-import re
 from functools import cache
 
 import numpy as np
@@ -171,35 +169,6 @@ def test_a_bag_of_a_wrong_configuration_is_rejected_with_what_fits_and_apply_ref
     urdf.write_text(f'<robot><joint name="j" type="fixed">{links}</joint></robot>')
     assert main(["apply", str(saved), "--urdf", str(urdf)]) == 2
     assert "--force" in capsys.readouterr().err
-
-
-REMEDIED = ("yaw off by 45 degrees", "z flipped", "ENU, body claimed", "NED, body claimed", "IMU in NED")
-
-
-def causes(reasons):
-    """Reasons, and all that these hold."""
-    return [*reasons, *(cause for each in reasons for cause in causes(each.causes))]
-
-
-def remedied(reasons, code):
-    """Parameters that the remedy of a code among reasons sets."""
-    (remedy,) = {each.remedy for each in causes(reasons) if each.code == code}
-    remedy = remedy.replace("the other of flu and frd", "frd")  # which a twist is not
-    found = dict(re.findall(r"(\w+) to (\[[^\]]*\]|\w+)", remedy))
-    return {name: tuple(json.loads(value)) if value[0] == "[" else value for name, value in found.items()}
-
-
-@pytest.mark.spread(2)
-@pytest.mark.parametrize("wrong", REMEDIED)
-def test_what_a_remedy_says_to_set_mends_the_calibration(wrong, tmp_path):
-    samples, given, code = WRONG[wrong]
-    bag = write_bag(tmp_path / "bag", samples())
-    result = replay([bag], Parameters(**given)).result
-    remedy = remedied(result.verifications[result.selected].reasons, code)
-    assert remedy and all(Parameters(**given).as_dict()[name] != value for name, value in remedy.items())
-    mended = replay([bag], Parameters(**{**given, **remedy})).result
-    verification = mended.verifications[mended.selected]
-    assert verification.verdict is not Severity.REJECT and code not in codes(verification.reasons)
 
 
 @pytest.mark.parametrize(

@@ -206,9 +206,7 @@ class KeptClocks:
         declared = FRAMES[int(self._declared.argmax())]
         try:
             found = register(motion, nominal, lever_arm)
-            configuration = fitting_configuration(
-                motion, declared, nominal, lever_arm, found, self._parameters.dvl_axes
-            )
+            configuration = fitting_configuration(motion, declared, found, self._parameters)
             rest = self._rest(fit_so_far) if self._is_live and fit_so_far is not None else None
             return Looked(self._blocks, found, configuration, rest)
         except np.linalg.LinAlgError:  # the fit diverged

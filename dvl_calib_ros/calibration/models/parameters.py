@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ..numerics.frames import Array, rotation_from_rpy
+from ..numerics.frames import Array, rotation_from_rpy, rpy_from_rotation
 from ..numerics.samples import VelocityFrame
 from . import MODELS
 from .base import ASSUMPTIONS
@@ -496,6 +496,11 @@ class Parameters:
 
 
 SCHEMA: Mapping[str, ParameterSpec] = {field.name: field.metadata["spec"] for field in dataclasses.fields(Parameters)}
+
+
+def rpy_text(rotation: Array) -> str:
+    """Return roll, pitch, yaw (rad) of a rotation (3, 3) as the value of a parameter."""
+    return "[" + ", ".join(f"{angle + 0.0:.5g}" for angle in rpy_from_rotation(rotation).round(4)) + "]"
 
 
 def check_names(names: Mapping[str, Any]) -> None:

@@ -52,13 +52,12 @@ class ClockChange:
     at: float = 0.0
     std: float = 0.0
 
-    @property
-    def reason(self) -> Reason:
-        """Finding that names the clock, with the remedy."""
+    def reason(self, corrected: float) -> Reason:
+        """Return the finding that names the clock, with the remedy. corrected: drift (s/s) subtracted already."""
         whose = {"dvl": "the DVL's", "imu": "the IMU's", "reference": "the reference's", "": "one"}[self.whose]
         ppm = {"ppm": 1e6 * self.drift, "std": 1e6 * self.std}
         if self.drift and self.whose == "dvl":
-            return finding("CLOCK_DRIFTS_DVL", drift=self.drift, **ppm)
+            return finding("CLOCK_DRIFTS_DVL", drift=corrected + self.drift, **ppm)
         if self.drift:
             return finding("CLOCK_DRIFTS", whose=whose, **ppm)
         way = "ahead" if self.leap > 0.0 else "back"

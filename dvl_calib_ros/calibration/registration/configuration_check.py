@@ -13,14 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
-from ..models.parameters import FLU, FRD
+from ..models.parameters import FLU, FRD, IMU_ENU, IMU_NED, Parameters, rpy_text
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
 from ..numerics.samples import VelocityFrame
 from ..numerics.tests import Z_ONE_TEST, Z_REPEATED_TEST
 from ..streams.interpolation import attitude_at
 from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
 from .motion_streams import GAP_S, Curves, MotionStreams
-from .registration import Registration
+from .registration import GAIN, INDEPENDENT_S, Registration
 
 # Detection of velocities in an earth frame: their direction rotates with the heading.
 # In its own axes a vehicle moves in much the same direction on every heading. DVL velocities that a driver rotated
@@ -89,7 +89,8 @@ DRAWN = math.pi / 4.0
 # that does not fit also the axis ahead mirrored, and all axes; the axis ahead and one other are a mounting.
 SIGNS: Sequence[Array] = [np.array([1.0, one, other]) for one in (1.0, -1.0) for other in (1.0, -1.0)]
 SIGNS_OF_AHEAD: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
-# Largest residual of an explanation as a multiple of the registered one, and an extra factor for few rows.
+# Largest residual of an explanation by signs as a multiple of the registered one, whose clocks are free, unless the
+# evidence for the clocks is enough; and an extra factor for few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
 # Smallest excess factor of one axis, above any error of the speed of sound.
 SCALED_ALONE = 0.2
@@ -106,12 +107,7 @@ _FRAMES = (VelocityFrame.BODY, VelocityFrame.ENU, VelocityFrame.NED)
 
 
 def fitting_configuration(
-    motion: MotionStreams,
-    declared: VelocityFrame,
-    nominal: Array,
-    lever_arm: Array,
-    given: Registration | None,
-    dvl_axes: str = "from_message",
+    motion: MotionStreams, declared: VelocityFrame, given: Registration | None, parameters: Parameters
 ) -> Reason | None:
     """Return the finding of a configuration that fits much better than the configured one, else None.
 
@@ -119,13 +115,12 @@ def fitting_configuration(
     ----------
     motion: Streams as configured.
     declared: Configured reference frame.
-    nominal: (3, 3) configured rotation_body_from_dvl.
-    lever_arm: (3,) m configured DVL position from the reference point, body frame.
     given: Registration of the motion as configured; None if it failed.
-    dvl_axes: The parameter of this name.
+    parameters: With the configured axes, mounting and lever arm.
     """
     if not all(motion.measured):
         return None
+    nominal, lever_arm = parameters.rotation_dvl_from_body.T, np.array(parameters.lever_arm)
     if motion.has_attitude:
         directions = Directions()
         rotation, known = attitude_at(motion.imu, motion.dvl.times, GAP_S)
@@ -138,7 +133,9 @@ def fitting_configuration(
         as_given = _with_turn(given.residual, given.scale, angle)
     if as_given < WRONG_FROM:
         assert given is not None
-        return wrong_axes(motion, curves, nominal, lever_arm, AS_WELL * given.spread, dvl_axes, SIGNS)
+        independent = float(np.ptp(motion.reference_times)) / INDEPENDENT_S
+        as_well = min(AS_WELL, math.exp(GAIN / (3.0 * max(independent, 1.0))))
+        return wrong_axes(motion, curves, nominal, lever_arm, as_well * given.spread, parameters.dvl_axes, SIGNS)
     found: dict[VelocityFrame, Fitted] = {}
     also_turned = set()
     for frame in _FRAMES:
@@ -157,10 +154,10 @@ def fitting_configuration(
     best = min(found, key=lambda frame: found[frame].residual * (math.sqrt(0.5) if frame is declared else 1.0))
     if found[best].residual > min(FITS_BELOW, BETTER_BY * min(as_given, 1.0)):
         return None
-    wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, dvl_axes)
+    wrong = wrong_axes(motion, curves, nominal, lever_arm, found[best].level, parameters.dvl_axes)
     if wrong is not None and wrong.code == "DVL_LEFT_HANDED":  # a left-handed frame fits better than any rotation
         return wrong
-    return _named(declared, best, found[best].rotation_body_from_dvl, nominal, best in also_turned)
+    return _named(declared, best, found[best].rotation_body_from_dvl, parameters, best in also_turned)
 
 
 def nearest(
@@ -256,7 +253,7 @@ def wrong_axes(
             return finding("DVL_LEFT_HANDED", axis="xyz"[mirrored], alike=alike)
         if ahead:
             return _mounting_fits(nominal @ np.diag(np.where(np.arange(3) == ahead, 1.0, -1.0)))
-        return finding("DVL_AXES_TURNED", axes=_OTHER_AXES.get(dvl_axes, "the other of flu and frd"))
+        return _axes_turned(nominal, dvl_axes)
     too_small = np.where(is_shown, (factors - Z_REPEATED_TEST * std) / factors[ahead] - SCALED_ALONE, 0.0)
     if not is_turned.any() and too_small.max() > 1.0:
         at = int(np.argmax(too_small))
@@ -270,9 +267,10 @@ def _signed(motion: MotionStreams, signs: Array) -> MotionStreams:
 
 
 def _named(
-    declared: VelocityFrame, best: VelocityFrame, rotation: Array, nominal: Array, also_turned: bool
+    declared: VelocityFrame, best: VelocityFrame, rotation: Array, parameters: Parameters, also_turned: bool
 ) -> Reason | None:
     """Return the finding that names the best configuration. also_turned: rotated body axes fit as well."""
+    nominal = parameters.rotation_dvl_from_body.T
     same_frame, as_given = best is declared, angle_between(rotation, nominal) < SAME_WITHIN
     if same_frame and as_given:  # a large misalignment is left to the calibration
         return None
@@ -284,14 +282,28 @@ def _named(
     if as_given:  # the frame alone explains the misfit
         return finding("REFERENCE_LOOKS", **frame)
     if not same_frame and earth and angle_between(rotation, FLU_FROM_FRD @ nominal) < SAME_WITHIN:
-        return finding("IMU_LOOKS_NED")
+        return _imu_turned(parameters)
     if angle_between(rotation, nominal @ FLU_FROM_FRD) < SAME_WITHIN:
-        turned = finding("DVL_AXES_TURNED", axes="the other of flu and frd")
+        turned = _axes_turned(nominal, parameters.dvl_axes)
     else:
         turned = _mounting_fits(_as_drawn(rotation))
     if same_frame:
         return turned
     return finding("TWO_CONTRADICTIONS", one=finding("REFERENCE_LOOKS", **frame), other=turned)
+
+
+def _imu_turned(parameters: Parameters) -> Reason:
+    """Return the finding of an IMU in the other axes of world and body than those configured."""
+    is_ned = parameters.imu_frame != IMU_NED
+    frame, name = (IMU_NED, "NED, forward-right-down") if is_ned else (IMU_ENU, "ENU, forward-left-up")
+    rpy = rpy_text(FLU_FROM_FRD @ rotation_from_rpy(parameters.imu_rpy))
+    return finding("IMU_LOOKS_NED", name=name, frame=frame, rpy=rpy)
+
+
+def _axes_turned(nominal: Array, dvl_axes: str) -> Reason:
+    """Return the finding of axes turned over; the mounting turns them back if only the messages tell the axes."""
+    axes, rpy = _OTHER_AXES.get(dvl_axes), rpy_text(nominal @ FLU_FROM_FRD)
+    return finding("DVL_AXES_TURNED", parameter="dvl_axes" if axes else "mounting_rpy", value=axes or rpy)
 
 
 def _mounting_fits(rotation: Array) -> Reason:

@@ -171,7 +171,7 @@ class Registration:
     def contradiction(self, parameters: Parameters) -> Reason | None:
         """Return the finding of a significant delay of reference or IMU, or of a clock change; else None."""
         if self.unsteady is not None:
-            return self.unsteady.reason
+            return self.unsteady.reason(parameters.dvl_clock_drift)
         name, clock = ("imu_time_offset", self.imu) if self.imu.is_shown else ("reference_time_offset", self.reference)
         if not clock.is_shown or (self.next_worse < REFUSED_FROM and self._holds(clock)):
             return self.ambiguity

@@ -71,8 +71,12 @@ def causes(found):
         ({"dvl": rotation_from_rpy([0.0, 0.0, 0.785]).T}, "MOUNTING_FITS", {"roll": 0.0, "pitch": 0.0, "yaw": 0.785}),
         ({"reference": ENU_FROM_NED}, "REFERENCE_LOOKS", {"name": "NED", "frame": "ned"}),
         ({"frame": VelocityFrame.NED}, "REFERENCE_LOOKS", {"name": "ENU", "frame": "enu"}),
-        ({"attitude": (ENU_FROM_NED, FLU_FROM_FRD)}, "IMU_LOOKS_NED", {}),
-        ({"dvl": FLU_FROM_FRD}, "DVL_AXES_TURNED", {"axes": "the other of flu and frd"}),
+        (
+            {"attitude": (ENU_FROM_NED, FLU_FROM_FRD)},
+            "IMU_LOOKS_NED",
+            {"name": "NED, forward-right-down", "frame": "ned", "rpy": "[3.1416, 0, 0]"},
+        ),
+        ({"dvl": FLU_FROM_FRD}, "DVL_AXES_TURNED", {"parameter": "mounting_rpy", "value": "[3.1416, 0, 0]"}),
     ],
     ids=["45 degrees", "NED called ENU", "ENU called NED", "attitude in NED", "flipped axes"],
 )

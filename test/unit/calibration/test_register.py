@@ -296,10 +296,13 @@ def test_a_left_handed_driver_is_named_with_its_axis(signs, axis):
     heave = level * np.sin(2.0 * np.pi * tg / 7.3)[:, None]
     made = make_motion((td, v * signs), (tg, g + heave), True, (True,) * 3, ImuColumns(*imu))
     found = register(made, np.eye(3), np.zeros(3))
-    said = fitting_configuration(made, VelocityFrame.ENU, np.eye(3), np.zeros(3), found)
+    said = fitting_configuration(made, VelocityFrame.ENU, found, Parameters())
     assert (said and (said.code, said.numbers)) == (axis and ("DVL_LEFT_HANDED", {"axis": axis, "alike": ""}))
-    said = fitting_configuration(made, VelocityFrame.ENU, np.eye(3), np.zeros(3), found, "frd")
+    said = fitting_configuration(made, VelocityFrame.ENU, found, Parameters(dvl_axes="frd"))
     assert axis not in ("y", "z") or f"(read as frd; read as flu, {'zy'['yz'.index(axis)]} does)" in said.sentence
+
+
+QUARTER = Parameters(mounting_rpy=(0.0, 0.0, 0.5 * np.pi))
 
 
 @pytest.mark.parametrize("axis", "xz")
@@ -313,7 +316,7 @@ def test_a_left_handed_driver_at_90_degrees_is_named_with_its_axis(axis):
     g = g + heave * np.sin(2.0 * np.pi * tg / 7.3)[:, None]
     made = make_motion((td, (v @ quarter) * signs), (tg, g), True, (True,) * 3, ImuColumns(*imu))
     found = register(made, quarter, np.zeros(3))
-    said = fitting_configuration(made, VelocityFrame.ENU, quarter, np.zeros(3), found)
+    said = fitting_configuration(made, VelocityFrame.ENU, found, QUARTER)
     assert said and (said.code, said.numbers) == ("DVL_LEFT_HANDED", {"axis": axis, "alike": ""})
 
 
@@ -324,7 +327,7 @@ def test_noise_of_the_axis_across_is_no_scale_of_the_axis_ahead(rng):
     measured = v @ quarter + rng.normal(0.0, 0.05, v.shape)
     made = make_motion((td, measured), (tg, g), True, (True,) * 3, ImuColumns(*imu))
     found = register(made, quarter, np.zeros(3))
-    assert fitting_configuration(made, VelocityFrame.ENU, quarter, np.zeros(3), found) is None
+    assert fitting_configuration(made, VelocityFrame.ENU, found, QUARTER) is None
 
 
 @pytest.mark.parametrize("late", [0.0, 0.06, 0.1])

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from remedies import changes
 from stacks import LEVER_ARM, TWIST, Told
 
 import dvl_calib_ros as dc
+from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.simulation.trajectories import make_motion
 
 CURRENT_MPS = (0.2, 0.1, 0.0)
@@ -46,7 +48,10 @@ def test_a_sway_that_a_current_contradicts_is_rejected_and_its_remedy_works(tmp_
     assert codes(examined.reasons)[0] == codes(reasons_of(calibration))[0] == "DVL_SIDE_INVERTED"
     assert "set dvl_axes to frd" in reasons_of(calibration)[0].sentence
     if signs[2] < 0.0:
-        mended = dc.replay(wrong, history=False, dvl_axes="frd")
+        typed = changes(
+            reasons_of(calibration)[0].remedy, Parameters.from_mapping(calibration.replayed.result.parameters)
+        )
+        mended = dc.replay(wrong, history=False, **typed)
     else:
         mended = dc.replay(recording(tmp_path / "mended", (1.0, 1.0, 1.0), mounting=mounting), history=False)
     assert mended.verdict != "reject" and "DVL_SIDE_INVERTED" not in codes(reasons_of(mended))

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from remedies import changes
 
 from dvl_calib_ros.calibration.models.parameters import Parameters
 from dvl_calib_ros.calibration.numerics.frames import quaternion_from_rotation, rotation_from_rpy
@@ -32,6 +33,7 @@ def message(at_s, *, sign=1.0, unit=9.81, inverted=False):
         ({"unit": 1.0}, Parameters(), "GRAVITY_IN_G"),
         ({"inverted": True}, Parameters(), "GRAVITY_FITS_INVERTED"),
         ({}, Parameters(imu_frame="ned"), "GRAVITY_UPSIDE_DOWN"),
+        ({}, Parameters(imu_rpy=(np.pi, 0.0, 0.0)), "GRAVITY_UPSIDE_DOWN"),
     ],
 )
 def test_gravity_is_held_against_the_orientation_by_a_message_a_second(given, parameters, code):
@@ -41,4 +43,8 @@ def test_gravity_is_held_against_the_orientation_by_a_message_a_second(given, pa
     assert seen.problems("imu/data", parameters) == []  # too few to tell
     for at_s in np.arange(19.0, 60.0, 0.1):
         seen.add(message(at_s, **given))
-    assert [each.code for each in seen.problems("imu/data", parameters)] == ([code] if code else [])
+    problems = seen.problems("imu/data", parameters)
+    assert [each.code for each in problems] == ([code] if code else [])
+    if code == "GRAVITY_UPSIDE_DOWN":
+        typed = changes(problems[0].remedy, parameters)
+        assert seen.problems("imu/data", parameters.replace(**typed)) == []
