@@ -210,7 +210,7 @@ CONFIGURATIONS = on_page(
         "CLOCK_FAR",
         "{whose} stamps are about {seconds:.0f} s {way} than {others}; up to {limit:.0f} s can be estimated and "
         "subtracted",
-        remedy="set that clock; to use the recording times of this bag instead: --restamp log",
+        remedy="set that clock; use the recording times for this bag: --restamp log",
     ),
     # declarations of a recording
     reject(

@@ -111,7 +111,7 @@ VERDICTS = on_page(
     reject(
         "CLOCKS_APART",
         "{whose} stamps are {seconds:.1f} s {side} {other} that arrived at the same time{known}",
-        remedy="synchronise the clocks; to use the recording times of this bag instead: --restamp log",
+        remedy="synchronise the clocks; use the recording times for this bag: --restamp log",
     ),
     # several recordings
     reject(

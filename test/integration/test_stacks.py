@@ -139,7 +139,7 @@ def test_a_declared_frame_that_does_not_fit_is_not_taken_silently(bags):
     found = discover([bags["odometry_in_the_world"]], Parameters())
     assert found.parameters.gnss_frame == "enu"
     (doubt,) = found.doubts
-    assert "'base_link' says body" in doubt and "-p gnss_frame:=body" in doubt
+    assert "'base_link' says body" in doubt and "correct the frame" in doubt
 
 
 def test_a_velocity_that_has_the_dvl_in_it_is_no_reference(tmp_path):
