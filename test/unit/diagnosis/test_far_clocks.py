@@ -88,7 +88,7 @@ def test_a_clock_that_is_too_far_off_is_refused_in_one_line_whatever_is_common_t
 def test_a_diagnosis_of_such_clocks_ends_in_that_line_and_not_in_an_answer(recording, seconds):
     if recording.name == "figure8" and seconds == 100.0:
         pytest.skip("it agrees with itself a round later, which is nearer than what is refused")
-    with pytest.raises(InputError, match="set that clock, or use the recording times"):
+    with pytest.raises(InputError, match="set that clock; use the recording times"):
         diagnose_recordings([late(recording, "dvl", seconds)], Parameters())
 
 

@@ -138,7 +138,7 @@ def test_the_command_prints_it_and_writes_json_and_report(bags, tmp_path, capsys
     out, _ = succeed(
         capsys, "diagnose", bags["vehicle"], "--simulator", bags["simulator"], "--report", report, "--json", document
     )
-    assert "The simulator lacks lever_arm. Put right" in " ".join(out.split())
+    assert "The simulator lacks lever_arm. Corrected" in " ".join(out.split())
     assert json.loads(document.read_text())["verdict"] == "different"
     page = Page(report)
     assert page.row("lever_arm")[1] == "the simulator lacks it"
