@@ -256,11 +256,12 @@ class _Search:
         """Set min_speed of a vehicle that mostly moves more slowly than the default."""
         speed = np.linalg.norm(dvl.values, axis=1)
         moving = speed[speed > SLOWEST_MPS]
-        if self._is_given("min_speed") or not len(moving) or median(moving) > self._parameters.min_speed:
+        typical = float(median(moving)) if len(moving) else math.inf
+        if self._is_given("min_speed") or typical > self._parameters.min_speed:
             return
         self._values["min_speed"] = SLOWEST_MPS
         self._found.append(
-            f"the vehicle moves at {float(median(moving)):.2g} m/s: samples from {SLOWEST_MPS:g} m/s on are used "
+            f"the vehicle moves at {typical:.2g} m/s: samples from {SLOWEST_MPS:g} m/s on are used "
             f"(-p min_speed:={SLOWEST_MPS:g})"
         )
 

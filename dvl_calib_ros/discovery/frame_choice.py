@@ -200,8 +200,7 @@ class FrameChooser:
             if self._gravity is not None:
                 wrong = self._gravity.contradicts(frame.rotation_body_from_imu, frame.world, z_down)
                 prior += (0.0, GRAVITY_CONTRADICTS, GRAVITY_INVERTED)[wrong]
-            frame = replace(frame, heading_offset=self._parameters.heading_offset)
-            found.append(ImuHypothesis(frame, z_down, prior))
+            found.append(ImuHypothesis(replace(frame, heading_offset=self._parameters.heading_offset), z_down, prior))
         return found
 
     def _body_is_z_down(self, frame: ImuFrame) -> bool:

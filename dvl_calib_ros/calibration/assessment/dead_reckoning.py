@@ -340,16 +340,16 @@ def in_words(navigation: Navigation) -> list[str]:
     """Return sentences that describe the drift."""
     n, before, after = navigation, navigation.before, navigation.after
     over = f"over stretches of {n.stretch_m:.0f} m" if n.stretches > 1 else f"over {n.distance_m:.0f} m"
-    reasons = [
+    sentences = [
         f"Dead reckoning on data held out, {over}: {metres(before.per_km)} m of drift per km as mounted "
         f"({before.percent:.2g} % of distance), {metres(after.per_km)} m corrected ({after.percent:.2g} %). "
         f"Noise of reference, attitude and DVL alone may make {metres(n.noise_per_km)} m."
     ]
-    reasons.append(
+    sentences.append(
         f"After {n.distance_m:.0f} m it is {metres(before.end)} m off as mounted, {metres(after.end)} m corrected"
         + ("." if n.on_a_map else "; without headings, as on one course.")
     )
-    return reasons
+    return sentences
 
 
 def metres(value: float) -> str:

@@ -40,8 +40,8 @@ from ..results.extrinsics import (
 )
 from ..results.mounting_quantities import date
 
-# False-alarm rates of one comparison, for any numbers of quantities and instants: of a mounting that has moved, and of
-# one that is suspicious. `CHANCE` is that of scale and delay.
+# False-alarm rates of one comparison, for any numbers of quantities and instants, of a moved and of a suspicious
+# mounting; for scale and delay the rate is `CHANCE`.
 MOVED, SUSPICIOUS = chance_of(Z_FIFTY_TESTS), chance_of(Z_95_PERCENT)
 # Standard deviation of a lever arm between recordings without a movement, m: the phase centre of a GNSS antenna wanders
 # by one to two centimetres with the satellites in view (IGS antenna calibrations)

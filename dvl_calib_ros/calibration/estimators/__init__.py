@@ -1,1 +1,1 @@
-"""Estimators of models that no per-sample filter solves: lever arm and delay (full), displacements (D1)."""
+"""Estimators of models that no per-sample filter solves: lever arm and delay (full), displacements (positions)."""

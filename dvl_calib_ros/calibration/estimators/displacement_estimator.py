@@ -1,4 +1,4 @@
-"""Estimator of D1 from displacements, its verification on held-out legs, and its track.
+"""Estimator of `positions` from displacements, its verification on held-out legs, and its track.
 
 All legs so far are solved together at scheduled stamps. Each solution uses only earlier rows and fixes, minus the delay
 that a fix may have, and takes effect one second later in stamps. So a live run and a replay agree.
@@ -59,10 +59,10 @@ NO_LOOK = _Look(None, 0.0)
 
 
 class Displacements(Estimator):
-    """Estimator of D1, which collects dead reckoning and fixes and has them solved."""
+    """Estimator of `positions`, which collects dead reckoning and fixes and has them solved."""
 
     def __init__(self, given: EstimatorSetup) -> None:
-        """Start from the prior of D1's states."""
+        """Start from the prior of its states."""
         self._model, self._parameters, self._aligner = given.model, given.parameters, given.aligner
         self._start = given.initial or prior(given.model, given.parameters)
         self._on_look = given.on_evidence
@@ -187,7 +187,7 @@ class Displacements(Estimator):
 
     @property
     def evidence(self) -> Evidence:
-        """Evidence that positions are too noisy or too sparse for velocities, once D1 has a fit."""
+        """Evidence that positions are too noisy or too sparse for velocities, once there is a fit."""
         if self._last_result.fit is None:
             return NO_EVIDENCE
         noise = self._last_result.noise_mps

@@ -1,4 +1,4 @@
-"""Least squares over legs of dead reckoning between position fixes (docs/models.md, "D1").
+"""Least squares over legs of dead reckoning between position fixes (docs/models.md, "positions").
 
 Fixes minus dead reckoning are y = o + J θ + noise, with a constant o per stretch. θ: misalignment (3) rad, scale, lever
 arm (3) m beyond the parameters', delay of the fixes s, and heading deviation (5). Means over blocks of time are fitted
@@ -59,7 +59,7 @@ class DisplacementFit(NamedTuple):
 
     @property
     def errors(self) -> GaussianState:
-        """Misalignment and scale, the states of D1."""
+        """Misalignment and scale, the states of `positions`."""
         return GaussianState(self.state.x[:N_ERRORS], self.state.p[:N_ERRORS, :N_ERRORS])
 
 

@@ -207,7 +207,7 @@ class JointFit:
             raise
 
     def _add(self, day: _Day, block: FitBlock) -> None:
-        """Add a block to its day. Linearise all blocks anew if their number is a power of two or x moved."""
+        """Add a block to its day. Linearise all anew if their number is a power of two, or if the estimate moved."""
         day.blocks.append(block)
         day.count += 1
         self._forget()

@@ -89,8 +89,8 @@ DRAWN = math.pi / 4.0
 # that does not fit also the axis ahead mirrored, and all axes; the axis ahead and one other are a mounting.
 SIGNS: Sequence[Array] = [np.array([1.0, one, other]) for one in (1.0, -1.0) for other in (1.0, -1.0)]
 SIGNS_OF_AHEAD: Sequence[Array] = [*SIGNS, np.array([-1.0, 1.0, 1.0]), -np.ones(3)]
-# Largest residual of an explanation by signs as a multiple of the registered one, whose clocks are free, unless the
-# evidence for the clocks is enough; and an extra factor for few rows.
+# Largest residual of an explanation by signs, as a multiple of the registered one, whose clocks are free. In long
+# recordings it is smaller: a residual less by that factor is then enough for a delay (`GAIN`). FAR_WORSE: for few rows.
 AS_WELL, FAR_WORSE = 1.1, 1.5
 # Smallest excess factor of one axis, above any error of the speed of sound.
 SCALED_ALONE = 0.2

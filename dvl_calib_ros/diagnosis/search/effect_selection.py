@@ -158,10 +158,10 @@ def select(
     fitter, fit = with_noise_reestimated(fitter, fit, every)
     fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
-    told = identify_effects(fitter, fit, guesses, effects, alike)
-    base = fitter.fit_kept(told.fit.hypothesis.with_effects([], len(recordings), {}), told.fit.noise)
+    found = identify_effects(fitter, fit, guesses, effects, alike)
+    base = fitter.fit_kept(found.fit.hypothesis.with_effects([], len(recordings), {}), found.fit.noise)
     return EffectSelection(
-        told.selected, base, told.fit, fitter, guesses, effects, told.opened, told.moved, wider.hypothesis
+        found.selected, base, found.fit, fitter, guesses, effects, found.opened, found.moved, wider.hypothesis
     )
 
 

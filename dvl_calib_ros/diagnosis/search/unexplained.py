@@ -170,9 +170,9 @@ def _score_tests(
     raw: dict[str, Array] = {}
     for name, functions in dictionary(problem, seen).items():
         raw[name] = _along_axes(functions, problem.axes)
-        told = ScoreTest.of(q, noise.whiten(raw[name]), white)
+        all_columns = ScoreTest.of(q, noise.whiten(raw[name]), white)
         for at in _columns_of_tests(name, functions.shape[1], problem.axes):
-            score_tests.append(FollowTest(name, at, *told.energy(at)))
+            score_tests.append(FollowTest(name, at, *all_columns.energy(at)))
     return score_tests, white, raw, q
 
 
