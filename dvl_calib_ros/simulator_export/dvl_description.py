@@ -87,11 +87,10 @@ def load_description(path: Path, sample: int | None = None) -> DvlDescription:
     sample: number of the draw of `diagnose --samples` to take, from 0; None: the estimate.
     """
     document = _document(path)
-    if sample is not None:
-        samples = document.get("samples", []) if isinstance(document, dict) else []
-        if not 0 <= sample < len(samples):
-            raise InputError(f"{path}: has {len(samples)} samples, so none of number {sample}; see diagnose --samples")
-        document |= samples[sample]
+    samples = document.get("samples") if isinstance(document, dict) else None
+    samples = samples if isinstance(samples, list) else []
+    if sample is not None and not 0 <= sample < len(samples):
+        raise InputError(f"{path}: has {len(samples)} samples, so none of number {sample}; see diagnose --samples")
     if isinstance(document, str):
         return _of_result(path) if document == RESULT else _of_parameters(path)
     if not isinstance(document, dict) or "effects" not in document or "calibration" not in document:
@@ -102,7 +101,7 @@ def load_description(path: Path, sample: int | None = None) -> DvlDescription:
             "wrote it; diagnose again (--json)"
         )
     try:
-        return _of_diagnosis(path, document)
+        return _of_diagnosis(path, document if sample is None else document | samples[sample])
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{path}: damaged diagnosis ({type(error).__name__}: {error}); diagnose again") from error
 

@@ -60,4 +60,8 @@ def test_a_draw_is_written_and_exported(tmp_path, capsys):
     sdf = tmp_path / "other.sdf"
     says = fail(capsys, "export", "gazebo", tmp_path / "samples.json", "--sample", 5, "-o", sdf)
     assert "has 5 samples, so none of number 5" in says
+    for damaged, says in (({"a": 1}, "has 0 samples"), ([3, 4], "damaged diagnosis"), ([{"effects": 5}], "damaged")):
+        content = json.loads((tmp_path / "samples.json").read_text()) | {"samples": damaged}
+        (tmp_path / "damaged.json").write_text(json.dumps(content))
+        assert says in fail(capsys, "export", "gazebo", tmp_path / "damaged.json", "--sample", 0, "-o", sdf)
     assert "from 1 to 5000" in fail(capsys, "diagnose", tmp_path / "bag", "--samples", "many", tmp_path / "x.json")
