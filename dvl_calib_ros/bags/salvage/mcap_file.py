@@ -42,6 +42,7 @@ from .mcap_records import (
     Tables,
     head_at,
     is_chunk,
+    is_definition,
     likeness,
     message_head,
     messages_of,
@@ -204,7 +205,7 @@ def _whole_chunk(
     chunk = open_chunk(file, at, length, size)
     if chunk.damage:
         raise DamagedError(chunk.damage)
-    starts = _indexed_starts(file, index)
+    starts = _indexed_starts(file, index, chunk.end)
     places = None if starts is None else places_by_index(chunk.records, starts, tables)
     places = places or places_of(chunk.records, tables)
     if places is not None:
@@ -219,11 +220,11 @@ def _whole_chunk(
     return numbered_batch(log_ns, number, data, channels)
 
 
-def _indexed_starts(file: BinaryIO, index: ChunkIndex) -> NDArray[np.uint64] | None:
-    """Return the starts of messages in a chunk by the indexes after it; None if those are not sound."""
+def _indexed_starts(file: BinaryIO, index: ChunkIndex, end: int) -> NDArray[np.uint64] | None:
+    """Return the starts of messages in a chunk by the indexes after its end; None if those are not sound."""
     if not index.message_index_offsets or not 0 < index.message_index_length <= LARGEST_RECORD:
         return None
-    file.seek(index.chunk_start_offset + index.chunk_length)
+    file.seek(end)
     content = file.read(index.message_index_length)
     starts = []
     at = 0
@@ -353,7 +354,8 @@ class _FileWalk:
         is_message = likeness(head, self._size - at, self._tables) >= ALL_BUT_OPCODE and bool(self._tables.eras)
         # an index after a chunk resembles a message except for the opcode
         is_index = self._holds_chunks and is_message and _INDEX_HEAD.unpack_from(head)[-1] == length - _INDEX_OWN
-        if is_message and (opcode == MESSAGE) == is_index:
+        is_other = opcode in (SCHEMA, CHANNEL) and is_definition(self._file, at, opcode, length)
+        if is_message and (opcode == MESSAGE) == is_index and not is_other:
             raise DamagedError(f"the record at byte {at} is damaged")
         self.has_ended = is_end
         if is_end and opcode == Opcode.FOOTER:  # the end of the data is damaged

@@ -230,11 +230,11 @@ def _begins(file: BinaryIO, at: int, size: int, tables: Tables) -> bool:
     if opcode == MESSAGE:
         return likeness(head, size - at, tables) == ALIKE and _record_follows(file, end, size, tables)
     if opcode in (SCHEMA, CHANNEL):
-        return _is_definition(file, at, opcode, length) and _record_follows(file, end, size, tables)
+        return is_definition(file, at, opcode, length) and _record_follows(file, end, size, tables)
     return opcode == Opcode.DATA_END and length == 4
 
 
-def _is_definition(file: BinaryIO, at: int, opcode: int, length: int) -> bool:
+def is_definition(file: BinaryIO, at: int, opcode: int, length: int) -> bool:
     """Return whether a record holds a definition that ends where the record does."""
     if length > LARGEST_RECORD:
         return False
