@@ -17,6 +17,7 @@ from ..calibration.models import MODELS
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.samples import Stream, VelocityFrame
+from ..calibration.numerics.tests import Z_ONE_TEST
 from ..calibration.registration.frame_hypotheses import FITS
 from ..calibration.results.mounting_quantities import Quantity, quantities
 from ..calibration.results.results import Estimate
@@ -336,12 +337,13 @@ def _has_error(found: Sequence[Reason]) -> bool:
 
 
 def _units(dvl: Recorded, reference: Recorded) -> list[Reason]:
-    """Report DVL and reference whose speeds differ by the factor between two units."""
+    """Report DVL and reference whose speeds, well above their noise, differ by the factor between two units."""
     speeds = []
     for topic in (dvl, reference):
         norms = np.linalg.norm(topic.values, axis=1)
         norms = norms[np.isfinite(norms) & (norms > 0.0)]
-        speeds.append(float(np.median(norms)) if len(norms) else 0.0)
+        speed = float(np.median(norms)) if len(norms) else 0.0
+        speeds.append(speed if speed > Z_ONE_TEST * topic_checks.shown_noise(topic.values) else 0.0)
     if not min(speeds) > 0.0:
         return []
     factor = speeds[0] / speeds[1]

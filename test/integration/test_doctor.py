@@ -364,3 +364,11 @@ def test_positions_read_from_degrees_and_minutes_are_named():
     dvl, reference = (SimpleNamespace(values=np.full((20, 3), each)) for each in (1.0, 0.602))
     (said,) = _units(dvl, reference)
     assert said.code == "DOCTOR_UNITS" and "ddmm.mmmm" in said.says
+
+
+def test_speeds_below_the_noise_are_no_other_unit():
+    """A hovering vehicle of 0.07 m/s: 0.1 m/s of noise made its reference 2.5 times as fast as its DVL."""
+    noise = np.random.default_rng(0).normal(0.0, 0.06, (300, 3))
+    dvl, reference = (SimpleNamespace(values=[0.07, 0.0, 0.0] + size * noise) for size in (0.01, 2.0))
+    assert np.median(np.linalg.norm(reference.values, axis=1)) > 2.5 * 0.07
+    assert _units(dvl, reference) == []

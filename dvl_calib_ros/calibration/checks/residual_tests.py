@@ -436,7 +436,9 @@ def _noise_in_reference(time: Array, dvl: Array, error: Array, columns: Array, f
                 continue
             share = float(np.einsum("n,ni,ni->", weight, past, rest)) / square
             scores = np.add.reduceat(weight * (past * (rest - share * past)).sum(axis=1), fit.starts)
-            found.append((share, math.hypot(float(_std(scores[None] / square, QUICK_STRETCHES)[0]), OF_WAVES), seconds))
+            std = math.hypot(float(_std(scores[None] / square, QUICK_STRETCHES)[0]), OF_WAVES)
+            if share - Z_95_PERCENT * std < 1.0:  # no filter makes more of the noise than there is: that is motion
+                found.append((share, std, seconds))
     return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
 
 

@@ -258,6 +258,15 @@ def test_a_reference_that_follows_the_noise_of_the_dvl_is_made_from_it(rng, seco
     assert said.severity is Severity.REJECT and said.code == "CIRCULAR_REFERENCE"
 
 
+def test_a_reference_that_moves_by_more_than_the_noise_of_the_dvl_is_no_filter_of_it(rng):
+    """A boat's reference followed 2.5 times what a quiet DVL's neighbours left of waves; a filter keeps less than 1."""
+    vehicle = Vehicle(rng)
+    kept = 3.0 * past_noise(vehicle.noise[1], 1.0) / STEP_S
+    vehicle.noise = 0.3 * vehicle.noise[0], vehicle.noise[1]
+    found = vehicle.found(reference=vehicle.earth + np.einsum("nij,nj->ni", vehicle.turns, kept))
+    assert "CIRCULAR_REFERENCE" not in [each.code for each in residual_warnings(found)]
+
+
 def made_by_a_filter(vehicle):
     """A reference that is the DVL smoothed over 0.5 s; that it is late has been taken off."""
     seen = vehicle.earth + np.einsum("nij,nj->ni", vehicle.turns, vehicle.noise[1])
