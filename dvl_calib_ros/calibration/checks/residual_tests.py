@@ -70,7 +70,8 @@ SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
 OUTLYING, ROUNDS = 4.0, 3
 # Smallest noise of the residual, m/s.
 QUIETEST_MPS = 1e-3
-# Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion.
+# Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion, and a
+# reference that is interpolated follows the motion before.
 FILTER_MEMORIES_S, LONGEST_INTERVAL_S = (0.5, 1.0, 3.0), 0.3
 # Samples to either side that predict one; innovations beyond OUTLYING_INNOVATION σ are outliers.
 NEIGHBOURS, OUTLYING_INNOVATION = 12, 4.0
@@ -210,7 +211,7 @@ def residual_trend(
     smoothed, smoothed_std = (fast.x[-1] / bends_by, fast.std[-1] / bends_by) if shows else (0.0, math.inf)
     return ResidualTrend(
         tilt, std, slow.x[-3:], slow.std[-3:], float(smoothed), float(smoothed_std), lean, speed,
-        *_noise_in_reference(time, velocity - error, error, both, fast), over_ground, over_bed.std[OVER_GROUND],
+        *_noise_in_reference(time, velocity - error, error, both, fast, interval_s), over_ground, over_bed.std[OVER_GROUND],
         float(slow.x[-4]), float(slow.std[-4]),
     )  # fmt: skip
 
@@ -396,14 +397,18 @@ def _std(scatter: Array, together: Sequence[int]) -> Array:
     return np.sqrt(np.max([(each**2).sum(axis=1) for each in sums], axis=0) * (m / (m - 1.0)))
 
 
-def _noise_in_reference(time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit) -> tuple[float, float, float]:
-    """Return the share of the DVL's noise that the reference keeps, its σ, and the memory, s. dvl: (N, 3) m/s, body.
+def _noise_in_reference(
+    time: Array, dvl: Array, error: Array, columns: Array, fit: _Fit, interval_s: float
+) -> tuple[float, float, float]:
+    """Return the share of the DVL's noise that the reference keeps, its σ, and the memory, s.
+
+    dvl: (N, 3) m/s, body. interval_s: of the reference.
 
     The innovation of a velocity, given its neighbours, holds its noise. The same filter is applied to the residual, so
     both hold the same noise. Nuisance columns hold DVL noise themselves, so the residual is not corrected by them.
     """
     step = float(median(np.diff(time)))
-    if step > LONGEST_INTERVAL_S or len(time) < 4 * NEIGHBOURS:
+    if max(step, interval_s) > LONGEST_INTERVAL_S or len(time) < 4 * NEIGHBOURS:
         return 0.0, math.inf, 0.0
     innovation, rest = (np.zeros_like(dvl) for _ in range(2))
     for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):

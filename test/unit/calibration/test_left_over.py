@@ -340,6 +340,7 @@ def test_waves_between_samples_of_a_slow_reference_do_not_make_it_a_smoothed_one
     found = vehicle.found(reference=between, interval_s=interval_s)
     assert found.smoothed == pytest.approx(0.0, abs=0.03)
     assert "VELOCITY_SMOOTHED" not in {each.code for each in residual_warnings(found)}
+    assert math.isinf(found.circular_std)  # a line between samples follows the motion before as a filter does
 
 
 def test_waves_between_samples_of_a_slow_reference_are_no_tilt_that_is_not_followed():
