@@ -57,7 +57,7 @@ POWER = 0.8
 MATERIAL = 0.2
 # Least closure of an explanation; less is a part of one (issue 46)
 EXPLAINS = 0.8
-# Least ratio of the unexplained error to the noise for a mention in the sentence
+# Least ratio of the unexplained error to the noise that is worth a mention, and no "no gap"
 WORTH_TELLING = 0.3
 
 
@@ -242,7 +242,10 @@ def _verdict(selection: EffectSelection, rest: Unexplained, gap: Gap, visible_sh
     if selection.selected:
         ambiguous = any(each.equivalent for each in selection.selected)
         return DiagnosisVerdict.AMBIGUOUS if ambiguous else DiagnosisVerdict.KNOWN
-    return DiagnosisVerdict.NO_GAP if visible_share >= MIN_VISIBLE_SHARE else DiagnosisVerdict.INSUFFICIENT_EXCITATION
+    if visible_share < MIN_VISIBLE_SHARE:
+        return DiagnosisVerdict.INSUFFICIENT_EXCITATION
+    is_left = gap.not_explained > WORTH_TELLING * gap.noise_floor
+    return DiagnosisVerdict.UNKNOWN if is_left else DiagnosisVerdict.NO_GAP
 
 
 def _minimum_detectable(selection: EffectSelection, effect: Effect, n_tested: int) -> dict[str, float]:
@@ -384,12 +387,10 @@ def _reasons(
         "tested": n_tested,
     }
     is_unknown = verdict is DiagnosisVerdict.UNKNOWN
-    is_left = (
-        gap.not_explained > WORTH_TELLING * gap.noise_floor and verdict is not DiagnosisVerdict.INSUFFICIENT_EXCITATION
-    )
+    is_left = bool(found) and gap.not_explained > WORTH_TELLING * gap.noise_floor
     code = "GAP_PARTLY_UNKNOWN" if is_unknown and found else CODES[verdict]
     reasons = [finding(code, **numbers)]
-    if is_left and code != "GAP_UNKNOWN":
+    if is_left:
         reasons.append(finding("REST_UNEXPLAINED", rest=1e3 * gap.not_explained))
     if is_unknown:
         reasons.append(rest.follows if rest.found else finding("REST_FOLLOWS_NOTHING"))

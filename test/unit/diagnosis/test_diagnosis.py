@@ -1078,11 +1078,11 @@ def test_effects_that_leave_more_than_the_noise_on_held_out_data_or_close_next_t
     assert "is explained by scale_drift" in explained[0].sentence
 
 
-def test_what_exceeds_the_noise_by_as_much_is_unknown_and_no_sound_bag():
+def test_an_error_of_a_third_of_the_noise_is_no_sound_bag():
     """94.4 mm/s were not explained beside `no_gap`."""
     selection: Any = SimpleNamespace(selected=[], fit=None, fitter=Mock())
     nothing_left = Unexplained(0.0, "", np.zeros((9, 3, 0)), np.zeros((9, 3, 0)))
-    for not_explained, verdict in ((0.99, DiagnosisVerdict.NO_GAP), (1.01, DiagnosisVerdict.UNKNOWN)):
+    for not_explained, verdict in ((0.29, DiagnosisVerdict.NO_GAP), (0.31, DiagnosisVerdict.UNKNOWN)):
         after = float(np.hypot(1.0, not_explained))
         gap = Gap(after, after, 1.0, np.nan, (np.nan, np.nan), not_explained)
         assert _verdict(selection, nothing_left, gap, 1.0) is verdict
