@@ -9,14 +9,13 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
+from ..numerics.robust import FEWEST_SAMPLES
 from ..numerics.tests import Z_REPEATED_TEST
 from ..results.mounting_quantities import date
 from ..results.results import ARM, OFFSETS, Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
-# Samples needed for a warning.
-ENOUGH_SAMPLES = 20
 # Share of exactly repeated DVL velocities above which the driver repeats stale data. Share of samples without attitude
 # or turn rate, such as those before the IMU's first, that changes no answer.
 SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
@@ -56,7 +55,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
     """Return warnings on the data received, from `Calibrator.counts`."""
     dvl, pairing = counts["dvl"], counts["pairing"]
     found = []
-    if dvl["received"] >= ENOUGH_SAMPLES and not dvl["accepted"]:
+    if dvl["received"] >= FEWEST_SAMPLES and not dvl["accepted"]:
         lost = ", ".join(f"{count} {name}" for name, count in dvl.items() if count and name != "received")
         found.append(finding("DVL_NONE_USABLE", count=dvl["received"], reasons=lost))
     if _never_meet(counts):
@@ -67,7 +66,7 @@ def recording_warnings(counts: Mapping[str, Mapping[str, int]]) -> list[Reason]:
         found.append(finding("DVL_DROPOUTS", count=dvl["dropouts"]))
     if dvl["frozen"]:
         found.append(finding("DVL_FROZEN", count=dvl["frozen"]))
-    elif dvl["repeated"] >= ENOUGH_SAMPLES and dvl["repeated"] > SUSPICIOUS_REPEATED * dvl["usable"]:
+    elif dvl["repeated"] >= FEWEST_SAMPLES and dvl["repeated"] > SUSPICIOUS_REPEATED * dvl["usable"]:
         found.append(finding("DVL_REPEATS", count=dvl["repeated"]))
     if pairing["gnss_losses"] >= FLAPPING:
         found.append(finding("GNSS_LOSSES", count=pairing["gnss_losses"]))
@@ -89,20 +88,20 @@ def _never_meet(counts: Mapping[str, Mapping[str, int]]) -> bool:
     usable = 2 * reference["received"] - sum(reference.values())
     if pairing["paired"] or pairing["without_attitude"]:
         return False
-    return usable >= ENOUGH_SAMPLES and pairing["unpaired"] >= ENOUGH_SAMPLES
+    return usable >= FEWEST_SAMPLES and pairing["unpaired"] >= FEWEST_SAMPLES
 
 
 def gate_warnings(estimate: Estimate) -> list[Reason]:
     """Return a warning if a model's gate rejects so many samples that the configuration must be wrong."""
     given = estimate.used + estimate.gated
-    if given < ENOUGH_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
+    if given < FEWEST_SAMPLES or estimate.gated <= SUSPICIOUS_GATED * given:
         return []
     return [finding("SAMPLES_GATED", model=estimate.model, gated=estimate.gated, given=given)]
 
 
 def consistency_warnings(estimate: Estimate) -> list[Reason]:
     """Return a warning if a model's innovations exceed their predicted covariance; smaller ones only enlarge σ."""
-    if estimate.used < ENOUGH_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
+    if estimate.used < FEWEST_SAMPLES or estimate.mean_nis <= estimate.nis_bounds[1]:
         return []
     return [finding("INNOVATIONS_LARGE", model=estimate.model, nis=estimate.mean_nis, limit=estimate.nis_bounds[1])]
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
-from ..numerics.robust import median, steps
+from ..numerics.robust import FEWEST_VALUES, median, steps
 
-# Samples per block, and blocks needed.
-FEWEST, ENOUGH = 12, 6
+# Blocks needed.
+ENOUGH = 6
 # Two streams share a topic if squared changes over one sample exceed FURTHER times those over two, plus FURTHER_MPS2,
 # (m/s)², for motion. MOST: share of the blocks in which they must.
 FURTHER, FURTHER_MPS2, MOST = 6.0, 0.02**2, 0.6
@@ -39,7 +39,7 @@ class DvlStream:
 
     def add(self, velocity: Array) -> None:
         """Add a block of consecutive DVL velocities (N, 3) m/s."""
-        if len(velocity) < FEWEST:
+        if len(velocity) < FEWEST_VALUES:
             return
         one, two = steps(velocity), velocity[2:] - velocity[:-2]
         near, far = (float(median((each**2).sum(axis=1))) for each in (two, one))

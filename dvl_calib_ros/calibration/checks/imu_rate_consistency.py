@@ -17,6 +17,7 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import ENU_FROM_NED, Array, product, rotation_from_quaternion, rotation_vector
+from ..numerics.robust import FEWEST_OF_MOTION
 from ..numerics.samples import Index
 from ..streams.imu_frame import quaternion_product
 
@@ -24,8 +25,8 @@ from ..streams.imu_frame import quaternion_product
 SPAN_S, LONGEST_S = 0.5, 1.6
 # Largest turn rate of a vehicle with a DVL, rad/s; larger differences are outliers of the attitude.
 FASTEST = 1.5
-# Differences, and turn rate (rms, rad/s), needed for the test.
-ENOUGH, LEAST_TURNING = 60, 0.005
+# Turn rate (rms, rad/s) needed for the test.
+LEAST_TURNING = 0.005
 # Residual share of the squared turn rate: at most with another convention, at most relative to the given one, and at
 # least with the given one for a contradiction.
 LEFT_AT_MOST, BETTER_BY, WRONG_FROM = 0.25, 0.25, 0.02
@@ -111,13 +112,13 @@ class AttitudeRates:
     @property
     def is_level(self) -> bool:
         """Return whether the attitude is a heading only, without roll and pitch."""
-        return self._n >= ENOUGH and not self._tilted
+        return self._n >= FEWEST_OF_MOTION and not self._tilted
 
     def contradiction(self) -> Reason | None:
         """Return the reason, and the convention that fits, if attitude and angular velocity disagree."""
         shown = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
         total = float(np.trace(self._turning[shown, shown]))
-        if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
+        if self._n < FEWEST_OF_MOTION or total < self._n * LEAST_TURNING**2:
             return None
         if not self._rates[_BODY].any():
             return finding("IMU_NO_RATES")

@@ -25,7 +25,7 @@ from ..models import MODELS
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import effective_blocks, student_factor
 from ..numerics.frames import Array, cross, skew
-from ..numerics.robust import median, robust_std
+from ..numerics.robust import FEWEST_VALUES, median, robust_std
 from ..numerics.samples import Index
 from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
 from ..results.results import ARM, OFFSETS, Estimate
@@ -36,8 +36,8 @@ from .imu_rate_consistency import LEVEL_BELOW
 TILT_S = 1.0, 15.0
 # Averaging time, s, of the velocity whose second derivative is tested.
 BEND_S = 1.0
-# Stretches, s, whose scatter gives σ, and the number of them needed.
-STRETCH_S, ENOUGH = 15.0, 12
+# Stretches, s, whose scatter gives σ.
+STRETCH_S = 15.0
 # Numbers of stretches combined for σ: slow errors of references and attitudes last a minute or two.
 QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # Prior σ of nuisance columns: misalignment (rad), scale, lever arm (m), delay (s), reference error (m/s), heading error
@@ -148,7 +148,7 @@ def residual_trend(
     rates: (N, 3) rad/s, body.
     interval_s: sample interval of the reference, which is interpolated linearly, s.
     """
-    if len(time) < 3 or time[-1] - time[0] < ENOUGH * STRETCH_S:
+    if len(time) < 3 or time[-1] - time[0] < FEWEST_VALUES * STRETCH_S:
         return None
     up = np.sign(rotation_enu_from_body[:, 2, 2].mean())  # -1 for a z-down body
     roll = np.arctan2(up * rotation_enu_from_body[:, 2, 1], up * rotation_enu_from_body[:, 2, 2])
@@ -365,7 +365,7 @@ def _fitted(
     """Fit error (N, 3) = columns (N, 3, n) x; None for too few stretches."""
     stretch = np.floor((time - time[0]) / STRETCH_S).astype(np.int64)
     starts = np.flatnonzero(np.diff(stretch, prepend=-1))
-    if len(starts) < ENOUGH:
+    if len(starts) < FEWEST_VALUES:
         return None
     n = columns.shape[2]
     rest = error

@@ -18,13 +18,11 @@ from ..models.parameters import Parameters
 from ..numerics.error_model import correction_matrix
 from ..numerics.frames import Array, rotation_from_quaternion
 from ..numerics.kalman import GaussianState
-from ..numerics.robust import median, robust_std
+from ..numerics.robust import FEWEST_VALUES, median, robust_std
 from ..numerics.samples import Index, Mask, Stamps
 
 N_ERRORS, N_THETA = 4, 13
 SCALE, ARM, LATE, DEVIATION, DRIFT = 3, slice(4, 7), 7, slice(8, 13), 12
-# Fixes needed for a fit.
-ENOUGH_FIXES = 12
 # Shortest block of time, s, and largest number of blocks, which are solved together.
 SHORTEST_BLOCK_S, MOST_BLOCKS = 10.0, 120
 # A fix is an outlier beyond this number of σ from the median of its neighbours to either side.
@@ -106,7 +104,7 @@ def _prior(errors: GaussianState, parameters: Parameters, span_s: float) -> Gaus
 
 def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> DisplacementFit | None:
     """Return the fit, or None for too few fixes; see `solve`."""
-    if len(legs.seconds) < ENOUGH_FIXES:
+    if len(legs.seconds) < FEWEST_VALUES:
         return None
     prior = _prior(errors, parameters, float(np.ptp(legs.seconds)))
     std = np.sqrt(np.diag(prior.p))
@@ -120,11 +118,11 @@ def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displa
         linear = linear_about(legs, state.x, parameters)
         left = linear.y - linear.columns @ state.x
         used = _no_outliers(left[:, :2], legs.stretch)
-        if used.sum() < ENOUGH_FIXES:
+        if used.sum() < FEWEST_VALUES:
             return None
         state, noise = _fitted(_means(linear, legs, used, (0, 1)), prior)
         has_height = used & np.isfinite(legs.variance[:, 2]) & (np.abs(legs.position[:, 2]) < FARTHEST_M)
-        if has_height.sum() >= ENOUGH_FIXES:
+        if has_height.sum() >= FEWEST_VALUES:
             state, _ = _fitted(_means(linear, legs, has_height, (2,)), state)
     # a heading drift with unknown zero makes yaw uncertain; an unknown pitch ε changes the scale by ε²/2
     span_s, (x, p) = float(np.ptp(legs.seconds)), state

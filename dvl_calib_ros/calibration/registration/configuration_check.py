@@ -15,6 +15,7 @@ import numpy as np
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import FLU, FRD, IMU_ENU, IMU_NED, Parameters, rpy_text
 from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation, turn_between
+from ..numerics.robust import FEWEST_OF_MOTION
 from ..numerics.samples import VelocityFrame
 from ..numerics.tests import Z_ONE_TEST, Z_REPEATED_TEST
 from ..streams.interpolation import attitude_at
@@ -26,8 +27,8 @@ from .registration import GAIN, INDEPENDENT_S, Registration
 # In its own axes a vehicle moves in much the same direction on every heading. DVL velocities that a driver rotated
 # into the earth frame agree with an earth-frame reference without residual, so only the heading reveals them.
 
-# Fewest samples, and lowest speed (m/s), that determine a direction.
-ENOUGH, SLOW = 60, 0.2
+# Lowest speed that determines a direction, m/s.
+SLOW = 0.2
 # Mean resultant lengths: above ONE directions agree; below SEVERAL headings differ (25° about their mean).
 ONE, SEVERAL = 0.9, 0.9
 # Largest ratio of the spread in the earth frame to the spread in the body frame for earth-frame velocities.
@@ -54,7 +55,7 @@ class Directions:
         self._heading += complex(ahead.sum())
 
     def _length(self, total: complex) -> float:
-        return abs(total) / self._n if self._n >= ENOUGH else math.nan
+        return abs(total) / self._n if self._n >= FEWEST_OF_MOTION else math.nan
 
     @property
     def turn_with_heading(self) -> bool:

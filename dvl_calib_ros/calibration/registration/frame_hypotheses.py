@@ -29,6 +29,7 @@ from ..numerics.frames import (
     squared,
     whole_degrees,
 )
+from ..numerics.robust import FEWEST_VALUES
 from ..numerics.samples import VelocityFrame
 from ..streams.imu_frame import enu_from, quaternion_product
 from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
@@ -37,8 +38,6 @@ from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_n
 from .motion_streams import GAP_S, Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at
 
-# Fewest samples of a comparison.
-ENOUGH_SAMPLES = 12
 # Weight of the prior rotation, as a share of the mean squared speed: it decides unobservable rotations (roll of a
 # vehicle that only moves ahead) and changes observable ones by less than 0.1 degrees.
 AS_IT_IS = 1e-3
@@ -189,7 +188,7 @@ class Readings:
 
         rotation_dvl_from_body: (3, 3) mounting, None if unknown.
         """
-        if len(self) < ENOUGH_SAMPLES:
+        if len(self) < FEWEST_VALUES:
             return []
         known = rotation_dvl_from_body
         likely = np.eye(3) if known is None else known
@@ -304,7 +303,7 @@ def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> b
     rates = angular_velocity_at(TurnRates.of(frame.read(imu)), times, GAP_S)
     use = np.isfinite(rates).all(axis=1) & np.isfinite(own).all(axis=1)
     rates, own = rates[use], own[use]
-    if len(own) < ENOUGH_SAMPLES or _rms(own) < TURNS or _rms(rates) < TURNS:
+    if len(own) < FEWEST_VALUES or _rms(own) < TURNS or _rms(rates) < TURNS:
         return None
     left, right = _rms(own - rates), _rms(own @ FLU_FROM_FRD - rates)
     return None if min(left, right) > CLEARLY * max(left, right) else right < left

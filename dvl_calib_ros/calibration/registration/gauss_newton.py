@@ -18,7 +18,7 @@ import numpy as np
 
 from ..numerics.block_covariance import TimeBlocks
 from ..numerics.frames import Array, cross, nearest_rotation, rotation_of, skew, squared, turn_between
-from ..numerics.robust import MEDIAN_SQUARE, median
+from ..numerics.robust import FEWEST_SAMPLES, MEDIAN_SQUARE, median
 from ..numerics.samples import Index, Mask
 from ..numerics.tests import chi2_isf
 from ..streams.interpolation import attitude_at
@@ -46,8 +46,8 @@ FARTHEST_S = 0.7
 ROUNDS_TO_FALL, HARDLY_LESS = 3, 0.9
 # Residual in σ at which a sample has half the weight.
 HALF_AT = 3.0
-# Lowest compared reference speed, m/s, and fewest rows of a fit.
-SLOW_MPS, ENOUGH = 0.1, 20
+# Lowest compared reference speed, m/s.
+SLOW_MPS = 0.1
 # Prior σ of an axis factor about 1, for factors that are not observable.
 WIDEST_FACTOR = 3.0
 # Largest share of the information on δ that is attributed to DVL noise.
@@ -292,7 +292,7 @@ class MotionFit:
             known = known & oriented
         if among is not None:
             known = known & self._shared(among, reference, apart)
-        if np.count_nonzero(known) < ENOUGH:
+        if np.count_nonzero(known) < FEWEST_SAMPLES:
             return None
         at = np.flatnonzero(known)
         seen, rotation = self._velocity[at], rotation[at]
