@@ -37,12 +37,10 @@ from .displacement_least_squares import (
     solve,
     white_noise,
 )
-from .estimator import NEVER, AtOnce, Estimator, EstimatorSetup
+from .estimator import NEVER, SOLVED_WITHIN_NS, AtOnce, Estimator, EstimatorSetup
 
 # Time of the first solution, s, and growth of the run between solutions.
 FIRST_LOOK_S, GROWN = 60.0, 1.2
-# From a solution's stamp until it takes effect, in stamps, ns.
-SOLVED_WITHIN_NS = 1_000_000_000
 # Velocities from positions are too noisy beyond NOISY_MPS. They do not exist for fixes further apart than this number
 # of windows (position_velocities.py).
 LONGEST_WINDOWS = 3.0

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..models.parameters import Parameters
+from ..numerics.block_covariance import BLOCK_S
 from ..numerics.error_model import correction_matrix
 from ..numerics.frames import Array, rotation_from_quaternion
 from ..numerics.kalman import GaussianState
@@ -23,8 +24,8 @@ from ..numerics.samples import Index, Mask, Stamps
 
 N_ERRORS, N_THETA = 4, 13
 SCALE, ARM, LATE, DEVIATION, DRIFT = 3, slice(4, 7), 7, slice(8, 13), 12
-# Shortest block of time, s, and largest number of blocks, which are solved together.
-SHORTEST_BLOCK_S, MOST_BLOCKS = 10.0, 120
+# Largest number of blocks of time, which are solved together.
+MOST_BLOCKS = 120
 # A fix is an outlier beyond this number of σ from the median of its neighbours to either side.
 OUTLYING, NEIGHBOURS = 4.5, 6
 # Limit for outliers that last for minutes, in σ from the median of a stretch; drift spreads evenly and stays below.
@@ -213,7 +214,7 @@ def _means(linear: _Linear, legs: Legs, use: Mask, axes: tuple[int, ...]) -> _Bl
     """Average the fixes in use over blocks of time."""
     at = np.flatnonzero(use)
     seconds = legs.seconds[at]
-    length = max(SHORTEST_BLOCK_S, float(seconds[-1] - seconds[0]) / MOST_BLOCKS)
+    length = max(BLOCK_S, float(seconds[-1] - seconds[0]) / MOST_BLOCKS)
     number = np.floor((seconds - seconds[0]) / length).astype(np.intp)
     key = np.stack([legs.stretch[at], number])
     first = np.flatnonzero(np.concatenate([[True], (np.diff(key, axis=1) != 0).any(axis=0)]))

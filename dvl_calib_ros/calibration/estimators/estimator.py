@@ -34,6 +34,9 @@ from ..results.thinned_recording import Terms, ThinnedRecording
 from ..streams.aligner import Aligner
 
 NEVER = 2**63 - 1  # number of a row that never comes
+# From the last data of a solution until it takes effect, in stamps, ns. A worker needs a hundredth of it; when a
+# recording is played fast, the node waits for the worker.
+SOLVED_WITHIN_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ..checks.beam_faults import N_EFFECTS, BeamFault, effect_velocities, most_s
 from ..filters.cross_validation import FOLDS, HeldOutError
 from ..models.own import DELAY, FULL, HEADING, LEVER_ARM, N_STATE, PHI, REFERENCE_DELAY, REFERENCE_ERROR, SCALE
 from ..models.parameters import Parameters
-from ..numerics.block_covariance import TimeBlocks
+from ..numerics.block_covariance import BLOCK_S, TimeBlocks
 from ..numerics.frames import Array, product
 from ..numerics.kalman import GaussianState, covariance_of
 from ..numerics.robust import MEDIAN_DISTANCE
@@ -28,7 +28,7 @@ from ..numerics.samples import Index
 from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
 from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
-from .section_rows import GATE, SECTION_S, SectionRows, effects_gram, masked_median, section_starts, usual_square
+from .section_rows import GATE, SectionRows, effects_gram, masked_median, section_starts, usual_square
 from .slow_errors import Chain, Eliminated, Priors, SlowErrors, gram_of, normal_points, scatter
 
 OF_DAY = FULL.of_day
@@ -409,7 +409,7 @@ class JointFit:
                 self._misfit += float(misfit[good].sum())
                 bins = part.bins(day.single)
                 gram, fold = gram_of(bins, day.white, x, part.slope_variance), int(bins.fold[len(bins.fold) // 2])
-            self._append(day, _Section(SECTION_S, gram, fold, None if gram is None else part.up(x)))
+            self._append(day, _Section(BLOCK_S, gram, fold, None if gram is None else part.up(x)))
 
     def _append(self, day: _Day, section: _Section) -> None:
         assert day.chain is not None
@@ -512,8 +512,8 @@ class JointFit:
             if len(rows) > 1:
                 at, up = self._of_day(number), np.array(rows)
                 velocity = up[:, :-1] @ self._x[at] + up[:, -1]
-                path = SECTION_S * np.cumsum(velocity - velocity.mean())
-                std = (LEVEL_M + float(np.ptp(path))) / (SECTION_S * len(up))
+                path = BLOCK_S * np.cumsum(velocity - velocity.mean())
+                std = (LEVEL_M + float(np.ptp(path))) / (BLOCK_S * len(up))
                 found.append(_Climb(at, up.mean(axis=0), min(std, CLIMB_MPS)))
         return found
 

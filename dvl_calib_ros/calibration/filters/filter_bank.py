@@ -18,7 +18,7 @@ from ..models import Model, Needs
 from ..models.base import Observations
 from ..models.parameters import Parameters
 from ..numerics import kalman
-from ..numerics.block_covariance import TimeBlocks
+from ..numerics.block_covariance import BLOCK_NS, TimeBlocks
 from ..numerics.frames import Array
 from ..numerics.kalman import GaussianState
 from ..numerics.samples import Index, Mask, Stamps
@@ -60,8 +60,6 @@ class RelativeHeight:
 
 
 Ends = Index
-# Time blocks for the scatter of σ, ns: as long as the correlation of vehicle motion.
-BLOCK_NS = 10_000_000_000
 
 # Number of samples from which the vectorised batch is faster than the recursion.
 BATCH_FROM = 24

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from .frames import Array
 from .tests import chi2_isf
 
+# Length of a block of time: motion and the errors of waves are correlated over less.
+BLOCK_S, BLOCK_NS = 10.0, 10_000_000_000
 # Most blocks. When full, neighbours are joined and the block length doubles: memory is bounded, and the scatter covers
 # effects of minutes.
 MOST = 64
