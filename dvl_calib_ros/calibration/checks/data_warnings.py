@@ -12,7 +12,7 @@ from ..models.parameters import Parameters
 from ..numerics.robust import FEWEST_SAMPLES
 from ..numerics.tests import Z_REPEATED_TEST
 from ..results.mounting_quantities import date
-from ..results.results import ARM, OFFSETS, Day, Estimate
+from ..results.results import ARM, OFFSETS, TAPE_STD_M, Day, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
@@ -22,11 +22,11 @@ SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
 OFTEN_OFF = 4.0
 # Constant reference error that is reported, m/s.
-OFFSET_REPORTED_FROM_MPS = 0.01
+OFFSET_TAPE_STD_MPS = 0.01
 # Share of the reference error that yaw absorbs, above which the two are not separable.
 NOT_SHOWN = 0.6
-# Uncertainty due to a clock offset that is reported: lever arm (m), delay (s), yaw (°).
-REPORTED_FROM_M, REPORTED_FROM_S, REPORTED_FROM_DEG = 0.05, 0.05, 0.1
+# Uncertainty due to a clock offset that is reported: delay (s), yaw (°); a lever arm from `TAPE_STD_M`.
+REPORTED_FROM_S, REPORTED_FROM_DEG = 0.05, 0.1
 # GNSS losses from which reception is unstable.
 FLAPPING = 3
 
@@ -136,7 +136,7 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
         metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
-        if metres >= REPORTED_FROM_M or seconds >= REPORTED_FROM_S:
+        if metres >= TAPE_STD_M or seconds >= REPORTED_FROM_S:
             reasons.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
         elif turn >= REPORTED_FROM_DEG:  # the lever arm is configured
             reasons.append(finding("CLOCK_ON_TURN", degrees=turn))
@@ -146,7 +146,7 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
     ] or [("", np.array([estimate.state_of(name) for name in OFFSETS]), std)]
     for where, offset, own_std in found:
         size = float(np.linalg.norm(offset))
-        if size < OFFSET_REPORTED_FROM_MPS or (np.abs(offset) < Z_REPEATED_TEST * own_std).all():
+        if size < OFFSET_TAPE_STD_MPS or (np.abs(offset) < Z_REPEATED_TEST * own_std).all():
             continue
         course = math.degrees(math.atan2(*offset)) % 360.0
         reasons.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
-from ..numerics.robust import FEWEST_VALUES, median, steps
+from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, median, steps
 
 # Blocks needed.
 ENOUGH = 6
@@ -22,8 +22,6 @@ FURTHER, FURTHER_MPS2, MOST = 6.0, 0.02**2, 0.6
 # Rounding step, as a share of the speed, that changes the mounting by half a degree. Share of repeated values that
 # shows it: noise does not average it out.
 ROUNDED_FROM, REPEATED_FROM = 0.03, 0.4
-# Noise (m/s) of another axis from which an axis of zeros is dead.
-NOISE_MPS = 1e-3
 _AXES = "xyz"
 
 
@@ -64,6 +62,6 @@ class DvlStream:
         if step > ROUNDED_FROM * math.sqrt(self._square / self._n):
             return finding("DVL_ROUNDED", step=step)
         dead = [axis for axis, is_dead in zip(_AXES, self._is_dead, strict=True) if is_dead]
-        if dead and len(dead) < 3 and self._noise > NOISE_MPS:
+        if dead and len(dead) < 3 and self._noise > QUIETEST_MPS:
             return finding("DVL_AXIS_DEAD", axes=" and ".join(dead))
         return None

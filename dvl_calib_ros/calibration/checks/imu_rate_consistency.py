@@ -27,9 +27,9 @@ SPAN_S, LONGEST_S = 0.5, 1.6
 FASTEST = 1.5
 # Turn rate (rms, rad/s) needed for the test.
 LEAST_TURNING = 0.005
-# Residual share of the squared turn rate: at most with another convention, at most relative to the given one, and at
-# least with the given one for a contradiction.
-LEFT_AT_MOST, BETTER_BY, WRONG_FROM = 0.25, 0.25, 0.02
+# Residual share of the squared turn rate: at most with another convention, also relative to the given one, and at least
+# with the given one for a contradiction.
+LEFT_AT_MOST, WRONG_FROM = 0.25, 0.02
 # Conventions within this factor of the best are reported too. Smallest rotation (°) and scale (log) that count as such.
 AS_GOOD, TURNED_FROM_DEG, SCALED_FROM = 1.2, 20.0, 0.2
 # A rotation with row elements this near 1 only exchanges axes, which is tested separately.
@@ -127,7 +127,7 @@ class AttitudeRates:
             return None
         explained = [(self._left(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
         best = min(left for left, _ in explained)
-        if best > min(LEFT_AT_MOST * total, BETTER_BY * given):
+        if best > LEFT_AT_MOST * min(total, given):
             return None
         found, *others = (fits for left, fits in explained if left <= AS_GOOD * best + 1e-3 * total)
         if others:

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
-from ..numerics.robust import FEWEST_VALUES, median
+from ..numerics.robust import FEWEST_VALUES, ROUNDING_MPS, median
 from ..numerics.samples import Mask
 from ..numerics.tests import Z_FIFTY_TESTS, Z_ONE_TEST, chance_of, chi2_isf
 
@@ -31,8 +31,6 @@ SHIFTS_S: Array = 0.1 * np.arange(-2, 11)
 Z_BEST_SHIFT = math.sqrt(chi2_isf(chance_of(Z_FIFTY_TESTS) / len(SHIFTS_S), 1.0))
 # Tolerances as shares of the interval: of the intervals in a difference, and of the time between the streams' samples.
 EVEN, NEAR = 0.25, 0.6
-# Noise below this, m/s, is rounding.
-LEAST_NOISE_MPS = 1e-4
 # Differences needed per stretch (three axes); of a slow reference, samples.
 FEWEST = 30
 # Share of the noise that is reported. A filter that smooths passes little noise on.
@@ -111,7 +109,7 @@ class SharedNoise:
         if steps < Z_ONE_TEST * float(std[best, 2]):
             steps = 0.0
         passed, own = c_4 - steps, v_4 - steps
-        if own < max(LEAST_SHARE * v_4, 70.0 * LEAST_NOISE_MPS**2):
+        if own < max(LEAST_SHARE * v_4, 70.0 * ROUNDING_MPS**2):
             return 0.0
         return passed / own if passed > max(SHARED_FROM * own, Z_BEST_SHIFT * float(std[best, 0])) else 0.0
 

@@ -25,7 +25,7 @@ from ..models import MODELS
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import effective_blocks, student_factor
 from ..numerics.frames import Array, cross, skew
-from ..numerics.robust import FEWEST_VALUES, median, robust_std
+from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, median, robust_std
 from ..numerics.samples import Index
 from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
 from ..results.results import ARM, OFFSETS, Estimate
@@ -66,14 +66,12 @@ WRONG_SIGN_TILT_SHARE = 1.6
 REPORTED_FROM_RAD = math.radians(0.2)
 # Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
 SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
-# Residual, relative to the median, beyond which it is an outlier; number of iterations.
+# Residual relative to the median, or innovation in σ, beyond which it is an outlier; number of iterations.
 OUTLYING, ROUNDS = 4.0, 3
-# Smallest noise of the residual, m/s.
-QUIETEST_MPS = 1e-3
 # Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion.
 FILTER_MEMORIES_S, LONGEST_INTERVAL_S = (0.5, 1.0, 3.0), 0.3
-# Samples to either side that predict one; innovations beyond OUTLYING_INNOVATION σ are outliers.
-NEIGHBOURS, OUTLYING_INNOVATION = 12, 4.0
+# Samples to either side that predict one.
+NEIGHBOURS = 12
 # σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
 OF_WAVES = 0.015
 # Delay of a reference that a filter explains: within this factor of the filter's time constant, and at least this, s.
@@ -410,7 +408,7 @@ def _noise_in_reference(time: Array, dvl: Array, error: Array, columns: Array, f
         shares = _innovation_filter(values)
         for filtered, each in ((innovation, values), (rest, error[:, axis])):
             filtered[NEIGHBOURS:-NEIGHBOURS, axis] = np.correlate(each, shares, "valid")
-    limit = OUTLYING_INNOVATION * robust_std(innovation)
+    limit = OUTLYING * robust_std(innovation)
     # gaps break the prediction
     is_gap = np.append(0.0, np.abs(np.diff(time) - step) > 0.5 * step)
     innovation[np.convolve(is_gap, np.ones(2 * NEIGHBOURS), "same") > 0.5] = 0.0

@@ -23,8 +23,9 @@ from ..models.parameters import Parameters
 from ..numerics.block_covariance import BLOCK_S, TimeBlocks
 from ..numerics.frames import Array, product
 from ..numerics.kalman import GaussianState, covariance_of
-from ..numerics.robust import MEDIAN_DISTANCE
+from ..numerics.robust import MEDIAN_DISTANCE, ROUNDING_MPS
 from ..numerics.samples import Index
+from ..results.results import TAPE_STD_M
 from .full_delay_search import better_delay
 from .full_forward_model import FitBlock, predicted, with_bias_in_mounting
 from .full_held_out import NOT_TAKEN_OFF, HeldOutSums
@@ -44,16 +45,16 @@ KEPT_BLOCKS = 240
 POINTS = 16
 # The points are re-centred when the data move them by OFF_CENTRE σ of the prior, at most RECENTRED times.
 OFF_CENTRE, RECENTRED = 0.7, 4
-# A configured lever arm is a tape measurement with this σ, m, and wrong with probability WRONG_TAPE.
-TAPE_STD_M, WRONG_TAPE = 0.05, 0.1
+# Prior probability of each exception: a wrong configured lever arm, a vehicle that sinks or rises by its trim, one that
+# dives, and a large vertical error of the reference.
+EXCEPTION = 0.1
 # A vehicle at the surface or at constant depth ends at the height at which it began, within LEVEL_M (tide, waves) and
-# its own excursions. With probability SLOWLY it sinks or rises by its trim (σ SLOW_MPS), and with probability CLIMBS it
-# dives (σ CLIMB_MPS). Vertical reference error: with probability OFFSET it has σ OFFSET_MPS (an antenna's model)
-# instead of `reference_offset_std`.
-LEVEL_M, SLOWLY, SLOW_MPS, CLIMBS, CLIMB_MPS = 1.0, 0.1, 0.02, 0.1, 0.3
-OFFSET, OFFSET_MPS = 0.1, 0.05
-# Smallest white noise of a velocity, m/s. Degrees of freedom needed to estimate the noise of bins.
-LEAST_NOISE_MPS, FEWEST = 1e-4, 6
+# its own excursions; else it sinks or rises by its trim (σ SLOW_MPS), or dives (σ CLIMB_MPS).
+LEVEL_M, SLOW_MPS, CLIMB_MPS = 1.0, 0.02, 0.3
+# σ of a large vertical reference error (an antenna's model), m/s, instead of `reference_offset_std`.
+OFFSET_MPS = 0.05
+# Degrees of freedom needed to estimate the noise of bins.
+FEWEST = 6
 # Squared residual of three axes, in variances, beyond which a row is an outlier.
 GATED = 4.0 * GATE
 # A sample of a slow DVL is rejected if the references near it then fit better: by LEAST_GAIN (chi-square), and to this
@@ -383,10 +384,10 @@ class JointFit:
         levels = np.array([part.level for part in parts if part.rows is not None])
         day.level = masked_median(levels)
         day.level_std = np.maximum(masked_median(np.abs(levels - day.level)) / MEDIAN_DISTANCE, GROSS_MPS / GROSS)
-        day.single = np.maximum(usual_square(np.concatenate(left)), LEAST_NOISE_MPS**2)
+        day.single = np.maximum(usual_square(np.concatenate(left)), ROUNDING_MPS**2)
         each = [scatter(part.bins(day.single)) for part in parts if part.rows is not None]
         total, freedom = (np.sum(sums, axis=0) for sums in zip(*each, strict=True))
-        white = np.maximum(total / np.maximum(freedom, 1.0), LEAST_NOISE_MPS**2)
+        white = np.maximum(total / np.maximum(freedom, 1.0), ROUNDING_MPS**2)
         day.white = np.where(freedom < FEWEST, day.single, white)
 
     def _add_parts(self, day: _Day, parts: Sequence[SectionRows], x: Array) -> None:
@@ -561,9 +562,10 @@ class JointFit:
         """
         key = points.start, points.stop, seen_climbing, len(self._days)
         if key not in self._known:
-            arms = {TAPE_STD_M: 1.0 - WRONG_TAPE, math.inf: WRONG_TAPE} if self._arm_is_given else {math.inf: 1.0}
-            offsets = {0.0: 1.0 - OFFSET, OFFSET_MPS: OFFSET} if seen_climbing else {0.0: 1.0}
-            paths = {0.0: 1.0 - SLOWLY - CLIMBS, SLOW_MPS: SLOWLY, CLIMB_MPS: CLIMBS} if seen_climbing else {0.0: 1.0}
+            arms = {TAPE_STD_M: 1.0 - EXCEPTION, math.inf: EXCEPTION} if self._arm_is_given else {math.inf: 1.0}
+            offsets = {0.0: 1.0 - EXCEPTION, OFFSET_MPS: EXCEPTION} if seen_climbing else {0.0: 1.0}
+            climbs = {SLOW_MPS: EXCEPTION, CLIMB_MPS: EXCEPTION} if seen_climbing else {}
+            paths = {0.0: 1.0 - sum(climbs.values()), **climbs}
             cases = list(itertools.product(arms, offsets))
             priors = [self._by_prior(points, arm, offset) for arm, offset in cases]
             information, vector, log_det = (np.stack(each) for each in zip(*priors, strict=True))

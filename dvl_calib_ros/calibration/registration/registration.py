@@ -17,7 +17,7 @@ from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
 from ..numerics.frames import Array
 from ..numerics.tests import RULED_OUT, Z_FIFTY_TESTS
-from .clock_drift_and_jumps import MOST_STRETCHES, STRETCH_S, ClockChange, stamps, unsteady
+from .clock_drift_and_jumps import MOST_STRETCHES, REPORTED_FROM_S, STRETCH_S, ClockChange, stamps, unsteady
 from .delay_search import LONGEST_S, places
 from .gauss_newton import (  # fmt: skip
     ARM,
@@ -37,9 +37,6 @@ from .gauss_newton import (  # fmt: skip
 )
 from .motion_streams import Curves, MotionStreams
 
-# Smallest delay that is reported, s. It shifts a lever arm by a tenth of a second times the speed. Interpolated
-# attitudes and the filters of an INS have smaller delays (five real recordings: 0.03 to 0.07 s).
-REPORTED_FROM_S = 0.1
 # Chi-square that each additional delayed clock must gain.
 ONE_MORE = 12.0
 # Chi-square by which the next explanation must be worse for a refusal, if the σ of the calibration cover the delay. The

@@ -15,19 +15,19 @@ from ...verdict.reasons import Reason, finding
 from ..numerics.frames import Array
 from ..numerics.robust import median
 from ..streams.interpolation import attitude_at, shortened
-from .delay_search import HOLE_S, LONGEST_S
+from .delay_search import HOLE_S, LONGEST_S, OVERLAP, STEP_S
 from .motion_streams import MotionStreams
 
 # Largest share of the squared residual at the best near delay that a far delay may leave. Repeated legs agree to a
 # half.
 BELIEVED = 0.25
-# Time step of the series, s; smallest overlap as a share of the shorter series, and in seconds.
-STEP_S, OVERLAP, FEWEST_S = 0.5, 0.4, 60.0
+# Smallest overlap, s.
+FEWEST_S = 60.0
 # Longest series, s, or steps per sample: memory must not grow with pauses.
 LONGEST_PAUSES_S, STEPS_OF_A_SAMPLE = 86_400.0, 16
 # Width of the running median that removes spikes of the speed, steps.
 SPIKE_STEPS = 9
-# Lowest speed whose course is compared with the heading.
+# Lowest speed that determines a direction.
 MOVING_MPS = 0.2
 Series = NDArray[Any]  # complex
 
