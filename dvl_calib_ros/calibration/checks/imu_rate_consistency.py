@@ -23,8 +23,6 @@ from ..streams.imu_frame import quaternion_product
 
 # Interval of differentiation, s: 0.05° of attitude noise become 0.1 °/s. Longer gaps are skipped.
 SPAN_S, LONGEST_S = 0.5, 1.6
-# Largest turn rate of a vehicle with a DVL, rad/s; larger differences are outliers of the attitude.
-FASTEST = 1.5
 # Turn rate (rms, rad/s) needed for the test.
 LEAST_TURNING = 0.005
 # Residual share of the squared turn rate: at most with another convention, also relative to the given one, and at least
@@ -97,7 +95,7 @@ class AttitudeRates:
         steps = 0.5 * (angular_velocity[1:] + angular_velocity[:-1]) * np.diff(times)[:, None]
         sums = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
         w = (sums[last] - sums[first]) / seconds[:, None]
-        good = (seconds <= LONGEST_S) & ((a**2).sum(axis=1) < FASTEST**2)
+        good = seconds <= LONGEST_S
         a, w, before, after = a[good], w[good], before[good], after[good]
         middle = before + np.copysign(1.0, (before * after).sum(axis=1))[:, None] * after
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
