@@ -18,7 +18,7 @@ from ...verdict.kinds import Severity
 from ...verdict.reasons import Reason, finding
 from ..checks.beam_faults import BeamFault
 from ..checks.data_warnings import one_heading_warnings
-from ..checks.heading_deviation import HeadingDeviation, heading_deviation, heading_warnings, severity_of
+from ..checks.heading_deviation import HeadingDeviation, heading_deviation, heading_warning
 from ..checks.lever_arm_check import lever_arm_warnings
 from ..checks.residual_tests import (
     ResidualTrend,
@@ -388,7 +388,7 @@ def doubts(
     if bed is not None:  # a moving bed looks like a heading error, and like a reference error
         found.append(bed)
     elif navigation.deviation is not None:
-        found.append(heading_warnings(navigation.deviation).weighed(severity_of(navigation.deviation, estimate)))
+        found.append(heading_warning(navigation.deviation))
     if in_earth and bed is None:
         found += one_heading_warnings(estimate, parameters, navigation.speed)
     # the first-order model of a misalignment makes a velocity longer, which looks like one beam
