@@ -366,12 +366,6 @@ FINDINGS = (
         remedy="use the velocity or positions of GNSS alone",
     ),
     warning(
-        "FILTER_FINDS_NOTHING",
-        "the reference lags by {late:.1f} s, is smoothed over as long, and shows no error of the DVL: a filter may "
-        "have made it from this DVL",
-        remedy="use the velocity or positions of GNSS alone",
-    ),
-    warning(
         "LEVER_ARM_CONTRADICTED",
         "the lever arm in the data differs from the configured one: {axes}",
         means="Wrong position, or an IMU heading, turn rate or clock that looks like one. The configured arm is kept.",

@@ -23,9 +23,7 @@ from ..checks.lever_arm_check import lever_arm_warnings
 from ..checks.residual_tests import (
     ResidualTrend,
     confused_with_bias_std,
-    is_insignificant,
     moving_bed,
-    reference_lag_s,
     residual_trend,
     residual_warnings,
 )
@@ -396,8 +394,6 @@ def doubts(
     return found + residual_warnings(
         navigation.followed,
         are_positions(parameters),
-        reference_lag_s(estimate, parameters),
-        is_insignificant(estimate),
         confused_with_bias_std(estimate, parameters),
         None if is_large else navigation.beam,
         ACCEPTED_DRIFT * parameters.target_drift / KM,

@@ -28,7 +28,7 @@ from ..numerics.frames import Array, cross, skew
 from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, median, robust_std
 from ..numerics.samples import Index
 from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
-from ..results.results import ARM, OFFSETS, Estimate
+from ..results.results import OFFSETS, Estimate
 from .beam_faults import BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
 
@@ -74,10 +74,6 @@ FILTER_MEMORIES_S, LONGEST_INTERVAL_S = (0.5, 1.0, 3.0), 0.3
 NEIGHBOURS = 12
 # σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
 OF_WAVES = 0.015
-# Delay of a reference that a filter explains: within this factor of the filter's time constant, and at least this, s.
-LAG_FACTOR, LEAST_LAG_S = 2.0, 0.2
-# Corrections (rad, scale, m) below these, or below `Z_ONE_TEST` σ, count as none.
-NO_ANGLE, NO_SCALE, NO_ARM_M = math.radians(0.35), 0.005, 0.2
 # Smallest share of DVL noise in a reference from positions: the motion on both sides in its window looks similar.
 POSITIONS_NOISE_SHARE = 0.1
 
@@ -236,27 +232,6 @@ def _neighbouring_means(time: Array, values: Array, starts: Index) -> Array:
     return np.repeat(means, np.diff(starts, append=len(time)), axis=0)
 
 
-def reference_lag_s(estimate: Estimate, parameters: Parameters) -> float:
-    """Return the estimated delay of the reference relative to the DVL, s."""
-    own = dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
-    return parameters.reference_time_offset - parameters.dvl_time_offset - own.get("time_offset", 0.0)
-
-
-def is_insignificant(estimate: Estimate) -> bool:
-    """Return whether a calibration finds nothing to correct except a delay.
-
-    False if fewer than two angles are known, because nothing was then tested. A filter of the DVL shows no lever arm of
-    its own.
-    """
-    terms = MODELS[estimate.model].error_terms_from_state
-    found = np.abs(terms @ estimate.state)
-    std = np.sqrt(np.diag(terms @ estimate.recording_covariance @ terms.T))
-    if (found > np.maximum([NO_ANGLE] * 3 + [NO_SCALE] * 3, Z_ONE_TEST * std)).any() or np.sort(std[:3])[1] > NO_ANGLE:
-        return False
-    arm, own = estimate.std_of(*ARM), dict(zip(estimate.state_names, estimate.state.tolist(), strict=True))
-    return arm is None or not (np.abs([own[name] for name in ARM]) > np.maximum(NO_ARM_M, Z_ONE_TEST * arm)).any()
-
-
 def confused_with_bias_std(estimate: Estimate, parameters: Parameters) -> Array:
     """Return σ (3,) of scale, yaw and pitch (rad), which a bias along body x, y and z resembles at constant speed."""
     terms, dvl_from_body = MODELS[estimate.model].error_terms_from_state, parameters.rotation_dvl_from_body
@@ -286,29 +261,24 @@ def moving_bed(found: ResidualTrend | None, estimate: Estimate) -> Reason | None
 def residual_warnings(
     found: ResidualTrend | None,
     of_positions: bool = False,
-    lag_s: float = 0.0,
-    finds_nothing: bool = False,
     mounting_std: Sequence[float] | Array = (0.0, 0.0, 0.0),
     beam: BeamFault | None = None,
     accepted: float = 0.01,
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
-    of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, finds_nothing,
-    mounting_std: see `reference_lag_s`, `is_insignificant`, `confused_with_bias_std`. accepted: error of the mounting
-    (rad, or share of the distance) that does not reject a calibration; nor does an error within its own 95 % interval.
+    of_positions: the reference's velocities are position differences, smoothed by their interval. mounting_std: see
+    `confused_with_bias_std`. accepted: error of the mounting (rad, or share of the distance) that does not reject a
+    calibration; nor does an error within its own 95 % interval.
     """
     if found is None:
         return []
     smallest_share = POSITIONS_NOISE_SHARE if of_positions else 0.0
     seconds = math.sqrt(2.0 * abs(found.smoothed))
-    lag_fits_filter = lag_s > max(LEAST_LAG_S, seconds / LAG_FACTOR) and lag_s < LAG_FACTOR * seconds
     # a filter smooths and passes noise on: with evidence for one, the other needs less
     is_filter = not of_positions and found.smoothed > Z_95_PERCENT * found.smoothed_std
     if found.circular > max((Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * found.circular_std, smallest_share):
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
-    if is_filter and lag_fits_filter and finds_nothing:
-        return [finding("FILTER_FINDS_NOTHING", late=lag_s).weighed(Severity.REJECT)]
     by_position_window = of_positions and found.smoothed > 0.0
     is_smoothed = abs(found.smoothed) > Z_REPEATED_TEST * found.smoothed_std
     if is_smoothed and seconds > (TOO_SMOOTH_S if by_position_window else SMOOTHED_FROM_S):
