@@ -47,8 +47,8 @@ NUISANCE_STD: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2 + [0.1])
 # Prior σ of the tested signals: shares of tilt, second derivative (s²); DVL bias (m/s), tested on means over MEAN_S.
 SIGNAL_STD, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
-# Smallest tilt (rad, rms) and second derivative (m/s²) for a test, and share of tilt that the residual must follow.
-LEAST_TILT, MISSING_TILT_SHARE, LEAST_BEND = math.radians(0.08), 0.6, 0.006
+# Smallest tilt (rad, rms) for a test, and share of tilt that the residual must follow.
+LEAST_TILT, MISSING_TILT_SHARE = math.radians(0.08), 0.6
 # Prior σ of the bed's velocity, m/s: sediment in a flood, or a water layer. Below MOVES_FROM_MPS the reference may be
 # the cause: an inertial navigation at sea (recording T09) had an error of 0.054.
 BED_STD_MPS, MOVES_FROM_MPS = 1.0, 0.08
@@ -64,8 +64,8 @@ TYPICAL_BIAS_MPS, BIAS_UNOBSERVABLE_STD_MPS = 0.02, 0.008
 WRONG_SIGN_TILT_SHARE = 1.6
 # Mounting error (rad) from which it is reported.
 REPORTED_FROM_RAD = math.radians(0.2)
-# Time constant of smoothing (s) from which it is reported, and from which the calibration is rejected.
-SMOOTHED_FROM_S, TOO_SMOOTH_S = 0.45, 0.6
+# Time constant of smoothing (s) from which the calibration is rejected.
+TOO_SMOOTH_S = 0.6
 # Residual relative to the median, or innovation in σ, beyond which it is an outlier; number of iterations.
 OUTLYING, ROUNDS = 4.0, 3
 # Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion.
@@ -168,7 +168,6 @@ def residual_trend(
         (_at(time, each, BEND_S) - 2.0 * each + _at(time, each, -BEND_S)) / BEND_S**2 for each in (turning, earth)
     )
     quick[:, :, 2] = _turned(body_from_enu, bend)
-    bends = math.sqrt(float((bend**2).sum(axis=1).mean()))
     # linear interpolation loses this part of the second derivative on average
     bent = error - interval_s**2 / 12.0 * _turned(body_from_enu, whole_bend)
     both = np.concatenate([_nuisance_columns(moving, rates, slope, body_from_enu), quick], axis=2)
@@ -197,7 +196,7 @@ def residual_trend(
     lean = np.array([roll.mean(), pitch.mean()])
     speed = math.sqrt(float((velocity**2).sum(axis=1).mean()))
     # without tilt data, wave motion looks like turning
-    shows = bends > LEAST_BEND and max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
+    shows = max(float(np.abs(each).max()) for each in changing) > LEVEL_BELOW
     # scaled to the whole second derivative, which a smoothed reference lacks, as means keep little of waves
     bends_by = fast.seen_of(both, _turned(body_from_enu, whole_bend))
     shows = shows and bends_by > LEAST_OF_BEND
@@ -281,8 +280,8 @@ def residual_warnings(
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
     by_position_window = of_positions and found.smoothed > 0.0
     is_smoothed = abs(found.smoothed) > Z_REPEATED_TEST * found.smoothed_std
-    if is_smoothed and seconds > (TOO_SMOOTH_S if by_position_window else SMOOTHED_FROM_S):
-        severity = Severity.REJECT if seconds > TOO_SMOOTH_S and not by_position_window else Severity.MARGINAL
+    if is_smoothed and seconds > TOO_SMOOTH_S:
+        severity = Severity.MARGINAL if by_position_window else Severity.REJECT
         # smoothing causes any other signal
         return [finding("VELOCITY_SMOOTHED", name=_smoothed_one(found), seconds=seconds).weighed(severity)]
     reasons = []
