@@ -47,8 +47,6 @@ SHORTEST_M = 20.0
 GAP_INTERVALS, GAP_S = 5.0, 2.0
 # Ratio of drift with and without calibration that few stretches rarely exceed by noise.
 WORSE = 1.5
-# Ratio of median squared velocity errors below which velocities fit significantly better.
-FITS_BETTER = 0.5
 # Samples compared together, which limits memory.
 COMPARED_AT_ONCE = 2048
 # Points of a track that are kept for a map.
@@ -141,14 +139,6 @@ class Navigation:
     def speed(self) -> float:
         """Mean speed, m/s."""
         return self.distance_m / max(self.seconds, 1e-9)
-
-    @property
-    def fits_better(self) -> bool:
-        """Return whether median velocity errors are significantly smaller; on a returning track their drift cancels."""
-        if not len(self.error_before):
-            return False
-        before, after = (median((each**2).sum(axis=1)) for each in (self.error_before, self.error_after))
-        return bool(after < FITS_BETTER * before)
 
 
 def dead_reckoned(
@@ -331,7 +321,7 @@ def objections(navigation: Navigation | None, known_to: float = 0.0) -> list[Rea
         return [finding("DRIFT_NO_BETTER", after=after, before=before)]
     worse = finding("DRIFT_WORSE", after=after, before=before)
     is_open = after**2 - before**2 < (2.0 * known_to) ** 2
-    return [worse.weighed(Severity.MARGINAL) if navigation.fits_better or is_open else worse]
+    return [worse.weighed(Severity.MARGINAL) if is_open else worse]
 
 
 def in_words(navigation: Navigation) -> list[str]:
