@@ -1,7 +1,7 @@
 """Time blocks of all streams prepared for the fit: copied, thinned, in seconds, without outliers.
 
-In a fast stream, neighbours identify an outlier (outliers.py). Between samples of a slow stream a vehicle may turn, so
-there `full` tests suspicious samples by the references near them (`JointFit`).
+Neighbours identify an outlier (outliers.py). Between samples of a slow stream a vehicle may turn, so a larger scatter
+is assumed there.
 """
 
 from __future__ import annotations

@@ -57,9 +57,6 @@ OFFSET_MPS = 0.05
 FEWEST = 6
 # Squared residual of three axes, in variances, beyond which a row is an outlier.
 GATED = 4.0 * GATE
-# A sample of a slow DVL is rejected if the references near it then fit better: by LEAST_GAIN (chi-square), and to this
-# share.
-LEAST_GAIN, SHARE_LEFT = 50.0, 0.5
 # A section is rejected if its median differs from the others' by GROSS of their σ and by GROSS_MPS (m/s): no slow error
 # is so large.
 GROSS, GROSS_MPS = 10.0, 0.5
@@ -154,7 +151,7 @@ class JointFit:
         self._centre: Array = np.zeros(_UNIT_POINTS.shape[1])
         self._slow, self._deviation, self._log_prior = self._points()
         self._known: dict[tuple[int | None, int | None, bool, int], _Hypotheses] = {}
-        self.used = self._gated = self._left_out = 0
+        self.used = self._gated = 0
         self._misfit = 0.0
         self._fitted: JointEstimate | None = None
         self._without: tuple[JointEstimate | None, list[list[GaussianState]]] | None = None
@@ -216,7 +213,6 @@ class JointFit:
             self._renew()
             return
         x = self._linear[self._of_day(len(self._days) - 1)]
-        day.blocks[-1] = block = self._without_contradicted(day, block, x)
         self._add_parts(day, self._parts([block], x), x)
         self._solve()
         if self._is_far():
@@ -236,8 +232,8 @@ class JointFit:
 
     @property
     def gated(self) -> int:
-        """Number of rejected references and slow DVL samples."""
-        return self._gated + self._left_out
+        """Number of rejected references."""
+        return self._gated
 
     @property
     def mean_misfit(self) -> float:
@@ -294,7 +290,7 @@ class JointFit:
             assert self._fitted is not None
             state = self._fitted.state
             step = (self._x - before) / np.sqrt(np.diag(state.p))
-            if not self._are_contradicted() and np.abs(step).max() < LAST_STEP:
+            if np.abs(step).max() < LAST_STEP:
                 break
             # acceleration columns reduced for noise make steps too long: halve a step that turns back
             self._x, last = 0.5 * (before + self._x) if step @ last < 0.0 else self._x, step
@@ -329,41 +325,6 @@ class JointFit:
             day.end_s = day.begin_s
             self._measure_noise(day, parts)
             self._add_parts(day, parts, x)
-
-    def _are_contradicted(self) -> bool:
-        """Apply `_without_contradicted` to all blocks. Return whether any sample was rejected."""
-        found = False
-        for number, day in enumerate(self._days):
-            x = self._x[self._of_day(number)]
-            for place, block in enumerate(day.blocks):
-                day.blocks[place] = self._without_contradicted(day, block, x)
-                found = found or day.blocks[place] is not block
-        return found
-
-    def _without_contradicted(self, day: _Day, block: FitBlock, x: Array) -> FitBlock:
-        """Reject suspicious samples of a slow DVL without which the references near them fit much better.
-
-        Neighbours alone do not prove an outlier, because the vehicle may turn between samples. x: (20,).
-        """
-        suspicious = block.suspicious.tolist() if np.isfinite(day.single).all() else []
-        for at in reversed(suspicious):
-            fewer = block.without(np.array([at]))
-            (times, before), (also, after) = (self._misfits(day, each, x) for each in (block, fewer))
-            near = np.abs(times - x[REFERENCE_DELAY] + x[DELAY] - block.dvl.times[at]) < block.interval_s
-            both = near & np.isin(times, also, assume_unique=True)
-            left = after[np.searchsorted(also, times[both])].sum()
-            if before[both].sum() - left > LEAST_GAIN and left < SHARE_LEFT * before[both].sum():
-                self._left_out += int(block.from_s <= block.dvl.times[at] < block.end_s)
-                block = fewer
-        return block
-
-    def _misfits(self, day: _Day, block: FitBlock, x: Array) -> tuple[Array, Array]:
-        """Return times (J,) s and squared residuals (J,) of a block's references about a state (20,)."""
-        parts = [part for part in self._parts([block], x) if part.rows is not None]
-        if not parts:
-            return np.zeros(0), np.zeros(0)
-        times = np.concatenate([part.rows.times for part in parts if part.rows is not None])
-        return times, np.concatenate([part.misfit(day.single) for part in parts])
 
     def _parts(self, blocks: Sequence[FitBlock], x: Array) -> list[SectionRows]:
         """Return the sections of blocks about a state (20,) of their day."""
