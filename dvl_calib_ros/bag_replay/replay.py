@@ -464,7 +464,7 @@ def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[R
         found.append(finding("STAMPS_MISSING_IN_BAG", count=decoder.zero_stamps))
     for estimate in result.estimates.values():
         found += gate_warnings(estimate)
-    return found + reference_warnings(result.estimate, result.own_days)
+    return found + reference_warnings(result.estimate)
 
 
 def _refusal_advice(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:

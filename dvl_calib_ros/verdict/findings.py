@@ -387,12 +387,6 @@ FINDINGS = (
         remedy="drive turns to both sides, or a straight leg",
     ),
     warning(
-        "REFERENCE_OFFSET",
-        "the reference has a constant error of {millimetres:.0f} mm/s towards {course:.0f}°{where}",
-        means="A constant error of an inertial navigation, or a current in water track. `full` estimates it.",
-        remedy="judge the drift by another reference",
-    ),
-    warning(
         "ONE_HEADING",
         "on one heading a constant error of reference or DVL looks like yaw, pitch or scale: {off:g} m/s would be "
         "{degrees:.1f}° or {percent:.1f} %; σ includes the reference's constant error",

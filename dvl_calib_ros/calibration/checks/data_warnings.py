@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from ...verdict.reasons import Reason, finding
 from ..models.parameters import Parameters
 from ..numerics.robust import FEWEST_SAMPLES
-from ..numerics.tests import Z_REPEATED_TEST
-from ..results.mounting_quantities import date
-from ..results.results import ARM, OFFSETS, TAPE_STD_M, Day, Estimate
+from ..results.results import ARM, OFFSETS, TAPE_STD_M, Estimate
 
 # Share of gated samples above which the configuration is more likely wrong than the data.
 SUSPICIOUS_GATED = 0.2
@@ -21,12 +19,10 @@ SUSPICIOUS_GATED = 0.2
 SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
 # Largest error of an intact reference, in `reference_offset_std`.
 OFTEN_OFF = 4.0
-# Constant reference error that is reported, m/s.
-OFFSET_TAPE_STD_MPS = 0.01
 # Share of the reference error that yaw absorbs, above which the two are not separable.
 NOT_SHOWN = 0.6
-# Uncertainty due to a clock offset that is reported: delay (s), yaw (°); a lever arm from `TAPE_STD_M`.
-REPORTED_FROM_S, REPORTED_FROM_DEG = 0.05, 0.1
+# Uncertainty of yaw (°) due to a clock offset that is reported; that of a lever arm is from `TAPE_STD_M`.
+REPORTED_FROM_DEG = 0.1
 # GNSS losses from which reception is unstable.
 FLAPPING = 3
 
@@ -121,13 +117,9 @@ def one_heading_warnings(estimate: Estimate, parameters: Parameters, speed: floa
     return [finding("ONE_HEADING", off=off, degrees=math.degrees(share), percent=100.0 * share)]
 
 
-def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Reason]:
-    """Return warnings on a clock offset that leaves lever arm or yaw uncertain, and on constant reference errors.
-
-    days: per-day values of the model, if there are several days.
-    """
-    std = estimate.std_of(*OFFSETS)
-    if std is None:
+def reference_warnings(estimate: Estimate) -> list[Reason]:
+    """Return warnings on a clock offset that leaves lever arm or yaw uncertain."""
+    if estimate.std_of(*OFFSETS) is None:
         return []
     reasons = []
     open_std = np.sqrt(np.diag(estimate.left_open))
@@ -136,18 +128,8 @@ def reference_warnings(estimate: Estimate, days: Sequence[Day] = ()) -> list[Rea
         metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
-        if metres >= TAPE_STD_M or seconds >= REPORTED_FROM_S:
+        if metres >= TAPE_STD_M:
             reasons.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
         elif turn >= REPORTED_FROM_DEG:  # the lever arm is configured
             reasons.append(finding("CLOCK_ON_TURN", degrees=turn))
-    found = [
-        (f" on {day.name or date(day.first_ns)}", np.array(day.reference_offset), np.array(day.reference_offset_std))
-        for day in days
-    ] or [("", np.array([estimate.state_of(name) for name in OFFSETS]), std)]
-    for where, offset, own_std in found:
-        size = float(np.linalg.norm(offset))
-        if size < OFFSET_TAPE_STD_MPS or (np.abs(offset) < Z_REPEATED_TEST * own_std).all():
-            continue
-        course = math.degrees(math.atan2(*offset)) % 360.0
-        reasons.append(finding("REFERENCE_OFFSET", millimetres=1000.0 * size, course=course, where=where))
     return reasons
