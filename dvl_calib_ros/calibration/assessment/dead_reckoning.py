@@ -36,6 +36,7 @@ from ..numerics.samples import Index
 from ..results.held_out_verification import ACCEPTED_DRIFT
 from ..results.results import Estimate
 from ..results.thinned_recording import NO_TERMS, Terms, ThinnedRecording
+from ..streams.interpolation import GAP_S
 from ..streams.position_velocities import are_positions
 
 # Stretch lengths for the drift, m: the longest with ENOUGH stretches, else the whole track.
@@ -43,8 +44,8 @@ STRETCHES_M = (1000.0, 500.0, 200.0, 100.0)
 ENOUGH = 3
 # Shortest track, m.
 SHORTEST_M = 20.0
-# Longest interval that is integrated: the larger of this multiple of the usual interval and this time, s.
-GAP_INTERVALS, GAP_S = 5.0, 2.0
+# Longest interval that is integrated, in usual ones; at least `GAP_S`.
+GAP_INTERVALS = 5.0
 # Ratio of drift with and without calibration that few stretches rarely exceed by noise.
 WORSE = 1.5
 # Samples compared together, which limits memory.

@@ -31,6 +31,7 @@ from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED
 from ..results.results import OFFSETS, Estimate
 from .beam_faults import BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
+from .reference_independence import SLOWEST_S
 
 # Time constants, s, between which a change of tilt is the vehicle's; slower ones may be the IMU's error.
 TILT_S = 1.0, 15.0
@@ -68,8 +69,8 @@ REPORTED_FROM_RAD = math.radians(0.2)
 TOO_SMOOTH_S = 0.6
 # Residual relative to the median, or innovation in σ, beyond which it is an outlier; number of iterations.
 OUTLYING, ROUNDS = 4.0, 3
-# Memories of a filter that are tested, s. Longest sample interval, s: in slower streams the innovation is motion.
-FILTER_MEMORIES_S, LONGEST_INTERVAL_S = (0.5, 1.0, 3.0), 0.3
+# Memories of a filter that are tested, s.
+FILTER_MEMORIES_S = 0.5, 1.0, 3.0
 # Samples to either side that predict one.
 NEIGHBOURS = 12
 # σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
@@ -370,7 +371,7 @@ def _noise_in_reference(time: Array, dvl: Array, error: Array, columns: Array, f
     both hold the same noise. Nuisance columns hold DVL noise themselves, so the residual is not corrected by them.
     """
     step = float(median(np.diff(time)))
-    if step > LONGEST_INTERVAL_S or len(time) < 4 * NEIGHBOURS:
+    if step > SLOWEST_S or len(time) < 4 * NEIGHBOURS:
         return 0.0, math.inf, 0.0
     innovation, rest = (np.zeros_like(dvl) for _ in range(2))
     for axis, values in enumerate((dvl - dvl.mean(axis=0)).T):

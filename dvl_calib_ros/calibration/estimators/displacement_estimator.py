@@ -256,8 +256,9 @@ def _noise_of_velocities(legs: Legs, parameters: Parameters) -> float:
     return math.sqrt(2.0) * white_noise(legs, np.array(parameters.lever_arm)) / max(window_s, interval)
 
 
-# Time before a fix over which a velocity error is averaged, s; over less, position noise dominates.
-OVER_S = 60.0
+# Time before a fix over which a velocity error is averaged, and longest held-out leg, s: over less, position noise
+# dominates.
+LEG_S = 60.0
 
 
 def navigated(
@@ -324,8 +325,8 @@ def navigated(
 
 
 def _velocities(astray: Array, seconds: Array, rotation_enu_from_body: Array) -> Array:
-    """Return mean velocity errors (N, 3) m/s, body axes, over `OVER_S` before each fix, from track errors (N, 2) m."""
-    since = np.searchsorted(seconds, seconds - OVER_S)
+    """Return mean velocity errors (N, 3) m/s, body axes, over `LEG_S` before each fix, from track errors (N, 2) m."""
+    since = np.searchsorted(seconds, seconds - LEG_S)
     passed = np.maximum(seconds - seconds[since], 1.0)[:, None]
     enu = np.concatenate([(astray - astray[since]) / passed, np.zeros((len(seconds), 1))], axis=1)
     return np.asarray(np.einsum("nji,nj->ni", rotation_enu_from_body, enu))
@@ -333,7 +334,7 @@ def _velocities(astray: Array, seconds: Array, rotation_enu_from_body: Array) ->
 
 # Length of a held-out leg, s: at most LEG_S against position noise, and shorter to have LEGS of them; at least
 # SHORTEST_LEG_S, and no more than MOST_LEGS legs.
-LEG_S, SHORTEST_LEG_S, LEGS, MOST_LEGS = 60.0, 20.0, 30.0, 200.0
+SHORTEST_LEG_S, LEGS, MOST_LEGS = 20.0, 30.0, 200.0
 # Share of a leg at each end whose fixes are averaged.
 END_SHARE = 0.25
 

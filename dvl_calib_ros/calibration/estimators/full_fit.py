@@ -39,7 +39,8 @@ OF_VEHICLE = np.delete(np.arange(N_STATE), OF_DAY)
 FAR = 1.0
 # Gauss-Newton steps at a renewal: at most STEPS, or until a step is below LAST_STEP σ.
 STEPS, LAST_STEP = 8, 0.3
-# Blocks whose streams are kept (40 minutes); the contribution of older ones stays fixed.
+# Blocks whose streams are kept (40 minutes), because a node's memory must not grow. Older ones contribute a fixed sum,
+# and registration uses at most the rows of a third of them.
 KEPT_BLOCKS = 240
 # Points of the slow errors' prior for the numerical integration.
 POINTS = 16

@@ -41,8 +41,8 @@ SLOW = 6
 TURNING_S = 0.1
 # At sample intervals below this, s, slopes come from parabolas instead of a spline.
 DENSE_S = 0.15
-# Half-width of the difference for the DVL's acceleration: s, and intervals of the DVL.
-SLOPE_REACH_S, SLOPE_INTERVALS = 0.5, 2.0
+# Half-width of the difference for the DVL's acceleration, and bins of dense references: s, and intervals of the DVL.
+SPAN_S, SPAN_INTERVALS = 0.5, 2.0
 # Blocks that are predicted at once: more do not fit the processor's caches.
 AT_ONCE = 16
 # Longest gap of the DVL that is interpolated: the larger of this number of its usual intervals and this time, s.
@@ -80,7 +80,7 @@ class FitBlock:
     @cached_property
     def slope_reach_s(self) -> float:
         """Half-width (s) of the difference for the DVL's acceleration; over less, its noise dominates."""
-        return max(SLOPE_REACH_S, SLOPE_INTERVALS * self.interval_s)
+        return max(SPAN_S, SPAN_INTERVALS * self.interval_s)
 
     @cached_property
     def slope_variance(self) -> float:

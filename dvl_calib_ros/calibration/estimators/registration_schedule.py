@@ -31,14 +31,13 @@ from ..results.thinned_recording import (
 )
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
 from .estimator import Rest
-from .full_fit import JointFit
+from .full_fit import KEPT_BLOCKS, JointFit
 from .full_forward_model import deviation_of
 
 # Live, registration is repeated once the number of blocks has grown by this factor.
 AGAIN_FROM = 1.5
-# Blocks needed for a registration, blocks before the first live one (a minute), and blocks kept (40 minutes):
-# registration uses at most the rows of a third of them, and a node's memory must not grow.
-ENOUGH, FIRST_LOOK, MOST = 2, 6, 240
+# Blocks needed for a registration, and before the first live one (a minute).
+ENOUGH, FIRST_LOOK = 2, 6
 # Rows of each stream in a 10 s block.
 MOST_OF_A_BLOCK = int(10.0 / KEPT_EVERY_S) + 1
 
@@ -85,10 +84,10 @@ class _Registered:
     def take_room(self) -> None:
         """Reserve the final size now, so that memory does not grow for 40 minutes."""
         for stream in self._streams:
-            stream.reserve((MOST + 1) * MOST_OF_A_BLOCK)
+            stream.reserve((KEPT_BLOCKS + 1) * MOST_OF_A_BLOCK)
 
     def add(self, kept: ThinnedBlock) -> None:
-        """Add a block, and drop the oldest beyond `MOST`."""
+        """Add a block, and drop the oldest beyond `KEPT_BLOCKS`."""
         r = kept.reference
         variance = np.diagonal(r.noise, axis1=1, axis2=2)
         own_noise = np.full(len(kept.dvl.times), np.trace(kept.noise_dvl))
@@ -98,7 +97,7 @@ class _Registered:
             for name, values in zip(stream.LAYOUT, own, strict=True):
                 getattr(stream, name)[at] = values
         self._blocks.append(tuple(len(own[0]) for own in columns))
-        if len(self._blocks) > MOST:
+        if len(self._blocks) > KEPT_BLOCKS:
             for stream, n in zip(self._streams, self._blocks.popleft(), strict=True):
                 stream.forget_before(stream.begin + n)
 

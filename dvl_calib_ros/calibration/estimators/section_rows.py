@@ -12,11 +12,9 @@ from ..models.own import BIAS
 from ..numerics.block_covariance import BLOCK_S
 from ..numerics.frames import Array
 from ..numerics.robust import median
-from .full_forward_model import FitBlock, PredictedRows
+from .full_forward_model import SPAN_S, FitBlock, PredictedRows
 from .slow_errors import WIDTH, Bins, Chain, SlowErrors, binned_rows, gram_of
 
-# Length of bins of rows, s. A bin holds at least BIN_INTERVALS DVL intervals.
-BIN_S, BIN_INTERVALS = 0.5, 2.0
 DENSER = 0.7  # references are denser than the DVL below this ratio of intervals
 # Squared residual of three axes, in variances, that 1 % of good rows exceed. Beyond it a row has weight gate / misfit.
 GATE = 11.3
@@ -108,9 +106,9 @@ def _bin_length_s(block: FitBlock) -> float:
     """Return the bin length, s: longer where references are denser than DVL samples, because they then share these."""
     times = block.reference.times
     if len(times) < 2 or len(block.dvl.times) < 2:
-        return BIN_S
+        return SPAN_S
     apart = (times[-1] - times[0]) / (len(times) - 1)
-    return max(BIN_S, BIN_INTERVALS * block.interval_s) if apart < DENSER * block.interval_s else BIN_S
+    return block.slope_reach_s if apart < DENSER * block.interval_s else SPAN_S
 
 
 def section_starts(block: FitBlock) -> list[float]:

@@ -18,9 +18,9 @@ from ..numerics.frames import ENU_FROM_NED, FLU_FROM_FRD, Array, rotation_from_r
 from ..numerics.robust import FEWEST_OF_MOTION
 from ..numerics.samples import VelocityFrame
 from ..numerics.tests import Z_ONE_TEST, Z_REPEATED_TEST
-from ..streams.interpolation import attitude_at
+from ..streams.interpolation import GAP_S, attitude_at
 from .gauss_newton import ARM, FEW_ROWS, MOST_ROWS, REFERENCE, SCALE, TURN, Fitted, MotionFit, N
-from .motion_streams import GAP_S, Curves, MotionStreams
+from .motion_streams import Curves, MotionStreams
 from .registration import GAIN, INDEPENDENT_S, Registration
 from .unregistrable_clocks import MOVING_MPS
 

@@ -32,10 +32,10 @@ from ..numerics.frames import (
 from ..numerics.robust import FEWEST_VALUES
 from ..numerics.samples import VelocityFrame
 from ..streams.imu_frame import enu_from, quaternion_product
-from ..streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
+from ..streams.interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from .configuration_check import DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
 from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
-from .motion_streams import GAP_S, Curves, MotionStreams
+from .motion_streams import Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at
 
 # Weight of the prior rotation, as a share of the mean squared speed: it decides unobservable rotations (roll of a

@@ -21,8 +21,8 @@ from ..numerics.frames import Array, cross, nearest_rotation, rotation_of, skew,
 from ..numerics.robust import FEWEST_SAMPLES, MEDIAN_SQUARE, median
 from ..numerics.samples import Index, Mask
 from ..numerics.tests import chi2_isf
-from ..streams.interpolation import attitude_at
-from .motion_streams import GAP_S, Curves, MotionStreams
+from ..streams.interpolation import GAP_S, attitude_at
+from .motion_streams import Curves, MotionStreams
 
 # States: rotation (rad, body), scale, lever arm (m), delays δ and ρ (s).
 TURN, SCALE, ARM, DELTA, RHO = slice(0, 3), 3, slice(4, 7), 7, 8

@@ -14,6 +14,8 @@ from ..numerics.robust import median
 from ..numerics.samples import FRAME_CODES, Index, Mask, SampleBlock, Streams, VelocityFrame
 from ..streams.clock_correction import Clocks
 from ..streams.interpolation import (
+    BIN_S,
+    GAP_S,
     LEAST_SLOPE_REACH_S,
     MOST_REACH_S,
     REACH_INTERVALS,
@@ -144,12 +146,10 @@ def _valid(block: SampleBlock, parameters: Parameters) -> SampleBlock:
     return block.part((block.refused == 0) & (speed <= parameters.max_speed) & (speed > 0.0))
 
 
-# Grid step of smoothed curves (s), most grid points of a long recording, and points per pass.
-GRID_S, MOST_GRID, AT_ONCE = 0.1, 18_000, 1000
+# Most grid points of the smoothed curves of a long recording, and points per pass.
+MOST_GRID, AT_ONCE = 18_000, 1000
 # Turn rates farther from the DVL data are not used, s: larger than any searched delay.
 TURNS_BEYOND_S = 3600.0
-# Longest gap between attitudes or rates that is interpolated, s.
-GAP_S = 2.0
 
 
 class Curves:
@@ -159,7 +159,7 @@ class Curves:
         """Smooth the streams of a motion."""
         times = motion.dvl.times
         length = float(times[-1] - times[0])
-        self._step, self._start = max(GRID_S, length / MOST_GRID), float(times[0])
+        self._step, self._start = max(BIN_S, length / MOST_GRID), float(times[0])
         self._grid = self._start + self._step * np.arange(int(length / self._step) + 2)
         typical = float(median(np.diff(times)))
         reach = reach_at(spacing_at(times, self._grid), LEAST_SLOPE_REACH_S, MOST_REACH_S)

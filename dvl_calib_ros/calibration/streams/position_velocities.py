@@ -7,14 +7,12 @@ import numpy as np
 from ..models import POSITIONS
 from ..models.parameters import ParameterError, Parameters
 from ..numerics.frames import Array, cross
-from .interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
+from .interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at
 
 # Noise from which velocities derived from positions are useless, m/s.
 NOISY_MPS = 0.3
 # Factors of the second, fourth and sixth difference in the inverse of a mean (arcsine series).
 SERIES = -1.0 / 24.0, 3.0 / 640.0, -5.0 / 7168.0
-# Longest interpolated gap of an IMU, s.
-GAP_S = 1.0
 
 
 def are_positions(parameters: Parameters) -> bool:
