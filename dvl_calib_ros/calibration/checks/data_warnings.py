@@ -21,8 +21,8 @@ SUSPICIOUS_REPEATED, FEW = 0.05, 0.01
 OFTEN_OFF = 4.0
 # Share of the reference error that yaw absorbs, above which the two are not separable.
 NOT_SHOWN = 0.6
-# Uncertainty of yaw (°) due to a clock offset that is reported; that of a lever arm is from `TAPE_STD_M`.
-REPORTED_FROM_DEG = 0.1
+# Uncertainty due to a clock offset that is reported: delay (s), yaw (°); a lever arm from `TAPE_STD_M`.
+REPORTED_FROM_S, REPORTED_FROM_DEG = 0.05, 0.1
 # GNSS losses from which reception is unstable.
 FLAPPING = 3
 
@@ -128,7 +128,7 @@ def reference_warnings(estimate: Estimate) -> list[Reason]:
         metres = math.hypot(*(by_name.get(name, 0.0) for name in ARM))
         turn = math.degrees(float(np.linalg.norm(open_std[:3])))
         seconds = by_name.get("time_offset", 0.0)
-        if metres >= TAPE_STD_M:
+        if metres >= TAPE_STD_M or seconds >= REPORTED_FROM_S:
             reasons.append(finding("CLOCK_OR_ARM", metres=metres, degrees=turn, seconds=seconds))
         elif turn >= REPORTED_FROM_DEG:  # the lever arm is configured
             reasons.append(finding("CLOCK_ON_TURN", degrees=turn))
