@@ -17,8 +17,8 @@ from ..calibration.models.parameters import FLU, FRD, FROM_FRAME_ID, FROM_MESSAG
 from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.numerics.robust import median
 from ..calibration.numerics.samples import VelocityFrame
+from ..calibration.registration.configuration_check import BETTER_BY
 from ..calibration.registration.frame_hypotheses import (
-    CLEARLY,
     FITS,
     Agreement,
     ImuFrame,
@@ -422,7 +422,7 @@ class _Search:
         if known is None and chosen.angle > OTHER_MOUNTING and chosen.best_residual < FITS:
             residual = self._readings.registered(reading, np.eye(3)).residual
             turned_residual, rotation, *_ = self._readings.registered(reading, None)
-            if self._readings.without_noise(turned_residual) < CLEARLY * self._readings.without_noise(residual):
+            if self._readings.without_noise(turned_residual) < BETTER_BY * self._readings.without_noise(residual):
                 agree = "where DVL and reference agree best"
                 rotation = self._readings.without_roll(chosen, rotation)
                 rpy = nominal_rpy(rotation.T)

@@ -23,9 +23,8 @@ from ..calibration.numerics.frames import (
     rpy_from_rotation,
 )
 from ..calibration.numerics.samples import VelocityFrame
-from ..calibration.registration.configuration_check import DRAWN, angle_between
+from ..calibration.registration.configuration_check import BETTER_BY, DRAWN, angle_between
 from ..calibration.registration.frame_hypotheses import (
-    CLEARLY,
     FITS,
     MEANT_WITHIN,
     Agreement,
@@ -430,7 +429,7 @@ def twist_axes(look: Look) -> str | None:
     turned = {each: np.einsum("nij,nj->ni", rotation, velocity @ axes) for each, axes in _BODY_AXES.items()}
     tried = {name: residual(seen) for name, seen in {**turned, "enu": velocity, "ned": velocity @ ENU_FROM_NED}.items()}
     best, second = sorted(tried, key=tried.__getitem__)[:2]
-    if tried[best] > FITS * look.speed or tried[best] > CLEARLY * tried[second]:
+    if tried[best] > FITS * look.speed or tried[best] > BETTER_BY * tried[second]:
         return None
     world = frame_named(look.world, ())
     in_ned = world is not None and world.frame is VelocityFrame.NED

@@ -25,11 +25,11 @@ from ..models import MODELS
 from ..models.parameters import Parameters
 from ..numerics.block_covariance import effective_blocks, student_factor
 from ..numerics.frames import Array, cross, skew
-from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, median, robust_std
+from ..numerics.robust import FEWEST_VALUES, QUIETEST_MPS, ROBUST_PASSES, median, robust_std
 from ..numerics.samples import Index
 from ..numerics.tests import Z_95_PERCENT, Z_FIFTY_TESTS, Z_ONE_TEST, Z_REPEATED_TEST, Z_SLOW_ERRORS
 from ..results.results import OFFSETS, Estimate
-from .beam_faults import BeamFault, beam_warning
+from .beam_faults import BIAS_STD, BeamFault, beam_warning
 from .imu_rate_consistency import LEVEL_BELOW
 from .reference_independence import SLOWEST_S
 
@@ -46,8 +46,8 @@ QUICK_STRETCHES, LASTING = (1, 2, 4), (1, 2, 4, 8)
 # and two cycles of the heading, and with a drift over the recording (rad), similar to a bias but not to fast signals.
 NUISANCE_STD: Array = np.array([0.05] * 3 + [0.02] * 3 + [1.0] * 3 + [0.3] + [0.01, 0.01, 0.05] + [0.1])
 BY_HEADING: Array = np.array([0.05] * 2 + [0.02] * 2 + [0.1])
-# Prior σ of the tested signals: shares of tilt, second derivative (s²); DVL bias (m/s), tested on means over MEAN_S.
-SIGNAL_STD, CONSTANT, MEAN_S = np.array([10.0, 10.0, 10.0]), np.array([0.1] * 3), 5.0
+# Prior σ of the tested signals: shares of tilt, second derivative (s²). The DVL bias is tested on means over MEAN_S.
+SIGNAL_STD, MEAN_S = np.array([10.0, 10.0, 10.0]), 5.0
 # Smallest tilt (rad, rms) for a test, and share of tilt that the residual must follow.
 LEAST_TILT, MISSING_TILT_SHARE = math.radians(0.08), 0.6
 # Prior σ of the bed's velocity, m/s: sediment in a flood, or a water layer. Below MOVES_FROM_MPS the reference may be
@@ -67,8 +67,8 @@ WRONG_SIGN_TILT_SHARE = 1.6
 REPORTED_FROM_RAD = math.radians(0.2)
 # Time constant of smoothing (s) from which the calibration is rejected.
 TOO_SMOOTH_S = 0.6
-# Residual relative to the median, or innovation in σ, beyond which it is an outlier; number of iterations.
-OUTLYING, ROUNDS = 4.0, 3
+# Residual relative to the median, or innovation in σ, beyond which it is an outlier.
+OUTLYING = 4.0
 # Memories of a filter that are tested, s.
 FILTER_MEMORIES_S = 0.5, 1.0, 3.0
 # Samples to either side that predict one.
@@ -179,7 +179,7 @@ def residual_trend(
     known = _nuisance_columns(_neighbouring_means(time, moving, starts), rates, slope, body_from_enu)
     by_heading = known[:, :, -1, None] * around[:, None]
     columns = np.concatenate([_means(each, starts) for each in (known, by_heading, constant)], axis=2)
-    likely = np.concatenate([NUISANCE_STD, BY_HEADING, CONSTANT])
+    likely = np.concatenate([NUISANCE_STD, BY_HEADING, np.full(3, BIAS_STD)])
     means = _means(time, starts), columns, _means(error, starts)
     slow = _fitted(*means, likely, LASTING)
     likely[OVER_GROUND] = BED_STD_MPS
@@ -337,7 +337,7 @@ def _fitted(
         return None
     n = columns.shape[2]
     rest = error
-    for _ in range(ROUNDS):
+    for _ in range(ROBUST_PASSES):
         square = (rest**2).sum(axis=1)
         level = max(float(median(square)), QUIETEST_MPS**2)
         weight = 1.0 / np.maximum(square / (OUTLYING**2 * level), 1.0)

@@ -19,7 +19,7 @@ from ..numerics.block_covariance import BLOCK_S
 from ..numerics.error_model import correction_matrix
 from ..numerics.frames import Array, rotation_from_quaternion
 from ..numerics.kalman import GaussianState
-from ..numerics.robust import FEWEST_VALUES, median, robust_std
+from ..numerics.robust import FEWEST_VALUES, ROBUST_PASSES, median, robust_std
 from ..numerics.samples import Index, Mask, Stamps
 
 N_ERRORS, N_THETA = 4, 13
@@ -43,7 +43,6 @@ _DEVIATES_LOG: Array = -0.5 * (np.log(DEVIATES) / np.log(4.0)) ** 2
 _SHARE: Array = np.array([1.0, 1.0, 0.7, 0.7, 1.0])
 # Variance of a stretch's constant, relative to the largest other variance.
 ANYWHERE = 1e5
-ROUNDS = 3  # iterations of linearisation and outlier rejection
 # Smallest noise of a fix against dead reckoning, m: in turns a delayed fix is wrong by half the acceleration times
 # delay².
 FINEST_M = 0.3
@@ -110,12 +109,12 @@ def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displa
     prior = _prior(errors, parameters, float(np.ptp(legs.seconds)))
     std = np.sqrt(np.diag(prior.p))
     theta = prior.x
-    for _ in range(ROUNDS):
+    for _ in range(ROBUST_PASSES):
         theta = _first_fit(linear_about(legs, theta, parameters), legs, std)
     used = np.ones(len(legs.seconds), dtype=bool)
     state = GaussianState(theta, prior.p)
     noise = 0.0
-    for _ in range(ROUNDS):
+    for _ in range(ROBUST_PASSES):
         linear = linear_about(legs, state.x, parameters)
         left = linear.y - linear.columns @ state.x
         used = _no_outliers(left[:, :2], legs.stretch)

@@ -28,7 +28,6 @@ NOISE_TWICE = 2.0
 # Smallest share of signal in the acceleration column; with less it is not used. Gauss-Newton steps are too long by 1 /
 # √share.
 LEAST_SHARE = 0.4
-DEG = math.pi / 180.0
 
 
 class SlowErrors(NamedTuple):
@@ -64,8 +63,8 @@ class Priors:
 
     horizontal: LogNormal = field(default_factory=lambda: LogNormal(0.012, 1.7))
     vertical: LogNormal = field(default_factory=lambda: LogNormal(0.018, 1.7))
-    heading: LogNormal = field(default_factory=lambda: LogNormal(0.21 * DEG, 1.7))
-    tilt: float = 0.1 * DEG
+    heading: LogNormal = field(default_factory=lambda: LogNormal(math.radians(0.21), 1.7))
+    tilt: float = math.radians(0.1)
     memory: LogNormal = field(default_factory=lambda: LogNormal(55.0, 2.8))
     deviation: LogNormal = field(default_factory=lambda: LogNormal(0.3, 3.0))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..numerics.frames import Array
 from ..numerics.robust import median
-from ..streams.interpolation import attitude_at
+from ..streams.interpolation import REACH_INTERVALS, attitude_at
 from .motion_streams import MotionStreams
 
 # Largest searched delay, s.
@@ -22,8 +22,8 @@ LONGEST_S = 60.0
 # Grid steps of short and long recordings, s, most steps of a short one, and most grid points: memory and time are
 # bounded, and turns of a vehicle last longer than a step.
 STEP_S, LONG_STEP_S, MANY, MOST = 0.5, 1.0, 500, 7200
-# Gaps longer than both this multiple of the sample interval and this time (s) are not interpolated.
-HOLE_INTERVALS, HOLE_S = 2.6, 2.5
+# Gaps longer than both `REACH_INTERVALS` and this time (s) are not interpolated.
+HOLE_S = 2.5
 # Smallest overlap: share of the shorter stream, and seconds.
 OVERLAP, SHORTEST_S = 0.4, 20.0
 # Smallest distance of two minima, s.
@@ -141,7 +141,7 @@ def _on_grid(times: Array, values: Array, grid: Array, step: float) -> _Series:
     at = np.add.reduceat(times, starts) / count
     means = np.add.reduceat(values, starts, axis=0) / count[:, None]
     after = np.clip(np.searchsorted(at, grid), 1, max(len(at) - 1, 1))
-    hole = max(HOLE_S, HOLE_INTERVALS * float(median(np.diff(times)))) if len(times) > 1 else HOLE_S
+    hole = max(HOLE_S, REACH_INTERVALS * float(median(np.diff(times)))) if len(times) > 1 else HOLE_S
     if len(at) < 2:
         return _Series(np.zeros((len(grid), 3)), np.zeros(len(grid)), np.zeros(len(grid)))
     known = ((grid >= at[0]) & (grid <= at[-1]) & (at[after] - at[after - 1] <= hole)).astype(float)

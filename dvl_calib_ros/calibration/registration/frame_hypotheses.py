@@ -33,7 +33,7 @@ from ..numerics.robust import FEWEST_VALUES
 from ..numerics.samples import VelocityFrame
 from ..streams.imu_frame import enu_from, quaternion_product
 from ..streams.interpolation import GAP_S, ImuColumns, TurnRates, angular_velocity_at, attitude_at
-from .configuration_check import DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
+from .configuration_check import BETTER_BY, DRAWN, Directions, angle_between, misfit, nearest, wrong_axes
 from .gauss_newton import ARM, FEW_ROWS, REFERENCE, SLOW_MPS, MotionFit, white_noise
 from .motion_streams import Curves, MotionStreams
 from .unregistrable_clocks import covered, velocity_at
@@ -43,9 +43,8 @@ from .unregistrable_clocks import covered, velocity_at
 AS_IT_IS = 1e-3
 # Share of samples kept; the rest are outliers or lags in turns.
 KEPT_SHARE = 0.9
-# Largest residual ratio of another reading to the declared one for it to be preferred ...
-CLEARLY = 0.5
-# ... and largest residual of it, as a share of the speed (17 degrees of misalignment).
+# Largest residual of a reading that is preferred to the declared one, as a share of the speed (17 degrees of
+# misalignment); its largest ratio is `BETTER_BY`.
 FITS = 0.3
 # Largest residual ratio that justifies a rotation about the direction of travel.
 ROLLED = 0.8
@@ -244,7 +243,7 @@ class Readings:
         best = of(None)
         turned = of(best.rotation_dvl_from_body @ FLU_FROM_FRD)
         upright, other = sorted((best, turned), key=lambda each: -float(each.rotation_dvl_from_body[2, 2]))
-        return other if other.residual < CLEARLY * upright.residual else upright
+        return other if other.residual < BETTER_BY * upright.residual else upright
 
     def are_axes_mirrored(self, reading: Reading, found: Array, rotation_dvl_from_body: Array) -> bool:
         """Return whether mirrored axes of the DVL with a mounting (3, 3) fit better than the rotation found (3, 3)."""
@@ -306,7 +305,7 @@ def turns_right(times: Array, own: Array, imu: ImuColumns, frame: ImuFrame) -> b
     if len(own) < FEWEST_VALUES or _rms(own) < TURNS or _rms(rates) < TURNS:
         return None
     left, right = _rms(own - rates), _rms(own @ FLU_FROM_FRD - rates)
-    return None if min(left, right) > CLEARLY * max(left, right) else right < left
+    return None if min(left, right) > BETTER_BY * max(left, right) else right < left
 
 
 def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ..numerics.frames import Array
-from ..numerics.robust import median, robust_std
+from ..numerics.robust import FEWEST_VALUES, median, robust_std
 from ..numerics.samples import Mask
 
 # Deviation in robust σ from which a sample is an outlier; most passes, as outliers hide each other.
 SPIKE, PASSES = 12.0, 6
-# Fewest samples with a meaningful scatter.
-FEWEST = 10
 
 
 def deviation_from_neighbours(values: Array) -> Array:
@@ -42,7 +40,7 @@ def without_spikes(
     """
     kept = np.arange(len(values))
     for _ in range(PASSES):
-        if len(kept) < FEWEST:
+        if len(kept) < FEWEST_VALUES:
             break
         x = values[kept]
         loud = np.ones_like(x) if loudness is None else loudness[kept]
