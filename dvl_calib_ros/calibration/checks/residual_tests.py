@@ -75,8 +75,6 @@ FILTER_MEMORIES_S = 0.5, 1.0, 3.0
 NEIGHBOURS = 12
 # σ of the share of the DVL's noise in the reference that is due to waves (0.2 m/s at 8 Hz: up to 0.05).
 OF_WAVES = 0.015
-# Smallest share of DVL noise in a reference from positions: the motion on both sides in its window looks similar.
-POSITIONS_NOISE_SHARE = 0.1
 
 
 class ResidualTrend(NamedTuple):
@@ -273,11 +271,10 @@ def residual_warnings(
     """
     if found is None:
         return []
-    smallest_share = POSITIONS_NOISE_SHARE if of_positions else 0.0
     seconds = math.sqrt(2.0 * abs(found.smoothed))
     # a filter smooths and passes noise on: with evidence for one, the other needs less
     is_filter = not of_positions and found.smoothed > Z_95_PERCENT * found.smoothed_std
-    if found.circular > max((Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * found.circular_std, smallest_share):
+    if found.circular > (Z_ONE_TEST if is_filter else Z_REPEATED_TEST) * found.circular_std:
         return [finding("CIRCULAR_REFERENCE", seconds=found.circular_s).weighed(Severity.REJECT)]
     by_position_window = of_positions and found.smoothed > 0.0
     is_smoothed = abs(found.smoothed) > Z_REPEATED_TEST * found.smoothed_std
