@@ -10,7 +10,8 @@ import numpy as np
 
 from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import rotation_from_rpy
-from ..calibration.registration.registration import ALIKE_S, OFFSETS, Registration
+from ..calibration.registration.clock_drift_and_jumps import REPORTED_FROM_S
+from ..calibration.registration.registration import OFFSETS, Registration
 from ..discovery.gravity import Gravity
 from ..verdict.reasons import Reason, finding
 
@@ -77,7 +78,7 @@ class LateClocks:
 
 
 def _are_alike(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    return one.keys() == other.keys() and all(abs(one[name] - other[name]) < ALIKE_S for name in other)
+    return one.keys() == other.keys() and all(abs(one[name] - other[name]) < REPORTED_FROM_S for name in other)
 
 
 # A process that checks its clock every second and finds this much time gone was paused, s.

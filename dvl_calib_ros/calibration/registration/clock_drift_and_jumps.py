@@ -25,9 +25,9 @@ from .motion_streams import MotionStreams
 DIRECTIONS: Mapping[str, tuple[float, float]] = {"dvl": (1.0, 0.0), "reference": (-1.0, 1.0), "imu": (0.0, -1.0)}
 # σ of the changes of interpolation and filter delays between stretches, s.
 LAGS_S = 0.03
-# Smallest delay, or its change from end to end, that is reported, s. It shifts a lever arm by a tenth of a second
-# times the speed. Interpolated attitudes and the filters of an INS have smaller delays (five real recordings: 0.03 to
-# 0.07 s).
+# Smallest delay, change of it from end to end, or difference of two estimates of it that is reported, s. It shifts a
+# lever arm by a tenth of a second times the speed. Interpolated attitudes and the filters of an INS have smaller delays
+# (five real recordings: 0.03 to 0.07 s).
 REPORTED_FROM_S = 0.1
 # Thresholds of a clock change: chi-square gain, and largest residual chi-square per degree of freedom.
 GAIN, LEFT = 18.0, 4.0

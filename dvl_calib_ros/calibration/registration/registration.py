@@ -62,8 +62,6 @@ KNOWN_STD_S, KNOWN_SHARE, KNOWN_AT_MOST_S = 0.25, 0.12, 0.35
 OFFSETS = {"dvl_time_offset": "the DVL's", "reference_time_offset": "the reference's", "imu_time_offset": "the IMU's"}
 # Smaller DVL delays are left to the calibration (full), which estimates them at any stamps, s.
 LEFT_TO_CALIBRATION_S = 2.5
-# Largest difference of two estimates of the same delay, s.
-ALIKE_S = 0.1
 # Prior σ of the reference delay, s: receivers and filters have delays of tenths of a second.
 IN_TIME_STD_S = 0.5
 # From this many σ on, the fitted delay of a clock assumed synchronised becomes its σ. From this multiple of the prior σ
@@ -386,7 +384,7 @@ def _is_as_good(motion: MotionStreams, fit: MotionFit, one: Fitted, closest: Fit
     A delay may lower the residual by moving a bad DVL stretch out of the overlap. Candidates with other DVL delays also
     sample other DVL noise; in periodic waves this alone makes a difference.
     """
-    is_read_elsewhere = abs(float(one.x[DELTA]) - float(closest.x[DELTA])) > ALIKE_S
+    is_read_elsewhere = abs(float(one.x[DELTA]) - float(closest.x[DELTA])) > REPORTED_FROM_S
     enough = GAIN + (_by_chance(motion, one, fit.dvl_noise) if is_read_elsewhere else 0.0)
     if _gain(motion, one, closest) < enough:
         return True
