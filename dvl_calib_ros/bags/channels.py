@@ -84,6 +84,7 @@ class Decoder:
             raise DecodingError(f"{type(error).__name__}: {error}") from error
 
     def _typestores(self, channel: Channel) -> list[Typestore]:
+        """Return the type stores of a channel, cached. Raises DefinitionError."""
         stores = self._stores.get(channel)
         if stores is None:
             try:
@@ -96,6 +97,7 @@ class Decoder:
         return stores
 
     def _make_typestores(self, channel: Channel) -> list[Typestore]:
+        """Build the type stores of a channel: from its definition, or from all known ones of its type."""
         _, msgtype, definition = channel
         key = (msgtype, definition)
         if key not in self._by_definition:
@@ -197,6 +199,7 @@ _SOUND = {
 
 
 def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
+    """Parse a definition (MSG or IDL). Raises DefinitionError for one too expensive to parse."""
     if len(definition.text) > LONGEST_DEFINITION:
         raise DefinitionError(f"the definition of {msgtype} has {len(definition.text)} characters")
     if definition.format is MessageDefinitionFormat.MSG:

@@ -163,6 +163,7 @@ class _Layouts:
             yield None, remaining
 
     def _learn(self, channel: Channel, data: bytes, known: list[Layout]) -> bool:
+        """Add the layout of a message to the known ones. Return False if it has none."""
         store = self._decoder.typestore(channel)
         if store is None or len(known) >= _MOST_LAYOUTS:
             return False
@@ -300,6 +301,7 @@ class _LayoutWalk:
             self._field(f"{prefix}{name}", description)
 
     def _field(self, path: str, description: Any) -> None:
+        """Add a field by its kind. Raises NoLayoutError for a sequence."""
         kind, what = description
         if kind == Nodetype.NAME:
             self.message(f"{path}.", what)
@@ -313,6 +315,7 @@ class _LayoutWalk:
             self._numbers(path, what[0])
 
     def _array(self, path: str, description: Any, size: int) -> None:
+        """Add an array of fixed size, as one column if its elements are numbers."""
         kind, what = description
         if kind == Nodetype.BASE and what[0] in _FORMATS and what[0] != "bool":
             self._numbers(path, what[0], size)
@@ -321,6 +324,7 @@ class _LayoutWalk:
             self._field(f"{path}[{number}]", description)
 
     def _numbers(self, path: str, name: str, size: int | None = None) -> None:
+        """Add one number, or an array of `size`, aligned to its size."""
         if name not in _FORMATS:
             raise NoLayoutError(f"{path} is {name}")
         format_ = self._order + _FORMATS[name]
@@ -331,6 +335,7 @@ class _LayoutWalk:
         self._add(path, format_ if size is None else (format_, (size,)), each * (1 if size is None else size))
 
     def _string(self, path: str) -> None:
+        """Add a string of the length in this message. Raises NoLayoutError."""
         self._align(4)
         try:
             (length,) = struct.unpack_from(f"{self._order}I", self._data, self.at)
@@ -348,6 +353,7 @@ class _LayoutWalk:
         self.at += -(self.at - ENCAPSULATION) % size
 
     def _add(self, path: str, format_: Any, size: int) -> None:
+        """Add a column of this NumPy format and number of bytes."""
         if len(self.fields) > _MOST_FIELDS:
             raise NoLayoutError("more fields than are worth it")
         self.fields[path] = format_, self.at
@@ -374,6 +380,7 @@ def _compare(layout: Layout, rows: Rows, message: Any) -> None:
 
 
 def _value_at(message: Any, path: str) -> Any:
+    """Return the value of a message at a path such as ``a.b[2]``."""
     for step in path.split("."):
         name, _, index = step.partition("[")
         message = getattr(message, name)

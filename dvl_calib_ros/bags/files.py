@@ -40,6 +40,7 @@ class _RawFile(io.RawIOBase):
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Set the position. Raises OSError for one before the start."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._at, os.SEEK_END: os.fstat(self._descriptor).st_size}[whence]
         if start + offset < 0:
             raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
@@ -47,6 +48,7 @@ class _RawFile(io.RawIOBase):
         return self._at
 
     def readinto(self, buffer: Any) -> int:
+        """Fill a buffer from the present position, with zeros in unreadable places. Return the count."""
         try:
             count = os.preadv(self._descriptor, [buffer], self._at)
         except OSError:  # read in pieces, and note the holes
@@ -78,6 +80,7 @@ class _RawFile(io.RawIOBase):
         return self._read(middle - at, at) + self._read(at + size - middle, middle)
 
     def _attempt(self, size: int, at: int) -> bytes | None:
+        """Read once; None if the disk cannot read it."""
         try:
             return os.pread(self._descriptor, size, at)
         except OSError as error:
@@ -88,6 +91,7 @@ class _RawFile(io.RawIOBase):
             return None
 
     def _note(self, start: int, end: int) -> None:
+        """Note an unreadable range, joined with those that it touches."""
         touching = [hole for hole in self.holes if hole[0] <= end and start <= hole[1]]
         self.holes = sorted(
             [hole for hole in self.holes if hole not in touching]
@@ -217,6 +221,7 @@ def with_journal(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
 
 
 def _journal(path: Path, suffix: str) -> Path | None:
+    """Return the non-empty journal of an SQLite file; None without one."""
     for database in (path, path.resolve()):
         journal = database.with_name(f"{database.name}{suffix}")
         if journal.is_file() and journal.stat().st_size:

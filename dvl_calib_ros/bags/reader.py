@@ -135,6 +135,7 @@ class BagReader:
         return batched(self.raw_messages(chosen))
 
     def _singly(self, source: Source, topics: frozenset[str]) -> Iterator[BagMessage]:
+        """Yield single messages of one source, after a marker at its first log time."""
         # a marker at the start: merging opens a recording only when its time comes
         yield source.span_ns[0], _MARKER, b""
         for batch in self._of_source(source, topics):
@@ -162,6 +163,7 @@ class BagReader:
             self.notes.append(f"{source.path}: {lost} compressed messages are damaged and left out")
 
     def _open(self, path: Path) -> list[Source]:
+        """Open a bag, or all bags in a folder. Raises InputError."""
         try:
             if path.is_dir():
                 return self._open_folder(path)

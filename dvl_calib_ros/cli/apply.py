@@ -136,6 +136,7 @@ def _parse_now(words: Sequence[str]) -> dict[str, float]:
 
 
 def _settings_lines(chosen: InstrumentSettings) -> list[str]:
+    """Return the settings of an instrument, with document and notes, as lines to print."""
     return [
         f"{chosen.instrument}, by: {chosen.document}",
         *(f"  {setting}" for setting in chosen.settings),

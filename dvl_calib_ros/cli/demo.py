@@ -86,6 +86,7 @@ def _latency(speed: float) -> str:
 
 
 def _show_live(out: Any, bag: Path, speed: float) -> None:
+    """Play the bag to the node and show its estimates live."""
     from rich.live import Live
 
     from ..demo.watch import Watcher
@@ -114,6 +115,7 @@ def _truth() -> dict[str, float]:
 
 
 def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
+    """Replay the bag with the node's latency."""
     from ..bag_replay.replay import replay
     from ..files.parameter_files import load_parameters
 
@@ -152,6 +154,7 @@ def _compare(out: Any, saved: Path, offline: Result) -> bool:
 
 
 def _show_diagnosis(out: Any, bag: Path) -> None:
+    """Diagnose the bag and print verdict and effects."""
     from ..calibration.models.parameters import Parameters
     from ..diagnosis.diagnose import diagnose
 
@@ -209,6 +212,7 @@ def _take(domain: int) -> bool:
 
 
 def _has_participant(domain: int) -> bool:
+    """Return whether a DDS participant on this host already uses a ROS domain."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("", PORT_BASE + DOMAIN_GAIN * domain + FIRST_PARTICIPANT))

@@ -100,6 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     written: list[str] = []
 
     def answer() -> None:
+        """Print the diagnosis and the written files."""
         layout = present.diagnosis if arguments.verbose else present.first_screen
         common.print_document(layout(diagnosis), discovery.doubts)
         common.print_found(discovery, arguments.bags, first_only=not arguments.verbose)
@@ -107,6 +108,7 @@ def run(arguments: argparse.Namespace) -> int:
             common.console().print(line, soft_wrap=True, markup=False)
 
     def apply(path: Path) -> None:
+        """Write the parameters that correct the diagnosed errors, per recording if they differ."""
         days: dict[int | None, Path] = {None: path}
         if any(effect.by_recording for effect in diagnosis.effects):
             days |= {index: of_each[name] for index, (name, _) in enumerate(diagnosis.recordings)}

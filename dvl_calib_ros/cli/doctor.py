@@ -58,6 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> None:
+    """Raise InputError unless either bags or a valid live duration are given."""
     if bool(arguments.bags) == (arguments.live is not None):
         raise InputError(
             "name a BAG, or the topics there are: --live" if not arguments.bags else "a BAG or --live, not both"

@@ -58,6 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _answer(node: Any, name: str, ask: Any, about: Any) -> Any:
+    """Send a request until the node answers. Raises InputError after `TRIES`."""
     import rclpy
 
     for _ in range(TRIES):

@@ -40,6 +40,7 @@ def with_profile(argv: Sequence[str], arguments: argparse.Namespace) -> list[str
 
 
 def _path(name: str | None) -> Path | None:
+    """Return the file of a profile, by default the one in the current folder, if any."""
     if name is None:
         return IN_FOLDER if IN_FOLDER.exists() else None
     if name == "none":

@@ -80,6 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print(arguments: argparse.Namespace, replayed: Replayed, discovery: Discovery, models: Sequence[str]) -> None:
+    """Print the result of a replay with warnings and next commands."""
     from ..present import replay as present
 
     findings = shown_findings(replayed, discovery, [replayed.result.selected, *models])

@@ -198,6 +198,7 @@ MAY_BE_ZERO = ("gnss_rate", "imu_rate")  # zero means no such sensor
 
 
 def _check(arguments: argparse.Namespace) -> None:
+    """Raise InputError for an option outside its range."""
     if len(arguments.scale) not in (1, 3):
         raise InputError("--scale: give one number for all axes, or three")
     for name, (low, high) in LIMITS.items():

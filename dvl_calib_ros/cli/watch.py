@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _listener(node: str) -> Listener:
+    """Return a listener to a node's diagnostics. Raises InputError without ROS."""
     from ..errors import needing_ros
 
     with needing_ros("watch"):
@@ -100,6 +101,7 @@ def node_command(ros_arguments: Sequence[str]) -> list[str]:
 
 
 def _ended(process: subprocess.Popen[bytes]) -> int:
+    """Ask the node to end by closing its standard input; kill it after `PATIENCE_S`. Return its exit code."""
     assert process.stdin is not None  # a pipe
     process.stdin.close()
     try:
@@ -240,6 +242,7 @@ def _is_usable(status: Status) -> bool:
 
 
 def _warnings(status: Status) -> list[str]:
+    """Return errors first, then a withdrawn result, warnings, and why the calibration takes longer."""
     found = [each for n in range(1, 100) if (each := status.values.get(f"finding {n}"))]
     found = found or [status.message] * bool(status.level)
     urgent = found[:1] if status.level > 1 else []  # an error, which comes first
@@ -308,6 +311,7 @@ def _quantity(status: Status, name: str, unit: str, shown: str) -> str:
 
 
 def _goal(status: Status, key: str, shown: str, width: int) -> Row:
+    """Return one row with a value, its progress bar, and the predicted drift."""
     percent = min(_number(status.get(f"goal {key} [%]")), 100.0)
     names = {"worth": "worth", "side": "worth to the side", "ahead": "worth ahead"}
     goal = f", goal {status.get('target')}" if key == "worth" else ""
@@ -318,6 +322,7 @@ def _goal(status: Status, key: str, shown: str, width: int) -> Row:
 
 
 def _rose(status: Status) -> str:
+    """Return the time driven on each sector of headings as a row of bars."""
     driven = [_number(status.get(f"driven {sector} [s]")) for sector in SECTORS]
     most = max(max(driven), 1.0)
     heights = (HEIGHTS[round((len(HEIGHTS) - 1) * seconds / most)] for seconds in driven)
@@ -436,6 +441,7 @@ def _message(logged: str) -> str:
 
 
 def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:
+    """Yield a line when model, convergence or severity change, and at least every `LINE_S`."""
     printed, printed_s = ("", "", ""), 0.0
     told_s = time.monotonic()
     while is_running():

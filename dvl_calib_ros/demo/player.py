@@ -134,6 +134,7 @@ class BagPlayer:
         return sent
 
     def _publish_clock(self, nanoseconds: int) -> None:
+        """Publish the recording's time, if requested."""
         if self._clock is not None:
             message = Clock()
             message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 1_000_000_000)

@@ -169,6 +169,7 @@ class _Search:
         return Topics(dvl, gnss, imu)
 
     def _named(self, role: str, name: str | None) -> str | None:
+        """Return a named topic if the recording has it with a usable type. Raises InputError."""
         if name is None:
             return None
         return topic_choice.checked_topic(
@@ -479,6 +480,7 @@ class _Search:
         self._found.append(f"the IMU's data are used {frame.says}: imu_rpy {in_degrees(rpy)}, imu_frame {frame.world}")
 
     def _mounting_found(self, rpy: tuple[float, float, float], why: str) -> None:
+        """Use a mounting (rad) found from the data, and note its source; nothing if it is zero."""
         if not any(rpy):
             return
         self._values["mounting_rpy"] = rpy

@@ -157,6 +157,7 @@ def _error_text(error: OSError | ValueError) -> str:
 
 
 def _write_stream(handle: int, content: bytes) -> None:
+    """Write to a standard stream after its earlier output."""
     if handle < 0:
         return
     for stream in (sys.stdout, sys.stderr):
@@ -265,6 +266,7 @@ def _locked(folder: Path) -> Iterator[bool]:
 
 
 def _lock(handle: int, patience_s: float) -> bool:
+    """Lock an open folder, waiting at most `patience_s`. Return whether that succeeded."""
     deadline = time.monotonic() + patience_s
     while True:
         try:

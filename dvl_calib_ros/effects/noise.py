@@ -51,6 +51,7 @@ class StaleSamples(NoiseEffect):
         last: Array = np.empty((0, 3))
 
         def disturbance(velocity: Array, motion: EffectInput) -> Array:
+            """Replace a share of the samples (N, 3) by the fresh one before them."""
             nonlocal last
             stale = rng.random(len(velocity)) < values["share"]
             known = np.vstack([last, velocity])
@@ -111,6 +112,7 @@ class ColouredReferenceNoise(NoiseEffect):
         last: tuple[float, Array] | None = None
 
         def disturbance(velocity: Array, motion: EffectInput) -> Array:
+            """Add first-order Gauss-Markov noise to samples (N, 3) m/s."""
             nonlocal last
             noise = values["std_mps"] * rng.standard_normal(velocity.shape)
             if tau > 0.0:

@@ -83,6 +83,7 @@ def all_effects() -> tuple[AnyEffect, ...]:
 
 
 def _plugged_in(point: EntryPoint) -> AnyEffect:
+    """Return the effect of an entry point. Raises InputError for any fault of its package."""
     try:
         kind = point.load()
         if not (isinstance(kind, type) and issubclass(kind, Effect | NoiseEffect)):
@@ -134,6 +135,7 @@ def effect_table() -> str:
 
 
 def _row(effect: AnyEffect) -> str:
+    """Return an effect's row of the table, in Markdown."""
     by_unit = [
         f"{_codes(parameter.name for parameter in group)} {unit}"
         for unit, group in groupby(effect.parameters, lambda parameter: parameter.unit)

@@ -156,6 +156,7 @@ def _with_own_delay(terms: Terms, verified: _Replayed) -> Terms:
 
 
 def _delayed_rmse(verified: _Replayed, terms: Terms, parameters: Parameters) -> float:
+    """Return the velocity RMSE (m/s) on the verifying bag, with the delay corrected."""
     if verified.recording is None:
         return float("nan")
     every = np.arange(len(verified.recording.dvl.times))

@@ -67,6 +67,7 @@ def evaluation_csv(evaluation: Evaluation) -> str:
 
 
 def _csv_rows(e: Evaluation) -> Iterator[Sequence[Any]]:
+    """Yield the CSV's rows: sets, calibration times, then calibrations on each run."""
     for each, by_column, published in zip(e.sets, e.avg_vrmse, e.published_table, strict=True):
         where = ("sets", each.name, each.calibration_run, 0.0, each.window_s)
         yield from _per_seed(e, where, by_column, published)
@@ -81,6 +82,7 @@ def _csv_rows(e: Evaluation) -> Iterator[Sequence[Any]]:
 def _per_seed(
     e: Evaluation, where: Sequence[Any], by_column: Array, published: Array | None = None
 ) -> Iterator[Sequence[Any]]:
+    """Yield one CSV row per column and seed. by_column: (C, seeds) m/s. published: (C,) m/s."""
     for index, column in enumerate(e.columns):
         known = "" if published is None or np.isnan(published[index]) else float(published[index])
         for seed, value in zip(e.seeds, by_column[index].tolist(), strict=True):
@@ -101,6 +103,7 @@ def _table(names: Sequence[str], columns: Sequence[str], values: Array) -> dict[
 
 
 def _coverage(coverage: Sequence[Coverage]) -> dict[str, Any]:
+    """Return plain data of the coverage by model."""
     return {
         each.model: {
             "errors": each.n_errors,
@@ -116,6 +119,7 @@ def _coverage(coverage: Sequence[Coverage]) -> dict[str, Any]:
 
 
 def _each(study: EachStudy | None, columns: Sequence[str]) -> dict[str, Any] | None:
+    """Return plain data of the calibrations on each single run; None if they were not made."""
     if study is None:
         return None
     runs = [

@@ -148,6 +148,7 @@ def _estimate_by_variant(
 def _estimate(
     models: Sequence[str], data: SensorData, parameters: Parameters, ends: Sequence[int]
 ) -> Mapping[str, GaussianState]:
+    """Run `estimate` for models that are usable with these data."""
     variants = aligned(data, parameters)
     found = {name: _estimate_fed(name, data, parameters, ends) for name in models if MODELS[name].estimator}
     for needs in Needs:

@@ -102,6 +102,7 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     def outcome(
         models: Sequence[str], stretch: SensorData, windows: Sequence[float | None], own_window: float | None
     ) -> RunOutcome:
+        """Calibrate on a stretch after each window, and evaluate on all other runs."""
         others = _others(moments, stretch.run.name)
         ends = [stretch.run.first(window) for window in windows]
         return _calibrate_once(models, stretch, ends, windows.index(own_window), others, procedure, failures)
@@ -266,6 +267,7 @@ def single_headings(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...
 
 
 def _described(run: Trajectory, start: int, end: int) -> CalibrationRun:
+    """Return a stretch of samples start .. end - 1 with its times and spread of headings."""
     rotation = run.rotation_enu_from_body
     assert rotation is not None  # only runs with attitude get here
     from_s, to_s = (float(run.time[at] - run.time[0]) for at in (start, end - 1))
@@ -395,6 +397,7 @@ def _for_procedure(parameters: Parameters) -> tuple[Parameters, tuple[str, ...]]
 
 
 def _coverage(models: Sequence[str], outcomes: Sequence[RunOutcome]) -> tuple[Coverage, ...]:
+    """Return the coverage of the intervals of every model, over all runs."""
     found = []
     for name in models:
         ran = [each for each in outcomes if name in each.errors]

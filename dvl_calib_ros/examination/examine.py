@@ -253,6 +253,7 @@ def _replayed(recording: Recording, discovery: Discovery) -> tuple[Replayed | No
 
 
 def _content(role: str, topic: Recorded, look: Look | None, rate_hz: float) -> Content:
+    """Return name, type, rate and reported σ of a topic, as text."""
     variances = topic.variances[np.isfinite(topic.variances).all(axis=1)]
     if role == "imu":
         covariance = ""
@@ -393,6 +394,7 @@ def _shown(replayed: Replayed) -> tuple[Shown, ...]:
 
 
 def _one_shown(found: Quantity, estimate: Estimate, parameters: Parameters) -> Shown:
+    """Return one quantity with its σ, progress to the goal, and the missing motion."""
     if found.name == "scale":
         unit, prior = 100.0, parameters.initial_std_scale
     else:

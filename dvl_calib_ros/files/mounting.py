@@ -200,6 +200,7 @@ def _saved_warnings(content: Mapping[str, Any], *severities: Severity) -> tuple[
 
 
 def _unobservable(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
+    """Return a sentence with 1 σ for each angle that was not observable."""
     entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
     return tuple(
         f"{each.name} ({each.axis}) was not observable in the data, which leaves ±{math.degrees(each.std):.1f}° (1σ)"

@@ -95,6 +95,7 @@ def _in_radians(value: Any) -> Any:
 
 
 def _number_or_degrees(value: Any) -> Any:
+    """Return a text such as ``90 deg`` as radians, or as a number; other values unchanged."""
     if not isinstance(value, str):
         return value
     found = _DEGREES.match(value.strip())
@@ -105,6 +106,7 @@ def _number_or_degrees(value: Any) -> Any:
 
 
 def _node_parameters(path: Path, text: str | None = None) -> dict[str, Any]:
+    """Return the parameters of this node in a ROS parameter file, without those of ROS itself."""
     sections = _own_sections(path, NODE_NAME, section_is_ours, text)
     values: dict[str, Any] = {}
     for _, body in sections:
@@ -197,6 +199,7 @@ def section_is_ours(node: str) -> bool:
 
 
 def _flat(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Join nested mappings into one, with names separated by dots."""
     values: dict[str, Any] = {}
     for key, value in body.items():
         name = f"{prefix}{key}"
@@ -247,6 +250,7 @@ def model_table() -> str:
 
 
 def _shown(default: Any) -> str:
+    """Return a default value as text for the table of parameters."""
     if isinstance(default, tuple):
         return " ".join(f"{value:g}" for value in default)
     if isinstance(default, bool):

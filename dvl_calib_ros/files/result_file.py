@@ -174,6 +174,7 @@ def _in_words(found: Quantity) -> str:
 
 
 def _std_in_words(estimate: Estimate, stds: Array) -> dict[str, str]:
+    """Return 1 σ of each state with its unit, by the state's name."""
     units = {"phi": (math.degrees(1.0), "deg"), "delta": (100.0, "%")}
     known = {each.name: (1.0, each.unit) for each in MODELS[estimate.model].nuisance}
     words = {}
@@ -422,6 +423,7 @@ def _check_says_one_thing(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _check_mounting(path: Path, content: Mapping[str, Any], mounting_rpy: Sequence[float] | None) -> None:
+    """Raise InputError if a saved result is relative to another nominal mounting (rad)."""
     if mounting_rpy is None:
         return
     try:

@@ -170,6 +170,7 @@ def _local_files(place: str, unread: list[str]) -> _Files:
 
 
 def _local_file(path: str) -> StoredFile:
+    """Return a local file with size and time of change. Raises OSError if it is no regular file."""
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "is no file")  # a pipe would block
@@ -231,6 +232,7 @@ def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterato
 
 
 def _is_bag(folder: str, files: Sequence[StoredFile], storage: Sequence[StoredFile]) -> bool:
+    """Return whether a folder has rosbag2's metadata, or only files numbered as rosbag2 does."""
     if any(each.where.endswith(f"/{METADATA}") for each in files):
         return True
     numbered = re.compile(re.escape(folder.rpartition("/")[2]) + r"_\d+\.")  # rosbag2's numbering of files
@@ -294,6 +296,7 @@ def failed(where: str, why: str, is_final: bool = True) -> Entry:
 
 
 def _calibrated(task: Task, path: Any) -> Entry:
+    """Discover topics and frames of a recording and replay it."""
     recording = open_recording([path], None, task.parameters)
     found = discover(recording, task.parameters, task.given)
     replayed = checked_replay(
@@ -335,6 +338,7 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
 
 
 def _day(stamp_ns: int) -> date | None:
+    """Return the UTC date of a stamp; None for an invalid one."""
     try:
         return datetime.fromtimestamp(stamp_ns // 1_000_000_000, timezone.utc).date()
     except (ValueError, OverflowError, OSError):  # an invalid time

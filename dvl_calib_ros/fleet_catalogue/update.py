@@ -159,6 +159,7 @@ class Catalogue:
         return content
 
     def _set_aside(self, path: Path, why: str) -> None:
+        """Move a faulty file to the folder `ASIDE`, and note why."""
         aside = self.folder / ASIDE
         place = aside / path.name
         try:
@@ -177,6 +178,7 @@ class Catalogue:
         return self.rows / f"{name}-{hashlib.sha256(recording.encode()).hexdigest()[:16]}.parquet"
 
     def _save(self, part: CataloguePart, rows: list[Row]) -> None:
+        """Write the rows of a recording as a Parquet file with its checksum."""
         from pyarrow import parquet
 
         rows = [{name: as_cell(value) for name, value in row.items()} for row in rows]
@@ -203,6 +205,7 @@ def _stamped(row: Row) -> Row:
 
 
 def _arrow() -> Any:
+    """Return pyarrow. Raises InputError if it is not installed."""
     try:
         import pyarrow
     except ImportError as error:
@@ -302,6 +305,7 @@ def run_fleet(
 
 
 def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence[str]) -> Fleet:
+    """Read the catalogue and compute the history of each vehicle."""
     entries = [
         Catalogued.of(part.recording, part.vehicle, catalogue.rows_of(part.recording), part.extrinsics)
         for part in sorted(catalogue.parts(), key=lambda part: part.recording)

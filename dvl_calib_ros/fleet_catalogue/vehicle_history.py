@@ -163,6 +163,7 @@ def need_person(entries: Sequence[Catalogued]) -> list[NeedsPerson]:
 
 
 def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
+    """Return the history of a vehicle: days, comparison, heading deviation and water."""
     usable = [each for each in entries if each.is_usable]
     # models without GNSS assume no current, so they are not compared with models with GNSS
     aided = [each for each in entries if each.extrinsics is not None and MODELS[each.extrinsics.model].aided]
@@ -177,6 +178,7 @@ def _history(name: str, entries: Sequence[Catalogued]) -> VehicleHistory:
 
 
 def _compared(several: Sequence[Extrinsics]) -> Comparison | None:
+    """Compare calibrations; None for fewer than two, or without a common observable quantity."""
     try:
         return compare(several) if len(several) > 1 else None
     except InputError:  # no quantity is observable in two of them
@@ -184,6 +186,7 @@ def _compared(several: Sequence[Extrinsics]) -> Comparison | None:
 
 
 def _days(entries: Sequence[Catalogued]) -> list[Extrinsics]:
+    """Average the recordings of each day, separately before and after a movement of the mounting."""
     by_day: dict[int, list[tuple[Extrinsics, Array]]] = defaultdict(list)
     for each in entries:
         if each.extrinsics is not None and each.covariance_of_recording is not None:

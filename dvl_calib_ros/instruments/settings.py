@@ -142,6 +142,7 @@ def _recorded_sound(
 
 
 def _water_linked(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
+    """Return settings, command to send and notes for a Water Linked DVL."""
     offset, swing = _heading(calibrated, now["mounting_rotation_offset"])
     angle = Setting("mounting_rotation_offset", now["mounting_rotation_offset"], round(offset % 360.0, 2) % 360.0, "°")
     sound, of_sound = _speed_of_sound(calibrated, now.get(SPEED_OF_SOUND))
@@ -177,6 +178,7 @@ def _speed_of_sound(calibrated: CalibratedMounting, now: float | None) -> tuple[
 
 
 def _cerulean(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tuple[list[Setting], str, list[str]]:
+    """Return settings, commands and notes for a Cerulean DVL."""
     heading, swing = _heading(calibrated, now["heading"])
     settings = [Setting("heading", now["heading"], round(math.remainder(heading, 360.0), 2), "°")]
     lines = [f"SET-SENSOR-ORIENTATION {now['roll']:g}, {now['pitch']:g}, {settings[0].new:g}"]
@@ -250,6 +252,7 @@ def _is_down(calibrated: CalibratedMounting) -> bool:
 
 
 def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
+    """Return notes on roll and pitch, which the instrument cannot correct; swing: (3, 3) left after its heading."""
     roll_pitch = np.abs(rpy_from_rotation(swing)[:2])
     notes = ["URDF and parameters stay unchanged: do not write this result into them as well"]
     if roll_pitch.max() <= REPORTED_FROM_RAD:
@@ -266,6 +269,7 @@ def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
 
 
 def _delay(calibrated: CalibratedMounting) -> list[str]:
+    """Return a note on a DVL delay, for which the instrument has no setting."""
     late = calibrated.dvl_time_offset
     return (
         [f"the DVL's stamps are {late:+.3f} s late against the IMU's, for which the instrument has no setting"]
@@ -397,6 +401,7 @@ class _Dvl:
             return answer.get("result")
 
     def _line(self, until: float) -> bytes:
+        """Return the next line from the instrument. Raises TimeoutError at the monotonic time `until`."""
         while b"\n" not in self._pending:
             remaining = until - time.monotonic()
             if remaining <= 0.0 or len(self._pending) > LONGEST_LINE:

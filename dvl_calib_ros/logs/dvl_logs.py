@@ -279,6 +279,7 @@ def _pd0_water(stamp_ns: int, data: dict[int, bytes]) -> WaterReading | None:
 
 
 def _pd0_stamp(data: dict[int, bytes]) -> int:
+    """Return the stamp (ns) of an ensemble's clock, taken as UTC."""
     year, month, day, hour, minute, second, hundredths = data[_VARIABLE_LEADER][4:11]
     # RDI's year has two digits; no DVL before 2000 has this format
     at = datetime(2000 + year, month, day, hour, minute, second, tzinfo=timezone.utc)

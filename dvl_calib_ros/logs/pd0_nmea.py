@@ -133,6 +133,7 @@ class Nmea:
         return stamps, values[:, 0]
 
     def _in_order(self, kind: str) -> tuple[list[int], Array]:
+        """Return stamps (ns) and values of one kind of sentence, with the sign of DT that spaces them most evenly."""
         own = self._found[kind]
         if not own:
             return [], np.zeros((0, 2))
@@ -166,6 +167,7 @@ def _values(kind: str, specific: int, body: bytes) -> list[float]:
 
 
 def _of_text(kind: str, sentence: re.Match[bytes]) -> list[float]:
+    """Parse the values of a sentence in text, see `_values`. Raises ValueError for another kind or a wrong checksum."""
     name, text, checksum = sentence.groups()
     fields = text.decode("ascii").split(",")
     whole = sentence[0][1:].partition(b"*")[0]

@@ -133,6 +133,7 @@ def read_columns(path: Path, unit: str) -> TimedRows:
 
 
 def _read_npy(path: Path) -> Array:
+    """Read an array from a NumPy file. Raises InputError."""
     try:
         return np.asarray(np.load(path, allow_pickle=False), dtype=float)
     except Exception as error:  # damaged files raise many types, MemoryError among them
@@ -303,6 +304,7 @@ def import_recording(
 
 
 def _references(path: Path, options: ImportOptions, notes: list[str]) -> list[ReferenceSample]:
+    """Read the reference velocities of a file by its kind; none from positions."""
     from .pd0_nmea import is_nmea, read_rmc
 
     if is_nmea(path):
@@ -433,6 +435,7 @@ def _stamp_ns(text: str, start_ns: int) -> int:
 
 
 def _moment(text: str) -> datetime:
+    """Parse a date and time in one of the common formats. Raises ValueError."""
     for form in _FORMATS:
         try:
             return datetime.strptime(text, form)

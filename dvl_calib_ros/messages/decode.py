@@ -295,6 +295,7 @@ class MessageDecoder:
         return Refusal(INVALID)
 
     def _stamp_ns(self, stream: Stream, header: Any, received_ns: int) -> int:
+        """Return a message's stamp, or the time of reception if it is zero or to be ignored."""
         stamp = received_ns if self.parameters.restamp == RESTAMP_ALL else stamp_ns(header.stamp)
         if stamp:
             return stamp
@@ -375,6 +376,7 @@ class MessageDecoder:
             self._problem("imu frame", finding("IMU_FRAME", frame_id=frame_id, base=base))
 
     def _problem(self, kind: str, found: Reason) -> None:
+        """Remember a problem, and report it if it is the first of its kind."""
         is_new = kind not in self.problems
         self.problems[kind] = found
         if is_new:  # alternating frames or ever new garbage must not be reported with every message

@@ -97,6 +97,7 @@ def _reader(fields: FieldMap) -> Callable[[Any], Any]:
         return [getter(message) for getter in getters.get(key, ())]
 
     def adapted(message: Any) -> Any:
+        """Return header, velocity, covariance and validity of a message by the map."""
         header = getattr(message, "header", None)
         stamp = _stamp(read("stamp", message) or ([header.stamp] if header is not None else [0.0]))
         frame = read("frame", message) or ([header.frame_id] if header is not None else [""])

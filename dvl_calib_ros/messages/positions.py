@@ -143,6 +143,7 @@ def _of_pose(message: Any) -> Place:
 
 
 def _pose_covariance(message: Any) -> Any:
+    """Return the covariance (36,) of a pose; None if missing or not positive."""
     if not hasattr(message.pose, "covariance"):
         return None
     given = np.asarray(message.pose.covariance, dtype=float)

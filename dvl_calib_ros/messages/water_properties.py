@@ -38,6 +38,8 @@ class OfWater(NamedTuple):
 
 
 def _used(field: str) -> Callable[[Any], float]:
+    """Return a reader of the speed of sound that the velocities depend on; nan for a phased array."""
+
     def read(message: Any) -> float:
         # the horizontal velocities of a phased array do not depend on the speed of sound
         is_phased = getattr(message, "dvl_type", 0) == _PHASED_ARRAY

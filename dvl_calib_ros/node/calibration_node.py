@@ -268,6 +268,7 @@ class CalibrationNode(AnsweringNode):
         return self.create_publisher(message_type, topic, qos, event_callbacks=events)
 
     def _log_configuration(self) -> None:
+        """Log the model and all parameters that differ from their defaults."""
         default = Parameters().as_dict()
         given = self._calibrator.parameters.as_dict()
         changed = ", ".join(f"{name}: {value}" for name, value in given.items() if value != default[name])
@@ -285,12 +286,14 @@ class CalibrationNode(AnsweringNode):
         """
 
         def on_incompatible(event: Any) -> None:
+            """Subscribe again as best effort, as soon as the executor is idle."""
             if event.last_policy_kind == QoSPolicyKind.RELIABILITY and reliability is ReliabilityPolicy.RELIABLE:
                 self.info(f"{topic}: a publisher is best effort; subscribing as best effort")
                 assert self.executor is not None  # it runs this callback
                 self.executor.create_task(resubscribe)
 
         def resubscribe() -> None:
+            """Replace the subscription by a best-effort one, without losing waiting messages."""
             old = self._inputs[topic]
             self.deliver()  # messages waiting in the old subscription would be lost
             self._subscribe(message_type, topic, ReliabilityPolicy.BEST_EFFORT)
@@ -333,6 +336,7 @@ class CalibrationNode(AnsweringNode):
         return 0 if believed and (stamp.sec or stamp.nanosec) else self.get_clock().now().nanoseconds
 
     def _feed_dvl(self, message: Any, received_ns: int) -> None:
+        """Feed a DVL message, and publish its corrected velocity."""
         self._update_mounting(message)
         self._subtract_clock_offsets()
         self._newest_dvl = message
@@ -341,6 +345,7 @@ class CalibrationNode(AnsweringNode):
             self._publish_corrected(sample)
 
     def _feed_imu(self, message: Any, received_ns: int) -> None:
+        """Feed an IMU message, also to the check of gravity."""
         if self._awaits_heading_std:
             self._use_claimed_heading_std(message)
         self._gravity.add(message)
@@ -364,6 +369,7 @@ class CalibrationNode(AnsweringNode):
             self._publish_estimate()
 
     def _publish_estimate(self) -> None:
+        """Publish the errors estimated by the selected model, and use them for the following samples."""
         calibrator = self._calibrator
         model = MODELS[calibrator.selected]
         self._published = (model.name, calibrator.n_given(model.name))
@@ -431,6 +437,7 @@ class CalibrationNode(AnsweringNode):
         self._mounting.publish(pose, stamp, parameters.base_frame, decoder.dvl_frame or "dvl_link", self._transforms)
 
     def _subtract_clock_offsets(self) -> None:
+        """Restart with the discovered clock offsets subtracted, once two estimates agree."""
         calibrator = self._calibrator
         parameters = self._late_clocks.parameters(calibrator.registration_so_far, calibrator.parameters)
         if parameters is not None:
@@ -467,6 +474,7 @@ class CalibrationNode(AnsweringNode):
         self._water, self._newest_dvl = self._water_heard.hear(subscribed, dvl), None
 
     def _topic_problems(self) -> list[Reason]:
+        """Return the problems with publishers and subscribers of all topics."""
         type_parameters = {"dvl/twist": "dvl_type", "gnss/twist": "gnss_type"}
         problems: list[Reason] = []
         for topic, subscription in self._inputs.items():
@@ -478,6 +486,7 @@ class CalibrationNode(AnsweringNode):
     # ------------------------------------------------------------------ services, parameters
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Forget all samples and restart from the parameters' prior."""
         self._calibrator.reset()
         self._feed.forget()
         self._gravity = GravitySeen()
@@ -508,6 +517,7 @@ class CalibrationNode(AnsweringNode):
         return response
 
     def _save(self, path: Path, save: Callable[..., None] = save_unless_worse) -> None:
+        """Save the result and publish the mounting. Raises InputError, after noting it for /diagnostics."""
         self._save_problem = None
         try:
             with self._calibrator.settled():  # what is published is what is saved
@@ -530,6 +540,7 @@ class CalibrationNode(AnsweringNode):
             check_outputs({"result_file": Path(name)}, self._parameter_files)
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Refuse changed parameters that are invalid, or a result file that cannot be written."""
         try:
             changed = self._changed(parameters)
             check_model(changed)
@@ -541,6 +552,7 @@ class CalibrationNode(AnsweringNode):
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
+        """Use changed parameters, and publish the estimate if they select another model."""
         before = self._calibrator.selected
         self._calibrator.set_parameters(self._changed(parameters))
         self._feed.decoder.parameters = self._calibrator.parameters

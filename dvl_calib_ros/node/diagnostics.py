@@ -264,6 +264,7 @@ def _scale_and_delay_values(estimate: Estimate, parameters: Parameters) -> dict[
 
 
 def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
+    """Return the cause of the scale error and the speed of sound to set, as text."""
     if cause is None:
         return {}
     setting = "-" if math.isnan(cause.setting) else f"{cause.setting:.1f}"
@@ -275,6 +276,7 @@ def _cause_values(cause: CauseOfScale | None) -> dict[str, str]:
 
 
 def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) -> dict[str, str]:
+    """Return the counts of samples by use, and of messages by stream and reason, as text."""
     values, model = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}, MODELS[estimate.model]
     if not model.from_positions:  # these models use positions instead of DVL samples
         where = whereabouts(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)

@@ -100,6 +100,7 @@ def parameter_files(args: Sequence[str]) -> list[Path]:
 
 
 def _refused(error: Exception | str) -> int:
+    """Print why the node cannot start. Return exit code 2."""
     from ..standard_streams import say
 
     say(f"calibration_node: {' '.join(str(error).split())}")

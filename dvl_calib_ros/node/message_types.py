@@ -106,6 +106,7 @@ def fill(message: Any, kind: VelocityType, sample: DvlSample | ReferenceSample, 
 
 
 def _first(message: Any, paths: tuple[str, ...]) -> Any:
+    """Return the first vector that exists below these attribute paths. Raises ValueError without any."""
     for path in paths:
         try:
             found = attrgetter(path)(message)
@@ -117,6 +118,7 @@ def _first(message: Any, paths: tuple[str, ...]) -> Any:
 
 
 def _put_covariance(message: Any, covariance: Any) -> None:
+    """Fill the velocity covariance (3, 3) (m/s)² into the fields that the message has."""
     if hasattr(message, "fom"):
         message.fom = 0.0 if covariance is None else math.sqrt(float(np.linalg.eigvalsh(covariance)[-1]))
     if hasattr(message, "twist"):

@@ -33,6 +33,7 @@ class AnsweringNode(Node):  # type: ignore[misc]
         """Create a service; a request that raises an error is logged and answered with an empty response."""
 
         def answer(request: Any, response: Any) -> Any:
+            """Run the callback; log an error and answer with an empty response if it raises."""
             try:
                 return _printable(callback(request, response))
             except Exception as error:  # rclpy raises ValueError for an unknown parameter type
@@ -63,6 +64,7 @@ def _printable(response: Any) -> Any:
 
 
 def _or_refused(topic: str, make: Callable[[], Any]) -> Any:
+    """Make a publisher or subscription. Raises InputError for an invalid name or type."""
     try:
         return make()
     # rclpy raises its own type for names, the middleware another for one topic with two types

@@ -192,6 +192,7 @@ def _play(
 
 
 def _imu(sample: Any) -> Any:
+    """Return an IMU sample as a message without acceleration."""
     message = Imu()
     set_stamp(message.header.stamp, sample.stamp_ns)
     message.header.frame_id = "base_link"

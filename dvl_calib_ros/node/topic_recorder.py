@@ -87,6 +87,7 @@ class TopicRecorder:
         self._subscriptions = []
 
     def _take(self, channel: Channel, data: bytes) -> None:
+        """Write a received message and count it, until writing fails."""
         if self.failed is not None:
             return
         try:

@@ -51,6 +51,7 @@ class Transforms:
         self.heard += 1
 
     def _on_transforms(self, message: Any) -> None:
+        """Keep the newest transform of each child frame, except this node's own."""
         others = [each for each in message.transforms if each not in self._own]
         for each in others:
             if len(self._transforms) < MOST_TRANSFORMS:

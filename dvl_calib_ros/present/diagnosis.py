@@ -66,6 +66,7 @@ TWINS_NOTE = (
 
 
 def _calibration(series: DiagnosisSeries) -> str:
+    """Return misalignment and scale error per axis with 1 σ, as a sentence."""
     angle_std, scale_std = np.split(series.calibration_std, 2)
     angles, scales = (
         ", ".join(
@@ -223,6 +224,7 @@ def _drift_sentences(d: Diagnosis) -> list[str]:
 
 
 def _numbers(d: Diagnosis) -> list[Number]:
+    """Return error, closed share of the gap, noise level and unexplained error as main quantities."""
     gap = d.gap
     found = [Number("error", f"{mm(gap.before)} mm/s", note="held-out rms, noise included")]
     if d.effects:
@@ -299,6 +301,7 @@ DETECTABLE: Columns[Detectable] = {
 
 
 def _detectable(d: Diagnosis) -> Iterator[Detectable]:
+    """Yield the smallest detectable size of each parameter of each tested effect."""
     for name, sizes in d.minimum_detectable.items():
         specs = {spec.name: spec for spec in EFFECTS[name].parameters} if name in EFFECTS else {}
         for i, (parameter, size) in enumerate(sizes.items()):

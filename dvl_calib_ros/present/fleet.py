@@ -225,6 +225,7 @@ COMPASS: Columns[tuple[str, CompassDeviation]] = {
 
 
 def _trend(name: str, compared: Comparison) -> Section:
+    """Return the section of a vehicle's angles and scale over time."""
     shown: list[Item] = [Sentence(each.full_sentence) for each in reasons(compared)]
     components = tuple(each.component for each in _ANGLES_AND_SCALE)
     shown.append(figures("comparison_figures.trend", compared, components))

@@ -104,6 +104,7 @@ _STREAMS = (("dvl", "DVL"), ("reference", "GNSS velocity"), ("imu", "IMU"), ("pa
 
 
 def _when(run: Replayed) -> str:
+    """Return the first and last stamp in UTC and the duration, as text."""
     result = run.result
     if result.first_ns is None or result.last_ns is None:
         return "nothing"
@@ -238,6 +239,7 @@ def straight_kilometre(result: Result) -> tuple[float, float]:
 
 
 def _answer(verification: Verification | None) -> Answer:
+    """Return the verdict of the held-out data with its reasons and advice."""
     if verification is None:
         return Answer("not verified", Severity.MARGINAL, ["Nothing was held back to verify the calibration on."])
     reasons = [*verification.reasons]

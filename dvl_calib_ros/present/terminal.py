@@ -91,6 +91,7 @@ def _groups(columns: Sequence[Column], needed: Sequence[int], width: int) -> lis
 
 
 def _part(table: RichTable, places: Sequence[int]) -> RichTable:
+    """Copy some columns of a table, by their indices."""
     part = RichTable(box=table.box, show_header=table.show_header, pad_edge=table.pad_edge)
     for at in places:
         column = table.columns[at]
@@ -102,6 +103,7 @@ def _part(table: RichTable, places: Sequence[int]) -> RichTable:
 
 
 def _lines(console: Console, table: RichTable) -> RenderResult:
+    """Yield the table with each cell on a line of its own, after its column's heading."""
     cells = [list(column.cells) for column in table.columns]
     for values in zip(*cells, strict=True):
         for at, (column, value) in enumerate(zip(table.columns, values, strict=True)):
@@ -177,6 +179,7 @@ def sections_shown(document: Document) -> Iterator[Any]:
 
 
 def _found(reason: Reason) -> Iterator[Padding]:
+    """Yield a finding and, indented below it, remedy and code."""
     from rich.padding import Padding
 
     yield Padding(Text(reason.says, COLOURS[reason.severity]), (0, 0, 0, 2))
@@ -191,6 +194,7 @@ def rich_table(table: Table) -> Folding:
 
 
 def _made(table: Table) -> RichTable:
+    """Build the table for rich without fitting it to the terminal."""
     from rich import box
 
     made = RichTable(
@@ -210,6 +214,7 @@ def _made(table: Table) -> RichTable:
 
 
 def _cell(cell: str | Cell) -> Text:
+    """Return a cell as styled text, with its small second line appended."""
     from rich.text import Text
 
     if isinstance(cell, str):

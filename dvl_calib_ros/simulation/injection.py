@@ -41,6 +41,7 @@ def injection_of(name: str, given: Mapping[str, float | str]) -> Injection:
 
 
 def _effect(name: str) -> AnyEffect:
+    """Return the effect of a name. Raises InputError."""
     known: dict[str, AnyEffect] = {**EFFECTS, **NOISE_EFFECTS}
     if name not in known:
         raise InputError(

@@ -113,6 +113,7 @@ class Follower:
                 heapq.heappush(self._pending, (made.stamp_ns, next(self._number), made))
 
     def _disturbed(self, velocity: Array, motion: EffectInput, acts_on: ActsOn) -> Array:
+        """Add the noise effects of one sensor to velocities (N, 3) m/s."""
         for effect, disturbance in self._disturbances:
             if effect.acts_on is acts_on:
                 velocity = disturbance(velocity, motion)

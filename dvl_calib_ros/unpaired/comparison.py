@@ -467,6 +467,7 @@ class _Compared:
         )
 
     def _equivalent(self, name: str) -> tuple[str, ...]:
+        """Return the effects that either diagnosis cannot distinguish from this one."""
         others: list[str] = []
         for log, renamed in zip(self._logs, self._renamed, strict=True):
             for each in log.diagnosis.effects:
@@ -476,6 +477,7 @@ class _Compared:
 
 
 def _status(there: tuple[bool, bool], differ: bool) -> ComparisonStatus:
+    """Return the status of an effect from its presence on (vehicle, simulator) and whether the sizes differ."""
     if there[0] and there[1]:
         return ComparisonStatus.OTHER_SIZE if differ else ComparisonStatus.ALIKE
     if not differ:
@@ -484,6 +486,7 @@ def _status(there: tuple[bool, bool], differ: bool) -> ComparisonStatus:
 
 
 def _noise(candidate: Candidate, p: float) -> ComparedNoise:
+    """Return a noise property as compared, at its adjusted p."""
     differ = p < LEVEL and candidate.matters
     status = _status(candidate.there, differ) if any(candidate.there) else ComparisonStatus.ALIKE
     if status is ComparisonStatus.CANNOT_TELL:
@@ -507,6 +510,7 @@ def _not_shown(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str,
 def _verdict(
     effects: Sequence[ComparedEffect], noise: Sequence[ComparedNoise], vehicle: Diagnosis, simulator: Diagnosis
 ) -> SimulatorVerdict:
+    """Return the verdict: effects weigh more than noise, and a difference more than missing excitation."""
     if any(each.status.is_claim for each in effects):
         return SimulatorVerdict.DIFFERENT
     if any(each.status.is_claim for each in noise):
@@ -553,6 +557,7 @@ def _reasons(
 
 
 def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> UnpairedComparison:
+    """Return the comparison for sides of which at least one could not be diagnosed."""
     reasons = tuple(
         finding("SIMULATOR_NOTHING_COMPARED", side=side, why=diagnosis.reasons)
         for side, diagnosis in (("vehicle", vehicle), ("simulator", simulator))

@@ -123,6 +123,7 @@ def _exact(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _dropouts(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the shares of missing and refused messages."""
     counts = [
         (sum(f.missing + f.refused for f in log.facts), sum(f.received for f in log.facts))
         for log in (vehicle, simulator)
@@ -137,6 +138,7 @@ def _zeros(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _repeats(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the shares of repeated samples; None for a DVL without noise."""
     if vehicle.exact or simulator.exact:
         return None  # at a constant velocity the truth repeats itself
     counts = [(sum(f.repeats for f in log.facts), sum(f.received for f in log.facts)) for log in (vehicle, simulator)]
@@ -144,6 +146,7 @@ def _repeats(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the sample rates, Hz; None if one is unknown."""
     rates = [1.0 / float(np.median([f.interval for f in log.facts])) for log in (vehicle, simulator)]
     if not np.isfinite(rates).all():
         return None
@@ -153,6 +156,8 @@ def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
 
 
 def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the standard deviation of the steps between stamps, s."""
+
     def of(log: Log) -> Array:
         return np.concatenate([_blocks(_usual(f.steps), lambda b: np.std(b, axis=1)) for f in log.facts])
 
@@ -166,6 +171,8 @@ def _usual(steps: Array) -> Array:
 
 
 def _latency(vehicle: Log, simulator: Log) -> Candidate | None:
+    """Compare the median delay from stamp to log time, s."""
+
     def of(log: Log) -> Array:
         return np.concatenate([_blocks(f.latency, lambda b: np.median(b, axis=1)) for f in log.facts])
 

@@ -124,6 +124,7 @@ class Tables:
         return Salvaged(*self._made[channel_id], log_ns, data)
 
     def _of(self, channel: Channel) -> tuple[str, str, str, str]:
+        """Return topic, type, encoding and definition of a channel, empty where the schema is missing."""
         known = self.schemas.get(channel.schema_id)
         if known is None:
             return channel.topic, "", "", ""

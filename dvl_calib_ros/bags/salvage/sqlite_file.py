@@ -152,6 +152,7 @@ class _Pages:
         return page
 
     def _row(self, page: bytes, at: int) -> _TableRow:
+        """Return the row of a table's leaf page at an offset. Raises ValueError."""
         size, at = _varint(page, at)
         number, at = _varint(page, at)
         if size > min(LARGEST_RECORD, self.count * self.size):
