@@ -65,13 +65,13 @@ class _RawFile(io.RawIOBase):
 
     def _read(self, size: int, at: int) -> bytes:
         """Read bytes; after an error read halves, so that a bad sector costs no more than itself."""
-        data = self._attempt(size, at)
+        data = self._read_once(size, at)
         if data is not None:
             return data
         size = min(size, os.fstat(self._descriptor).st_size - at)
         next_sector = (at // SECTOR + 1) * SECTOR
         if at + size <= next_sector:
-            data = self._attempt(size, at)  # a single failure may be transient
+            data = self._read_once(size, at)  # a single failure may be transient
             if data is None:
                 self._note(at, at + size)
                 return bytes(size)
@@ -79,7 +79,7 @@ class _RawFile(io.RawIOBase):
         middle = max((at + size // 2) // SECTOR * SECTOR, next_sector)
         return self._read(middle - at, at) + self._read(at + size - middle, middle)
 
-    def _attempt(self, size: int, at: int) -> bytes | None:
+    def _read_once(self, size: int, at: int) -> bytes | None:
         """Read once; None if the disk cannot read it."""
         try:
             return os.pread(self._descriptor, size, at)

@@ -185,13 +185,13 @@ def open_source(path: Path, new_folder: NewFolder, notes: list[str], shown: Path
     kinds = {MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
     kind = next((kinds[each] for each in kinds if magic.startswith(each)), storage_suffix(shown))
     if kind == ".mcap":
-        return _opened(path, shown, _open_mcap, salvage_mcap, notes)
+        return _open_or_salvage(path, shown, _open_mcap, salvage_mcap, notes)
     if kind == ".db3":
-        return _opened(with_journal(path, new_folder, notes), shown, _open_sqlite, salvage_sqlite, notes)
+        return _open_or_salvage(with_journal(path, new_folder, notes), shown, _open_sqlite, salvage_sqlite, notes)
     raise InputError(f"{shown}: no bag; give a rosbag2 folder, or a .mcap, .db3 or .bag file")
 
 
-def _opened(
+def _open_or_salvage(
     path: Path,
     shown: Path,
     by_index: Callable[[Path, Path, list[str]], Source | None],

@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         if not saved.exists():
             log.seek(0)
             raise InputError(f"the node did not save a result; its log: {log.read()[-2000:]}")
-        offline = _offline(bag, latency, with_history=arguments.report is not None)
+        offline = _replay_offline(bag, latency, with_history=arguments.report is not None)
         agree = _compare(out, saved, offline.result)
     _show_diagnosis(out, bag)
     if arguments.report is not None:
@@ -114,7 +114,7 @@ def _truth() -> dict[str, float]:
     return angles | {"delta_k": 100.0 * scale[0]}
 
 
-def _offline(bag: Path, latency: str, with_history: bool) -> Replayed:
+def _replay_offline(bag: Path, latency: str, with_history: bool) -> Replayed:
     """Replay the bag with the node's latency."""
     from ..bag_replay.replay import replay
     from ..files.parameter_files import load_parameters
@@ -185,7 +185,7 @@ def take_domain() -> int:
     It stays reserved until `give_back` or the end of this process. Raises InputError if there is none.
     """
     for domain in random.sample(DOMAINS, len(DOMAINS)):
-        if _take(domain):
+        if _claim_domain(domain):
             if not _has_participant(domain):
                 return domain
             give_back(domain)
@@ -199,7 +199,7 @@ def give_back(domain: int) -> None:
     _taken.pop(domain).close()
 
 
-def _take(domain: int) -> bool:
+def _claim_domain(domain: int) -> bool:
     """Claim a ROS domain for this process; return whether it was free."""
     claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
     try:

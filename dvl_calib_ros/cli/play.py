@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..bags.reader import BagReader
     from ..errors import InputError
 
-    _check(arguments)
+    _check_arguments(arguments)
     start, duration = arguments.start_offset, arguments.playback_duration
     with common.ros_node("play", "dvl_calib_player") as (node, ending):
         from ..demo.player import BagPlayer, wait_until
@@ -106,7 +106,7 @@ def _wait_for_subscribers(player: BagPlayer, has_ended: Callable[[], bool]) -> N
         time.sleep(BREATH_S)
 
 
-def _check(arguments: argparse.Namespace) -> None:
+def _check_arguments(arguments: argparse.Namespace) -> None:
     """Raise InputError for an option outside its range."""
     from ..errors import InputError
 

@@ -81,7 +81,7 @@ def run_and_watch(ros_arguments: Sequence[str], ending: Ending) -> int:
             show(common.console(), listener, lambda: process.poll() is None and not ending.requested, log.lines, True)
             n_shown = len(log.lines) if process.poll() is None else 0  # number of lines already on the screen
         finally:
-            code = _ended(process)
+            code = _end_process(process)
         for text in log.finished()[n_shown:]:
             say(text)
     return code
@@ -100,7 +100,7 @@ def node_command(ros_arguments: Sequence[str]) -> list[str]:
     return [sys.executable, "-m", "dvl_calib_ros.node.main", ENDS_WITH_STDIN, *ros_arguments]
 
 
-def _ended(process: subprocess.Popen[bytes]) -> int:
+def _end_process(process: subprocess.Popen[bytes]) -> int:
     """Ask the node to end by closing its standard input; kill it after `PATIENCE_S`. Return its exit code."""
     assert process.stdin is not None  # a pipe
     process.stdin.close()
@@ -230,7 +230,7 @@ class View:
         lines = 1 if width >= WIDE else 2
         return [
             state,
-            _goal(status, *GOALS[0], width),
+            _goal_row(status, *GOALS[0], width),
             Row(following, "bold green" if "GOOD" in code else "bold", most=lines, least=lines),
             Row(KEYS, "dim", most=lines),
             Row("" if self.event in warnings else self.event, "cyan", most=4 if "(y/n)" in self.event else 2),
@@ -273,8 +273,8 @@ def _body(status: Status, warnings: Sequence[str], width: int) -> Iterator[Row]:
         yield from first
     yield from between
     yield Row("   ".join(_stream(status, *each) for each in STREAMS))
-    yield from (_goal(status, *each, width) for each in GOALS[1:] if f"goal {each[0]} [%]" in status.values)
-    yield Row(_rose(status))
+    yield from (_goal_row(status, *each, width) for each in GOALS[1:] if f"goal {each[0]} [%]" in status.values)
+    yield Row(_heading_bars(status))
 
 
 def _duration(text: str, rough: bool = False) -> str:
@@ -310,7 +310,7 @@ def _quantity(status: Status, name: str, unit: str, shown: str) -> str:
     return f"{name:5} {value:>7}" + (f" ±{std}{shown}" if is_estimated else f"{shown}, as set").ljust(11)
 
 
-def _goal(status: Status, key: str, shown: str, width: int) -> Row:
+def _goal_row(status: Status, key: str, shown: str, width: int) -> Row:
     """Return one row with a value, its progress bar, and the predicted drift."""
     percent = min(_number(status.get(f"goal {key} [%]")), 100.0)
     names = {"worth": "worth", "side": "worth to the side", "ahead": "worth ahead"}
@@ -321,7 +321,7 @@ def _goal(status: Status, key: str, shown: str, width: int) -> Row:
     return Row(text, "green" if percent >= 100.0 else "yellow")
 
 
-def _rose(status: Status) -> str:
+def _heading_bars(status: Status) -> str:
     """Return the time driven on each sector of headings as a row of bars."""
     driven = [_number(status.get(f"driven {sector} [s]")) for sector in SECTORS]
     most = max(max(driven), 1.0)
@@ -415,7 +415,7 @@ def show(
     terminal the view is drawn in place; elsewhere a line is written after a change, or periodically.
     """
     if not console.is_terminal or console.is_dumb_terminal:
-        for text in _lines(listener.latest, is_running):
+        for text in _log_lines(listener.latest, is_running):
             console.print(text, markup=False, soft_wrap=True)
         return
     from rich.live import Live
@@ -440,7 +440,7 @@ def _message(logged: str) -> str:
     return re.sub(r"^\[(\w+)\] \[[\d.]+\] \[[^\]]*\]: ", "", logged)
 
 
-def _lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:
+def _log_lines(statuses: Callable[[float], Status | None], is_running: Callable[[], bool]) -> Iterable[str]:
     """Yield a line when model, convergence or severity change, and at least every `LINE_S`."""
     printed, printed_s = ("", "", ""), 0.0
     told_s = time.monotonic()

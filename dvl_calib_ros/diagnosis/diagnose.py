@@ -96,7 +96,7 @@ def diagnose_recordings(
     for recording in recordings:
         check_clocks(recording, parameters.rotation_dvl_from_body)
     available = frozenset.intersection(*(recording.available for recording in recordings))
-    untestable = {name: why for name, effect in effects.items() if (why := _lacks(effect, available, recordings))}
+    untestable = {name: why for name, effect in effects.items() if (why := _missing(effect, available, recordings))}
     try:
         selection = select(
             recordings,
@@ -129,7 +129,7 @@ def diagnose_recordings(
     unmoved, covariance = covariance, with_open(selection.fit, covariance, selection.opened)
     covariance = with_moved(selection.fit, covariance, selection.moved)
     found = tuple(
-        _found(selection, each, covariance, unmoved, times, len(testable), gap) for each in selection.selected
+        _found_effect(selection, each, covariance, unmoved, times, len(testable), gap) for each in selection.selected
     )
     columns = rest.columns
     if selection.selected and not (verdict is DiagnosisVerdict.UNKNOWN and rest.found):
@@ -172,7 +172,7 @@ def _check_bounds(selection: EffectSelection) -> None:
             )
 
 
-def _lacks(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequence[RecordedStreams]) -> str:
+def _missing(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequence[RecordedStreams]) -> str:
     """Return the inputs that an effect needs and recordings lack, '' if none."""
     lacking = [need.value for need in effect.needs - available]
     if effect.relative_to_first and len(recordings) < 2:
@@ -270,7 +270,7 @@ def _is_visible(effect: Effect, sizes: Mapping[str, float]) -> bool:
     return any(size <= VISIBLE_TIMES_TYPICAL * typical[name] for name, size in sizes.items())
 
 
-def _found(
+def _found_effect(
     selection: EffectSelection,
     selected: Selected,
     covariance: Array,

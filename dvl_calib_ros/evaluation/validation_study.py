@@ -103,7 +103,7 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
         models: Sequence[str], stretch: SensorData, windows: Sequence[float | None], own_window: float | None
     ) -> RunOutcome:
         """Calibrate on a stretch after each window, and evaluate on all other runs."""
-        others = _others(moments, stretch.run.name)
+        others = _moments_of_others(moments, stretch.run.name)
         ends = [stretch.run.first(window) for window in windows]
         return _calibrate_once(models, stretch, ends, windows.index(own_window), others, procedure, failures)
 
@@ -114,7 +114,7 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
     baselines = np.array(
         [
             [
-                float(vrmse(_others(moments, each.calibration_run), matrices).mean())
+                float(vrmse(_moments_of_others(moments, each.calibration_run), matrices).mean())
                 for matrices in _baselines(data(each.calibration_run), each.window_s, failures)
             ]
             for each in procedure.sets
@@ -129,7 +129,7 @@ def run_seed(procedure: Procedure, seed: int) -> SeedOutcome:
         by_set=by_set,
         each=tuple(outcome(procedure.studied, data(name), [None], None) for name in with_attitude),
         single_heading=tuple(
-            outcome(procedure.studied, _part(data(name), start, end), [None], None) for name, start, end in legs
+            outcome(procedure.studied, _part_of_data(data(name), start, end), [None], None) for name, start, end in legs
         ),
         baselines=baselines,
         convergence=np.stack(
@@ -162,7 +162,7 @@ def _of_seed(failures: Sequence[Failure], seed: int) -> tuple[Failure, ...]:
     return tuple(replace(each, seed=seed) for each in failures)
 
 
-def _others(moments: Mapping[str, RunMoments], name: str) -> RunMoments:
+def _moments_of_others(moments: Mapping[str, RunMoments], name: str) -> RunMoments:
     return RunMoments.stack([each for other, each in moments.items() if other != name])
 
 
@@ -204,7 +204,7 @@ def references(run: Trajectory, seed: int, gnss_std: float = protocol.GNSS_STD) 
     )
 
 
-def _part(data: SensorData, start: int, end: int) -> SensorData:
+def _part_of_data(data: SensorData, start: int, end: int) -> SensorData:
     return SensorData(data.run.part(start, end), data.velocity_dvl[:, start:end], data.reference[:, start:end])
 
 
@@ -257,16 +257,16 @@ def runs_with_attitude(runs: Mapping[str, Trajectory]) -> list[str]:
 
 def each_runs(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
     """Return the calibration runs of `SeedOutcome.each`."""
-    return tuple(_described(runs[name], 0, len(runs[name].time)) for name in runs_with_attitude(runs))
+    return tuple(_calibration_run(runs[name], 0, len(runs[name].time)) for name in runs_with_attitude(runs))
 
 
 def single_headings(runs: Mapping[str, Trajectory]) -> tuple[CalibrationRun, ...]:
     """Return the calibration runs of `SeedOutcome.single_heading`."""
     legs = [leg for name in runs_with_attitude(runs) for leg in _legs(runs[name])]
-    return tuple(_described(runs[name], start, end) for name, start, end in legs)
+    return tuple(_calibration_run(runs[name], start, end) for name, start, end in legs)
 
 
-def _described(run: Trajectory, start: int, end: int) -> CalibrationRun:
+def _calibration_run(run: Trajectory, start: int, end: int) -> CalibrationRun:
     """Return a stretch of samples start .. end - 1 with its times and spread of headings."""
     rotation = run.rotation_enu_from_body
     assert rotation is not None  # only runs with attitude get here

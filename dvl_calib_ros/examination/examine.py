@@ -181,7 +181,7 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
         discovery,
         tuple(findings),
         float(np.median(np.linalg.norm(velocity, axis=1))) if len(velocity) else 0.0,
-        () if replayed is None or "reference" not in streams else _shown(replayed),
+        () if replayed is None or "reference" not in streams else _observability(replayed),
         recording.notes,
         judged,
         reasons,
@@ -384,7 +384,7 @@ class Shown:
     needs: str
 
 
-def _shown(replayed: Replayed) -> tuple[Shown, ...]:
+def _observability(replayed: Replayed) -> tuple[Shown, ...]:
     """Return the observability of roll, pitch, yaw and scale; nothing if no sample was usable."""
     result = replayed.result
     if not result.estimate.used:

@@ -158,7 +158,7 @@ def load_calibrated_mounting(path: Path) -> CalibratedMounting:
         raise InputError(
             f"{path}: mounting is for frame {frames[1]!r}, parameters for {parameters.dvl_frame!r}; save it again"
         )
-    doubts += _unobservable(model, state, parameters)
+    doubts += _unobservable_angles(model, state, parameters)
     delay = scale_and_delay(model, state, parameters).time_offset
     of_scale = None
     if water is not None:
@@ -199,7 +199,7 @@ def _saved_warnings(content: Mapping[str, Any], *severities: Severity) -> tuple[
     return tuple(str(each["says"]) for each in content.get("doubts", ()) if each["severity"] in wanted)
 
 
-def _unobservable(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
+def _unobservable_angles(model: Model, state: GaussianState, parameters: Parameters) -> tuple[str, ...]:
     """Return a sentence with 1 σ for each angle that was not observable."""
     entries = [each for each in observability(model, state.p, parameters)[:3] if not each.observed]
     return tuple(
@@ -470,7 +470,7 @@ def write_calibration(
     """
     if targets.paths:
         calibrated.check_applicable(force)
-    contents, notes = _contents(calibrated, targets, force)
+    contents, notes = _new_contents(calibrated, targets, force)
     existing = [path for path in contents if own_stream(path) is None and path.exists()]
     new = {path: content for path, content in contents.items() if path not in existing or path.read_bytes() != content}
     unchanged = tuple(path for path in contents if path not in new)
@@ -489,7 +489,7 @@ def _difference(path: Path, before: bytes, after: bytes) -> str:
     return "".join(f"{printable(line)}\n" for line in lines)
 
 
-def _contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> tuple[dict[Path, bytes], list[str]]:
+def _new_contents(calibrated: CalibratedMounting, targets: Targets, force: bool) -> tuple[dict[Path, bytes], list[str]]:
     """Return new contents by file, and notes."""
     contents: dict[Path, bytes] = {}
     notes = []

@@ -147,7 +147,7 @@ def _own_sections(
     if not own_sections:  # ROS would silently use the defaults
         others = ", ".join(name for name, _ in sections)
         raise InputError(f"{path}: nothing in it is for node {node}, only for {others}; use '/**:' or the name")
-    return [(name, _flat(body)) for name, body in own_sections]
+    return [(name, _flattened(body)) for name, body in own_sections]
 
 
 def _names_for_all_nodes(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> set[str]:
@@ -198,12 +198,12 @@ def section_is_ours(node: str) -> bool:
     return fnmatch.fnmatchcase(NODE_NAME, node.rsplit("/", 1)[-1])
 
 
-def _flat(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+def _flattened(body: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
     """Join nested mappings into one, with names separated by dots."""
     values: dict[str, Any] = {}
     for key, value in body.items():
         name = f"{prefix}{key}"
-        values |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+        values |= _flattened(value, f"{name}.") if isinstance(value, dict) else {name: value}
     return values
 
 
@@ -237,7 +237,7 @@ def parameter_table() -> str:
     for name, spec in SCHEMA.items():
         about = " ".join(part for part in (spec.unit, ", ".join(spec.choices), _range(name)) if part)
         at_run_time = "" if spec.read_only else " *"
-        lines.append(f"| `{name}`{at_run_time} | {_shown(spec.default)} | {about} | {spec.description} |")
+        lines.append(f"| `{name}`{at_run_time} | {_default_text(spec.default)} | {about} | {spec.description} |")
     return "\n".join(lines) + "\n"
 
 
@@ -249,7 +249,7 @@ def model_table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _shown(default: Any) -> str:
+def _default_text(default: Any) -> str:
     """Return a default value as text for the table of parameters."""
     if isinstance(default, tuple):
         return " ".join(f"{value:g}" for value in default)

@@ -102,7 +102,7 @@ def result_document(
         "used": estimate.used,
         "gated": estimate.gated,
         "convergence": estimate.convergence.value,
-        "found": _Lines(_found(result)),
+        "found": _Lines(_found_quantities(result)),
         "mounting": {
             "static_transform_publisher": None if arguments is None else f"{_PUBLISHER} {arguments}",
             "urdf_origin": origin_tag(position, rpy_from_rotation(of_frame)),
@@ -158,7 +158,7 @@ def days_document(result: Result) -> dict[str, Any]:
     }
 
 
-def _found(result: Result) -> dict[str, str]:
+def _found_quantities(result: Result) -> dict[str, str]:
     """Return each quantity with its σ, and which configured values the model does not estimate."""
     found = {each.name: _in_words(each) for each in quantities(result)}
     configured = {"lever arm": result.parameters["lever_arm"], LATE: [result.parameters["dvl_time_offset"]]}
@@ -288,14 +288,14 @@ def _better(path: Path, document: Mapping[str, Any]) -> dict[str, Any] | None:
         return None
     if ranks[0] > ranks[1]:
         return before
-    return before if not continued and not moved and _spread(p_new) > _spread(p_old) else None
+    return before if not continued and not moved and _angle_spread(p_new) > _angle_spread(p_old) else None
 
 
 def _covariance_of_angles(mounting: Mapping[str, Any]) -> Array:
     return np.array(mounting["pose_covariance"], dtype=float)[3:, 3:]
 
 
-def _spread(covariance: Array) -> tuple[int, float]:
+def _angle_spread(covariance: Array) -> tuple[int, float]:
     """Return the number of angles that are not estimated, and the sum of variances (rad²) of the others."""
     variances = np.diag(covariance)
     return int((variances <= 0.0).sum()), float(variances[variances > 0.0].sum())
@@ -315,7 +315,7 @@ def _quality(document: Mapping[str, Any]) -> str:
 
 
 def _quality_in_words(document: Mapping[str, Any]) -> str:
-    sigma = math.degrees(math.sqrt(_spread(_covariance_of_angles(document["mounting"]))[1]))
+    sigma = math.degrees(math.sqrt(_angle_spread(_covariance_of_angles(document["mounting"]))[1]))
     return f"{_quality(document)}, ±{sigma:.2f}° of {document['used']} samples"
 
 

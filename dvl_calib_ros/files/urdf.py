@@ -65,9 +65,9 @@ class Urdf:
         base, dvl: frame ids, with or without a namespace before the link's name. joint: the DVL's own, if it is not the
         one above link `dvl`.
         """
-        chain = [self._joint(joint) if joint is not None else self._above(dvl)]
+        chain = [self._joint(joint) if joint is not None else self._joint_above(dvl)]
         while not _is_link(chain[0].parent, base):
-            above = self._above(chain[0].parent, f"; joint {chain[-1].name} does not lead to {base}")
+            above = self._joint_above(chain[0].parent, f"; joint {chain[-1].name} does not lead to {base}")
             if above in chain:
                 raise InputError(f"{self.path}: joint {above.name} is above itself")
             chain.insert(0, above)
@@ -87,18 +87,18 @@ class Urdf:
         found = [each for each in self.joints if each.name == name]
         if len(found) != 1:
             many = "more than one" if found else "no"
-            raise InputError(f"{self.path}: {many} joint {name!r}; {self._fixed()}")
+            raise InputError(f"{self.path}: {many} joint {name!r}; {self._fixed_joints_text()}")
         return found[0]
 
-    def _above(self, link: str, why: str = "") -> Joint:
+    def _joint_above(self, link: str, why: str = "") -> Joint:
         """Return the joint whose child is this link. Raises InputError unless there is exactly one."""
         found = [each for each in self.joints if _is_link(each.child, link)]
         if len(found) != 1:
             what = f"{'more than one' if found else 'no'} joint above link {link!r}{why}"
-            raise InputError(f"{self.path}: {what}; name the DVL's joint with --joint; {self._fixed()}")
+            raise InputError(f"{self.path}: {what}; name the DVL's joint with --joint; {self._fixed_joints_text()}")
         return found[0]
 
-    def _fixed(self) -> str:
+    def _fixed_joints_text(self) -> str:
         return "its fixed joints: " + (", ".join(each.name for each in self.joints if each.kind == "fixed") or "none")
 
     def moved(self, mounting: UrdfMounting, rotation_body_from_dvl: Array, position: Array | None = None) -> bytes:
@@ -211,7 +211,7 @@ class _UrdfReader:
 
     def _end(self, name: str) -> None:
         if self._open == ["robot", "joint"]:
-            self._found.append(self._finished())
+            self._found.append(self._finished_joint())
         self._open.pop()
 
     def _span(self) -> tuple[int, int]:
@@ -222,7 +222,7 @@ class _UrdfReader:
             raise InputError(f"{self.path}: its encoding cannot be edited byte for byte; save it as UTF-8")
         return found.span()
 
-    def _finished(self) -> Joint:
+    def _finished_joint(self) -> Joint:
         """Return the joint whose element has just ended."""
         attributes, origin = self._joint["joint"], self._joint.get("origin", {})
         name = attributes.get("name", "")

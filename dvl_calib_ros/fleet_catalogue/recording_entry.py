@@ -87,7 +87,7 @@ class StoredRecording:
             yield Path(self.where)
             return
         with tempfile.TemporaryDirectory(prefix="dvl_calib_fleet_") as folder:
-            store = _store(self.where)[0]
+            store = _open_store(self.where)[0]
             target = Path(folder) / PurePosixPath(self.where).name
             is_folder = [each.where for each in self.files] != [self.where]
             if is_folder:
@@ -122,8 +122,8 @@ def recordings_in(places: Sequence[str]) -> tuple[list[StoredRecording], list[st
     found: dict[str, StoredRecording] = {}
     unread: list[str] = []
     for place in places:
-        files = _local_files(place, unread) if "://" not in place or place.startswith("file://") else _stored(place)
-        for each in _grouped(*files):
+        files = _local_files(place, unread) if "://" not in place or place.startswith("file://") else _in_store(place)
+        for each in _group_into_recordings(*files):
             found.setdefault(each.where, each)
     if not found:
         raise InputError(f"{', '.join(places)}: no recording (.mcap, .db3, .bag) there or below; name another place")
@@ -177,9 +177,9 @@ def _local_file(path: str) -> StoredFile:
     return StoredFile(path, status.st_size, str(status.st_mtime_ns))
 
 
-def _stored(place: str) -> _Files:
+def _in_store(place: str) -> _Files:
     """Return root and files by folder of an object store. Raises InputError."""
-    store, root = _store(place)
+    store, root = _open_store(place)
     try:
         found: Mapping[str, Mapping[str, Any]] = store.find(root, detail=True)
     except Exception as error:  # each store has its own errors
@@ -198,7 +198,7 @@ def _stored(place: str) -> _Files:
     return place.rpartition("/")[0] if is_file else place.rstrip("/"), files
 
 
-def _store(place: str) -> tuple[Any, str]:
+def _open_store(place: str) -> tuple[Any, str]:
     """Return the store of a URL, and the path in it. Raises InputError."""
     try:
         from fsspec.core import url_to_fs
@@ -211,7 +211,7 @@ def _store(place: str) -> tuple[Any, str]:
     return store, root
 
 
-def _grouped(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterator[StoredRecording]:
+def _group_into_recordings(place: str, folders: Mapping[str, Sequence[StoredFile]]) -> Iterator[StoredRecording]:
     """Yield bags and single files: a folder is one bag if its files are numbered as rosbag2 does."""
     bags: list[str] = []
     for folder, files in sorted(folders.items()):
@@ -283,7 +283,7 @@ def entry_of(task: Task) -> Entry:
     try:
         with task.recording.at_hand() as path:
             try:
-                return _calibrated(task, path)
+                return _calibrate(task, path)
             except InputError as error:
                 return failed(where, as_text(str(error).replace(str(path), task.recording.where)))
     except Exception as error:
@@ -295,7 +295,7 @@ def failed(where: str, why: str, is_final: bool = True) -> Entry:
     return Entry([{"recording": where, "error": why}], None, is_final)
 
 
-def _calibrated(task: Task, path: Any) -> Entry:
+def _calibrate(task: Task, path: Any) -> Entry:
     """Discover topics and frames of a recording and replay it."""
     recording = open_recording([path], None, task.parameters)
     found = discover(recording, task.parameters, task.given)
@@ -331,7 +331,7 @@ def entry_of_replay(replayed: Replayed, where: str) -> Entry:
     extrinsics, without_day = (extrinsics_of_replay(each, where) for each in (replayed, _without_day(replayed)))
     extrinsics_row = None
     if extrinsics is not None and without_day is not None:
-        extrinsics_row = {**_plain(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
+        extrinsics_row = {**_plain_data(extrinsics), "covariance_of_recording": without_day.covariance.tolist()}
         extrinsics_row |= _cause(replayed)
     rows = (*_quantities(result), *_heading(estimate), *_water(replayed.water))
     return Entry([common | each for each in rows], extrinsics_row)
@@ -412,7 +412,7 @@ def _without_day(replayed: Replayed) -> Replayed:
     return replace(replayed, result=replace(replayed.result, parameters=parameters))
 
 
-def _plain(extrinsics: Extrinsics) -> dict[str, Any]:
+def _plain_data(extrinsics: Extrinsics) -> dict[str, Any]:
     return {
         name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in asdict(extrinsics).items()
     }

@@ -122,7 +122,7 @@ class Catalogue:
         """
         for path in sorted(self.rows.glob("*.parquet")):
             try:
-                part = self._part(path)
+                part = self._read_part(path)
             except InputError as error:
                 self._set_aside(path, str(error))
                 continue
@@ -133,15 +133,15 @@ class Catalogue:
         """Return the rows of a recording. Raises InputError if its part is damaged."""
         from pyarrow import parquet
 
-        content = self._whole(self._path(recording))
+        content = self._read_checked(self._path(recording))
         found: list[Row] = parquet.read_table(self._arrow.BufferReader(content)).to_pylist()
         return found
 
-    def _part(self, path: Path) -> CataloguePart:
+    def _read_part(self, path: Path) -> CataloguePart:
         """Read a file's own description. Raises InputError if it is no part, damaged, or misnamed."""
         from pyarrow import parquet
 
-        content = self._whole(path)
+        content = self._read_checked(path)
         try:
             metadata = json.loads(parquet.read_schema(self._arrow.BufferReader(content)).metadata[_KEY])
             part = CataloguePart(**metadata)
@@ -151,7 +151,7 @@ class Catalogue:
             raise InputError(f"{path}: holds {part.recording}, which belongs in a file of another name")
         return part
 
-    def _whole(self, path: Path) -> bytes:
+    def _read_checked(self, path: Path) -> bytes:
         """Read a file. Raises InputError if any bit has changed."""
         content = read_file(path, "part of a catalogue")
         if _CHECKSUM not in content or _with_checksum(content) != content:
@@ -301,10 +301,10 @@ def run_fleet(
         fingerprint = _fingerprint(each, options) if entry.is_final else ""
         catalogue.write(CataloguePart(each.name, each.vehicle(pattern), fingerprint, entry.extrinsics), entry)
         on_progress(number / len(tasks))
-    return _read(catalogue, len(to_do), len(recordings) - len(to_do), notes)
+    return _read_catalogue(catalogue, len(to_do), len(recordings) - len(to_do), notes)
 
 
-def _read(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence[str]) -> Fleet:
+def _read_catalogue(catalogue: Catalogue, calibrated: int, unchanged: int, notes: Sequence[str]) -> Fleet:
     """Read the catalogue and compute the history of each vehicle."""
     entries = [
         Catalogued.of(part.recording, part.vehicle, catalogue.rows_of(part.recording), part.extrinsics)

@@ -332,12 +332,12 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
         with socket.create_connection((parts["ipv6"] or parts["host"], port), timeout=PATIENCE_S) as connection:
             dvl = _Dvl(connection, address)
             before = dvl.ask({"command": "get_config"})
-            if all(_is(before, each.name, each.new) for each in settings):
+            if all(_is_set_to(before, each.name, each.new) for each in settings):
                 return True
             for each in settings:
-                if each.now is None or not _is(before, each.name, each.now):
+                if each.now is None or not _is_set_to(before, each.name, each.now):
                     raise InputError(
-                        f"{address}: {each.name} is {_held(before, each.name)}, and was {each.now} when the "
+                        f"{address}: {each.name} is {_number(before, each.name)}, and was {each.now} when the "
                         "data were recorded (--now), which the calibration is relative to; record again, or set "
                         "it yourself"
                     )
@@ -357,22 +357,22 @@ def configure(address: str, settings: Sequence[Setting], dry_run: bool = False) 
             ) from error
         raise InputError(f"{address}: {why}; is the DVL on, and the address right?") from error
     for each in settings:
-        if not _is(after, each.name, each.new):
+        if not _is_set_to(after, each.name, each.new):
             raise InputError(
-                f"{address}: {each.name} was set to {each.new:g} and is {_held(after, each.name)}; look at the DVL's "
+                f"{address}: {each.name} was set to {each.new:g} and is {_number(after, each.name)}; look at the DVL's "
                 "own page"
             )
     return False
 
 
-def _held(config: Any, name: str) -> float | str:
+def _number(config: Any, name: str) -> float | str:
     """Return the number that a DVL has under a name."""
     held = config.get(name) if isinstance(config, dict) else None
     return held if isinstance(held, float) else "no number"
 
 
-def _is(config: Any, name: str, value: float) -> bool:
-    held = _held(config, name)
+def _is_set_to(config: Any, name: str, value: float) -> bool:
+    held = _number(config, name)
     return isinstance(held, float) and abs(held - value) <= AS_SET
 
 
@@ -387,7 +387,7 @@ class _Dvl:
         self._connection.sendall(json.dumps(command).encode() + b"\n")
         until = time.monotonic() + PATIENCE_S
         while True:
-            line = self._line(until)
+            line = self._read_line(until)
             try:
                 answer = json.loads(line, parse_int=float)  # as float, because an integer may be too long to parse
             except (ValueError, RecursionError):
@@ -400,7 +400,7 @@ class _Dvl:
                 raise InputError(f"{self._address}: refuses {command['command']} ({why})")
             return answer.get("result")
 
-    def _line(self, until: float) -> bytes:
+    def _read_line(self, until: float) -> bytes:
         """Return the next line from the instrument. Raises TimeoutError at the monotonic time `until`."""
         while b"\n" not in self._pending:
             remaining = until - time.monotonic()

@@ -307,7 +307,7 @@ def _pd0_sample(path: Path, stamp_ns: int, data: dict[int, bytes], left_out: Cou
             left_out["in earth axes without a heading"] += 1
             return None
         roll, pitch, heading = attitude
-        turned = _turned_by(roll, pitch, heading + _pd0_alignment(data), data[_FIXED_LEADER])
+        turned = _applied_rotation(roll, pitch, heading + _pd0_alignment(data), data[_FIXED_LEADER])
         instrument = turned.T @ measured[:3]
     x, y, z = (-0.001 * _FLU_FROM_RDI @ instrument + 0.0).tolist()
     return DvlSample(stamp_ns, (x, y, z), None)
@@ -321,7 +321,7 @@ def _instrument_from_beams(fixed: bytes) -> Array:
     return np.array([[a, -a, 0.0, 0.0], [0.0, 0.0, -a, a], [b, b, b, b]])
 
 
-def _turned_by(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
+def _applied_rotation(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
     """Return the rotation (3, 3) that the instrument applied: by beam 3's heading and, if set, by its tilts.
 
     (Same document, eq. 18.) Its transpose undoes it, whatever the accuracy of the heading.

@@ -379,7 +379,7 @@ def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float
         raise InputError(f"{path}: cannot be read as text ({error}); save it in UTF-8") from error
     first = next((line for line in lines if line.strip()), "")
     rows = [row for row in csv.reader(lines, delimiter=max(_SEPARATORS, key=first.count)) if row]
-    at = {key: [_place(path, rows[:1], name) for name in names[key].split("+")] for key in names}
+    at = {key: [_column_index(path, rows[:1], name) for name in names[key].split("+")] for key in names}
     covariance = np.eye(3) * std**2 if std else None
     samples: list[DvlSample] = []
     left_out: Counter[str] = Counter()
@@ -411,7 +411,7 @@ def _is_header(rows: Sequence[Sequence[str]], place: int) -> bool:
         return True
 
 
-def _place(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
+def _column_index(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
     """Return the index of a column by its name, its name without the unit, or its number. Raises InputError."""
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     wanted = name.strip().lower()
@@ -428,13 +428,13 @@ def _stamp_ns(text: str, start_ns: int) -> int:
     try:
         seconds = float(text)
     except ValueError:
-        at = _moment(text)
+        at = _parse_time(text)
         at = at if at.tzinfo is not None else at.replace(tzinfo=timezone.utc)
         return int(at.replace(microsecond=0).timestamp()) * 1_000_000_000 + at.microsecond * 1000
     return round(seconds * 1e9) + (0 if seconds >= _SINCE_1970_S else start_ns)
 
 
-def _moment(text: str) -> datetime:
+def _parse_time(text: str) -> datetime:
     """Parse a date and time in one of the common formats. Raises ValueError."""
     for form in _FORMATS:
         try:

@@ -37,7 +37,7 @@ class OfWater(NamedTuple):
     std: float = 0.0
 
 
-def _used(field: str) -> Callable[[Any], float]:
+def _sound_speed_in_use(field: str) -> Callable[[Any], float]:
     """Return a reader of the speed of sound that the velocities depend on; nan for a phased array."""
 
     def read(message: Any) -> float:
@@ -52,8 +52,8 @@ _OF_TYPES: Mapping[str, Mapping[str, Callable[[Any], float]]] = {
     "sensor_msgs/msg/Temperature": {"temperature": attrgetter("temperature")},
     "sensor_msgs/msg/FluidPressure": {"pressure": attrgetter("fluid_pressure")},
     "ds_sensor_msgs/msg/Ctd": {"temperature": attrgetter("temperature"), "salinity": attrgetter("salinity")},
-    "marine_acoustic_msgs/msg/Dvl": {"used": _used("sound_speed")},
-    "ds_sensor_msgs/msg/Dvl": {"used": _used("speed_sound")},
+    "marine_acoustic_msgs/msg/Dvl": {"used": _sound_speed_in_use("sound_speed")},
+    "ds_sensor_msgs/msg/Dvl": {"used": _sound_speed_in_use("speed_sound")},
 }
 
 

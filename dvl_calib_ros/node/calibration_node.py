@@ -95,7 +95,7 @@ class CalibrationNode(AnsweringNode):
         kalman.prepare()
         self._worker = ThreadPoolExecutor(1, "g2")
         self._initial = initial
-        self._begin(parameters, initial)
+        self._start(parameters, initial)
         # a saved calibration belongs to the mounting that it was saved with
         self._transforms = Transforms(self) if parameters.use_transforms and initial is None else None
         self._transforms_tried: tuple[int, tuple[str, str, str]] = (0, ("", "", ""))
@@ -209,7 +209,7 @@ class CalibrationNode(AnsweringNode):
             old = self._inputs[name_used]
             self._subscribe(classes[name_used], name_used)
             self.destroy_subscription(old)
-        self._begin(parameters, self._initial)
+        self._start(parameters, self._initial)
         self._adapted = self._feed.decoder.adapted
         self._awaits_heading_std = self._awaits_heading_std and "heading_deviation_std" not in discovery.values
         now_s = self._pauses.running_s(steady_s())
@@ -217,7 +217,7 @@ class CalibrationNode(AnsweringNode):
         self._silence, self._recent, self._card = Silence(now_s, heard), RecentCounts(), Card(now_s)
         self._correction, self._mounting_published = None, ("", 0)
 
-    def _begin(
+    def _start(
         self, parameters: Parameters, initial: Mapping[str, GaussianState] | None, feed: MessageFeed | None = None
     ) -> None:
         """Start a calibration with these parameters. feed: its earlier messages are fed again."""
@@ -256,8 +256,8 @@ class CalibrationNode(AnsweringNode):
         self._restart(parameters.replace(**found.values))
 
     def _restart(self, parameters: Parameters, feed: MessageFeed | None = None) -> None:
-        """Restart as `_begin`, without the previous initial calibration and published values."""
-        self._begin(parameters, None, feed)
+        """Restart as `_start`, without the previous initial calibration and published values."""
+        self._start(parameters, None, feed)
         self._corrected.header.frame_id = self._calibrator.parameters.base_frame
         self._recent, self._correction = RecentCounts(), None
         self._mounting_published = self._iac_published = ("", 0)
@@ -359,7 +359,7 @@ class CalibrationNode(AnsweringNode):
         self._awaits_heading_std = False
         std = believed_heading(claimed)
         if std is not None:
-            self._begin(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial, self._feed)
+            self._start(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial, self._feed)
 
     # ------------------------------------------------------------------ output
 
@@ -455,7 +455,7 @@ class CalibrationNode(AnsweringNode):
         problems = [*self._found, *decoder.problems.values(), *self._topic_problems(), *self._late_clocks.found]
         problems += self._gravity.problems(self._inputs["imu/data"].topic_name, self._calibrator.parameters)
         problems += self._mounting.problems(decoder.dvl_frame or "dvl_link", self._transforms)
-        self._hear_water()
+        self._read_water()
         if self._save_problem:
             problems.append(self._save_problem)
         now_s = self._pauses.running_s(steady_s())
@@ -468,7 +468,7 @@ class CalibrationNode(AnsweringNode):
         message.header.stamp = self.get_clock().now().to_msg()
         self._diagnostics_publisher.publish(message)
 
-    def _hear_water(self) -> None:
+    def _read_water(self) -> None:
         subscribed = [subscription.topic_name for subscription in self._inputs.values()]
         dvl = (self._inputs["dvl/twist"].topic_name, self._feed.decoder.dvl_type.name, self._newest_dvl)
         self._water, self._newest_dvl = self._water_heard.hear(subscribed, dvl), None
@@ -542,7 +542,7 @@ class CalibrationNode(AnsweringNode):
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse changed parameters that are invalid, or a result file that cannot be written."""
         try:
-            changed = self._changed(parameters)
+            changed = self._changed_parameters(parameters)
             check_model(changed)
             if changed.result_file != self._calibrator.parameters.result_file and changed.result_file:
                 check_in_folder(Path(changed.result_file), self._result_folder)
@@ -554,13 +554,13 @@ class CalibrationNode(AnsweringNode):
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
         """Use changed parameters, and publish the estimate if they select another model."""
         before = self._calibrator.selected
-        self._calibrator.set_parameters(self._changed(parameters))
+        self._calibrator.set_parameters(self._changed_parameters(parameters))
         self._feed.decoder.parameters = self._calibrator.parameters
         if self._calibrator.selected != before:
             self.info(f"running {self._calibrator.selected} instead of {before}")
             self._publish_estimate()
 
-    def _changed(self, parameters: list[Parameter]) -> Parameters:
+    def _changed_parameters(self, parameters: list[Parameter]) -> Parameters:
         return self._calibrator.parameters.replace(
             **{parameter.name: parameter.value for parameter in parameters if parameter.name in SCHEMA}
         )

@@ -185,7 +185,7 @@ def diagnose(
     if any(each.code == "REFERENCE_FRAME" for each in problems):  # the receiver works: its messages are refused
         found = [each for each in found if not each.code.startswith("GNSS_OUTAGE")]
     found.sort(key=lambda each: (each.severity is not Severity.ERROR, each.code not in _CAUSES))
-    status = DiagnosticStatus(level=_level(found), hardware_id="dvl")
+    status = DiagnosticStatus(level=_status_level(found), hardware_id="dvl")
     status.message = printable("; ".join(map(str, found))) or f"{estimate.model} {estimate.convergence.value}"
     values = {
         "model": estimate.model,
@@ -209,7 +209,7 @@ def diagnose(
     return status
 
 
-def _level(found: Sequence[Reason]) -> bytes:
+def _status_level(found: Sequence[Reason]) -> bytes:
     if not found:
         return DiagnosticStatus.OK
     return DiagnosticStatus.ERROR if found[0].severity is Severity.ERROR else DiagnosticStatus.WARN

@@ -57,13 +57,13 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
             from .calibration_node import CalibrationNode
             from .executor import ReceivingExecutor
     except InputError as error:
-        return _refused(error)
+        return _report_refusal(error)
     if ending.requested:
         return 0
     try:
         rclpy.init(args=["calibration_node", *args], signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:  # rclpy raises its own types for bad --ros-args and unreadable parameter files
-        return _refused(error)
+        return _report_refusal(error)
     node, is_saved = None, True
     give_back_at_once()
     sys.setswitchinterval(GIVES_WAY_S)
@@ -76,7 +76,7 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
         while not ending.requested:
             executor.spin_once()
     except (ParameterError, InputError) as error:
-        return _refused(error)
+        return _report_refusal(error)
     finally:
         ending.heard()
         if node is not None:
@@ -99,7 +99,7 @@ def parameter_files(args: Sequence[str]) -> list[Path]:
     return files
 
 
-def _refused(error: Exception | str) -> int:
+def _report_refusal(error: Exception | str) -> int:
     """Print why the node cannot start. Return exit code 2."""
     from ..standard_streams import say
 

@@ -92,7 +92,7 @@ def fill(message: Any, kind: VelocityType, sample: DvlSample | ReferenceSample, 
     if hasattr(message, "child_frame_id"):  # child_frame_id is the frame of the velocity, header.frame_id of the pose
         message.header.frame_id, message.child_frame_id = "odom", DVL_FRAME
         message.pose.pose.orientation.w = 1.0
-    vector = _first(message, _VECTORS)
+    vector = _first_vector(message, _VECTORS)
     vector.x, vector.y, vector.z = (axes @ np.array(sample.velocity)).tolist()
     covariance = None if sample.covariance is None else axes @ np.asarray(sample.covariance) @ axes
     _put_covariance(message, covariance)
@@ -105,7 +105,7 @@ def fill(message: Any, kind: VelocityType, sample: DvlSample | ReferenceSample, 
     return message
 
 
-def _first(message: Any, paths: tuple[str, ...]) -> Any:
+def _first_vector(message: Any, paths: tuple[str, ...]) -> Any:
     """Return the first vector that exists below these attribute paths. Raises ValueError without any."""
     for path in paths:
         try:

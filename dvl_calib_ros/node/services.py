@@ -46,12 +46,12 @@ class AnsweringNode(Node):  # type: ignore[misc]
     def create_publisher(self, msg_type: Any, topic: str, *arguments: Any, **options: Any) -> Any:
         """Create a publisher. Raises InputError."""
         make = super().create_publisher
-        return _or_refused(topic, lambda: make(msg_type, topic, *arguments, **options))
+        return _create_or_refuse(topic, lambda: make(msg_type, topic, *arguments, **options))
 
     def create_subscription(self, msg_type: Any, topic: str, *arguments: Any, **options: Any) -> Any:
         """Create a subscription. Raises InputError."""
         make = super().create_subscription
-        return _or_refused(topic, lambda: make(msg_type, topic, *arguments, **options))
+        return _create_or_refuse(topic, lambda: make(msg_type, topic, *arguments, **options))
 
 
 def _printable(response: Any) -> Any:
@@ -63,7 +63,7 @@ def _printable(response: Any) -> Any:
     return response
 
 
-def _or_refused(topic: str, make: Callable[[], Any]) -> Any:
+def _create_or_refuse(topic: str, make: Callable[[], Any]) -> Any:
     """Make a publisher or subscription. Raises InputError for an invalid name or type."""
     try:
         return make()

@@ -51,7 +51,7 @@ def trend_png(comparison: Comparison) -> bytes:
         figure = Figure(figsize=(columns * PANEL_WIDTH, rows * PANEL_HEIGHT))
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes, quantity in zip(grid.flat, quantities, strict=False):
-            _draw(axes, comparison, quantity)
+            _draw_quantity(axes, comparison, quantity)
         for axes in list(grid.flat)[len(quantities) :]:
             axes.set_axis_off()
         target = io.BytesIO()
@@ -61,22 +61,22 @@ def trend_png(comparison: Comparison) -> bytes:
 
 def _panel(comparison: Comparison, quantity: ComparedQuantity) -> Figure:
     figure, axes = new_figure(height=PANEL_HEIGHT)
-    _draw(axes, comparison, quantity)
+    _draw_quantity(axes, comparison, quantity)
     return figure
 
 
-def _draw(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> None:
+def _draw_quantity(axes: Axes, comparison: Comparison, quantity: ComparedQuantity) -> None:
     """Draw one quantity over time with ±1σ, and a line at each change."""
     known = [each for each in comparison.calibrations if each.shown[quantity.component]]
     dated = _dated(comparison.calibrations)
     order = {id(each): index for index, each in enumerate(comparison.calibrations)}
     value = quantity.factor * np.array([each.value[quantity.component] for each in known])
     std = quantity.factor * np.array([each.std[quantity.component] for each in known])
-    at = [_middle(each) if dated else float(order[id(each)]) for each in known]
+    at = [_middle_day(each) if dated else float(order[id(each)]) for each in known]
     axes.errorbar(at, value, std, fmt="o", color=_POINT, markersize=4.0, capsize=2.5, elinewidth=1.2)
     changes: Sequence[Change] = getattr(comparison, quantity.changes)
     for index, change in enumerate(changes):
-        ends = [_middle(each) if dated else order[id(each)] for each in (change.last_before, change.first_after)]
+        ends = [_middle_day(each) if dated else order[id(each)] for each in (change.last_before, change.first_after)]
         label = "changed" if index == 0 else None
         axes.axvline(sum(ends) / 2.0, color=_MOVED, linewidth=1.2, linestyle="--", label=label)
     if dated:
@@ -100,7 +100,7 @@ def _dated(calibrations: Sequence[Extrinsics]) -> bool:
     return all(before.last_ns <= after.first_ns for before, after in pairwise(calibrations))
 
 
-def _middle(each: Extrinsics) -> float:
+def _middle_day(each: Extrinsics) -> float:
     """Return the middle in days since 1970, matplotlib's unit of dates."""
     return 0.5 * (each.first_ns + each.last_ns) * 1e-9 / 86400.0
 

@@ -65,7 +65,7 @@ TWINS_NOTE = (
 )
 
 
-def _calibration(series: DiagnosisSeries) -> str:
+def _calibration_text(series: DiagnosisSeries) -> str:
     """Return misalignment and scale error per axis with 1 σ, as a sentence."""
     angle_std, scale_std = np.split(series.calibration_std, 2)
     angles, scales = (
@@ -86,7 +86,7 @@ FACTS: Mapping[str, Callable[[DiagnosisSeries], str]] = {
     ),
     "Samples compared": lambda s: f"{len(s.time)}, on the axes {''.join(s.axes)}",
     "Held out": lambda s: "whole recordings in turn" if len(s.recordings) > 1 else "a fifth of the run in turn",
-    "Calibration": _calibration,
+    "Calibration": _calibration_text,
 }
 WHERE: Columns[GapPlace] = {
     "axis": lambda place: f"{place.axis} ({BODY_AXES[place.axis]})",
@@ -155,7 +155,7 @@ def diagnosis(d: Diagnosis) -> Document:
         answer=Answer(d.verdict.value, d.reasons[0].severity, [d.sentence, *found, *to_do]),
         warnings=d.notes,
         sections=[
-            section("", Numbers(_numbers(d)) if math.isfinite(d.gap.before) else None),
+            section("", Numbers(_main_numbers(d)) if math.isfinite(d.gap.before) else None),
             section("", *map(Sentence, _drift_sentences(d)), where=Where.PAGE),
             section("", None if series is None else facts_by(FACTS, series), where=Where.PAGE),
             section("", Warned(), where=Where.PAGE),
@@ -171,7 +171,7 @@ def diagnosis(d: Diagnosis) -> Document:
                 *_equivalence_sentences(d),
                 Sentence(f"Next: {d.next_manoeuvre}."),
                 table_by(NEEDS, d.untestable.items()),
-                table_by(DETECTABLE, _detectable(d), (DETECTABLE_NOTE,)),
+                table_by(DETECTABLE, _detectable_sizes(d), (DETECTABLE_NOTE,)),
             ),
             section("The noise", table_by(NOISE, d.noise)),
         ],
@@ -223,7 +223,7 @@ def _drift_sentences(d: Diagnosis) -> list[str]:
     return [f"Drift per straight km, noise included: {before}" + (f", {after} with the effects." if d.effects else ".")]
 
 
-def _numbers(d: Diagnosis) -> list[Number]:
+def _main_numbers(d: Diagnosis) -> list[Number]:
     """Return error, closed share of the gap, noise level and unexplained error as main quantities."""
     gap = d.gap
     found = [Number("error", f"{mm(gap.before)} mm/s", note="held-out rms, noise included")]
@@ -300,7 +300,7 @@ DETECTABLE: Columns[Detectable] = {
 }
 
 
-def _detectable(d: Diagnosis) -> Iterator[Detectable]:
+def _detectable_sizes(d: Diagnosis) -> Iterator[Detectable]:
     """Yield the smallest detectable size of each parameter of each tested effect."""
     for name, sizes in d.minimum_detectable.items():
         specs = {spec.name: spec for spec in EFFECTS[name].parameters} if name in EFFECTS else {}

@@ -110,15 +110,15 @@ def evaluation(e: Evaluation) -> Document:
             section("", facts_by(FACTS, e)),
             section("", Warned(), where=Where.PAGE),
             section("Velocity error after calibration", *_scores(e)),
-            _by_time(e),
-            *([_converging(e)] if e.convergence else []),
+            _error_by_time(e),
+            *([_convergence(e)] if e.convergence else []),
             section("What was done before", baselines),
             *(
                 section(f"Can the uncertainty be trusted? {title}", *_coverage(found))
                 for title, found in coverages
                 if found
             ),
-            *(_study(e, study, title) for study, title in studies if study is not None and study.runs),
+            *(_single_run_study(e, study, title) for study, title in studies if study is not None and study.runs),
             *([_held_out(e.held_out)] if e.held_out else []),
         ],
         parameters=e.parameters,
@@ -163,7 +163,7 @@ def _scores(e: Evaluation) -> Iterable[Item]:
     )
 
 
-def _by_time(e: Evaluation) -> Section:
+def _error_by_time(e: Evaluation) -> Section:
     """Lay out the error by set and calibration time."""
     rows = [
         (each.name, "all" if window is None else f"{window:g} s", *(number(value, 4) for value in row.tolist()))
@@ -190,7 +190,7 @@ def _by_time(e: Evaluation) -> Section:
     return section("Velocity error against calibration time", Legend(e.models, ""), SideBySide(drawn), table)
 
 
-def _converging(e: Evaluation) -> Section:
+def _convergence(e: Evaluation) -> Section:
     """Lay out the error of the misalignment over time."""
     rows = [
         (f"{seconds:g} s", *(f"{each.angle_deg[k]:.2f} / {each.level_deg[k]:.2f}" for each in e.convergence))
@@ -252,7 +252,7 @@ def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:
     )
 
 
-def _study(e: Evaluation, study: EachStudy, title: str) -> Section:
+def _single_run_study(e: Evaluation, study: EachStudy, title: str) -> Section:
     """Lay out the scores of calibrations on each single run."""
     rows = []
     for run, label, values, observed in zip(

@@ -82,7 +82,7 @@ def explorable(figure: Figure) -> str:
             }
             for line in sorted(lines, key=lambda line: line.get_zorder())
         ],
-        "sleeves": [_sleeve(each) for each in sleeves],
+        "sleeves": [_band_limits(each) for each in sleeves],
     }
     return _packed(plot)
 
@@ -101,7 +101,7 @@ def _map(figure: Figure, axes: Axes, tracks: Sequence[MapTrack]) -> dict[str, An
     return {"run": tracks[0].run, "times": _numbers(tracks[0].times, 9), "tracks": shown}
 
 
-def _sleeve(area: PolyCollection) -> dict[str, Any]:
+def _band_limits(area: PolyCollection) -> dict[str, Any]:
     """Return the lowest and highest value of a fill_between at each position."""
     vertices = np.asarray(area.get_paths()[0].vertices)
     red, green, blue, alpha = np.asarray(area.get_facecolor(), dtype=float)[0]

@@ -99,7 +99,7 @@ def fleet(result: Fleet) -> Document:
                 table_by(PERSONS, result.persons, (SEVERAL_NOTE,) if several else (), words=3),
             ),
             *(
-                _trend(each.history.name, each.history.compared)
+                _trend_section(each.history.name, each.history.compared)
                 for each in sitting
                 if each.history.compared is not None
             ),
@@ -224,7 +224,7 @@ COMPASS: Columns[tuple[str, CompassDeviation]] = {
 }
 
 
-def _trend(name: str, compared: Comparison) -> Section:
+def _trend_section(name: str, compared: Comparison) -> Section:
     """Return the section of a vehicle's angles and scale over time."""
     shown: list[Item] = [Sentence(each.full_sentence) for each in reasons(compared)]
     components = tuple(each.component for each in _ANGLES_AND_SCALE)

@@ -103,7 +103,7 @@ STREAMS: Columns[tuple[str, Mapping[str, int]]] = {
 _STREAMS = (("dvl", "DVL"), ("reference", "GNSS velocity"), ("imu", "IMU"), ("pairing", "pairing of DVL and GNSS"))
 
 
-def _when(run: Replayed) -> str:
+def _period_text(run: Replayed) -> str:
     """Return the first and last stamp in UTC and the duration, as text."""
     result = run.result
     if result.first_ns is None or result.last_ns is None:
@@ -120,7 +120,7 @@ FACTS: Mapping[str, Callable[[Replayed], str]] = {
         f"{run.result.selected} ({run.result.selected_because.sentence}); {run.result.estimate.convergence.value}"
     ),
     "Angles": lambda run: "against the IMU's heading and level" if run.reference_frame in EARTH else "",
-    "Recorded": _when,
+    "Recorded": _period_text,
     "DVL data": lambda run: run.dvl_data,
     "Samples": lambda run: (
         f"{run.result.counts['dvl']['accepted']} of the DVL, {run.result.counts['pairing']['paired']} with a reference "
@@ -179,7 +179,7 @@ def replayed(
     return Document(
         title="DVL calibration",
         subtitle=", ".join(map(str, bags)),
-        answer=_answer(verification),
+        answer=_verdict_answer(verification),
         warnings=shown_warnings,
         sections=[
             section(
@@ -238,7 +238,7 @@ def straight_kilometre(result: Result) -> tuple[float, float]:
     return math.hypot(off, left_open), left_open
 
 
-def _answer(verification: Verification | None) -> Answer:
+def _verdict_answer(verification: Verification | None) -> Answer:
     """Return the verdict of the held-out data with its reasons and advice."""
     if verification is None:
         return Answer("not verified", Severity.MARGINAL, ["Nothing was held back to verify the calibration on."])

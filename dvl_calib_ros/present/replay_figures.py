@@ -225,14 +225,14 @@ def mounting_pictures(result: Result) -> list[Picture]:
     return [
         picture(
             f"DVL on the vehicle, {where}", f"Axes of the DVL as configured and as found, {where}. {how}",
-            _view, (across, up, parameters.body_axes[up]), nominal, rotation_of(times * turn) @ nominal,
+            _hull, (across, up, parameters.body_axes[up]), nominal, rotation_of(times * turn) @ nominal,
             place or (0.0, 0.0, 0.0), parameters.is_z_down, caption=how,
         )
         for across, up, where in _VIEWS
     ]  # fmt: skip
 
 
-def _view(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float], down: bool) -> Figure:
+def _hull(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Sequence[float], down: bool) -> Figure:
     """Draw the DVL's axes on the hull in one view, as configured and as found."""
     across, up, name = axes_of
     figure, axes = new_figure(height=2.6)
@@ -310,7 +310,7 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
         lines += axes.plot(*each.track_after.T, color=colour, linewidth=1.2, label=name or "corrected")
     if len(corrected) == 1:
         lines[-1].set(alpha=0.0, label="_corrected")  # the colour bar is the legend
-        _coloured(figure, axes, one)
+        _draw_coloured_track(figure, axes, one)
     if time is not None:
         for line in lines:
             axes.add_line(MapTrack(line, time.run, time(one.stamps_ns)))
@@ -325,7 +325,7 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
     return figure
 
 
-def _coloured(figure: Figure, axes: Axes, one: Navigation) -> None:
+def _draw_coloured_track(figure: Figure, axes: Axes, one: Navigation) -> None:
     """Draw the corrected track, coloured by its distance from the reference's."""
     off = np.linalg.norm(one.track_after - one.reference, axis=1)
     parts = np.stack([one.track_after[:-1], one.track_after[1:]], axis=1)
@@ -403,7 +403,7 @@ def calibration_figure(replayed: Replayed) -> Figure:
             (navigation.error_before, "before", _COLOURS[2]),
             (navigation.error_after, "after", _COLOURS[0]),
         ):
-            _errors(errors, 1e-9 * (navigation.stamps_ns - first_ns), each, name, colour)
+            _draw_errors(errors, 1e-9 * (navigation.stamps_ns - first_ns), each, name, colour)
         _legend_above(errors)
     errors.set_ylabel("DVL less reference, m/s")
     errors.set_xlabel("time, s")
@@ -412,7 +412,7 @@ def calibration_figure(replayed: Replayed) -> Figure:
     return figure
 
 
-def _errors(axes: Axes, time: Array, error: Array, name: str, colour: str) -> None:
+def _draw_errors(axes: Axes, time: Array, error: Array, name: str, colour: str) -> None:
     """Draw the length of an error (N, 3) as points, with its root mean square."""
     length = np.linalg.norm(error, axis=1)
     rms = float(np.sqrt(np.mean(length**2)))
@@ -444,7 +444,7 @@ def estimate_pictures(result: Result, history: RunHistory, models: Sequence[str]
     time = TimeAxis(history.stamps_ns)
     for term in (*ANGLES, *_scales_shown(models)):
         lines = [
-            _line(name, history.models[name], term)
+            _model_line(name, history.models[name], term)
             for name in models
             if MODELS[name].error_terms_from_state[term.row].any()
         ]
@@ -470,7 +470,7 @@ def _scales_shown(models: Sequence[str]) -> list[Term]:
     return [ANY_SCALE]
 
 
-def _line(name: str, history: ModelHistory, term: Term) -> ModelLine:
+def _model_line(name: str, history: ModelHistory, term: Term) -> ModelLine:
     index = state_of(MODELS[name], term)
     return ModelLine(name, term.factor * history.state[:, index], term.factor * history.std[:, index])
 

@@ -379,7 +379,7 @@ def compare_logs(vehicle: Log, simulator: Log, effects: Mapping[str, Effect] = E
         rungs=shrunk.rungs,
         floor_mps=shrunk.floor,
         not_shown={
-            side: _not_shown(log.diagnosis, effects) for side, log in (("vehicle", vehicle), ("simulator", simulator))
+            side: _unobserved(log.diagnosis, effects) for side, log in (("vehicle", vehicle), ("simulator", simulator))
         },
         vehicle=vehicle.diagnosis,
         simulator=simulator.diagnosis,
@@ -496,7 +496,7 @@ def _noise(candidate: Candidate, p: float) -> ComparedNoise:
     )
 
 
-def _not_shown(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str, str]:
+def _unobserved(diagnosis: Diagnosis, effects: Mapping[str, Effect]) -> dict[str, str]:
     """Return effects unobservable on a side at relevant sizes -> the smallest detectable size, or the missing data."""
     found = {name: f"needs {needs}" for name, needs in diagnosis.untestable.items()}
     named = {each.name for each in diagnosis.effects}

@@ -120,10 +120,10 @@ class Tables:
         """Return a message with its channel's topic, type and definition."""
         log_ns, channel_id, data = message
         if channel_id not in self._made:
-            self._made[channel_id] = self._of(self.channels[channel_id])
+            self._made[channel_id] = self._type_of(self.channels[channel_id])
         return Salvaged(*self._made[channel_id], log_ns, data)
 
-    def _of(self, channel: Channel) -> tuple[str, str, str, str]:
+    def _type_of(self, channel: Channel) -> tuple[str, str, str, str]:
         """Return topic, type, encoding and definition of a channel, empty where the schema is missing."""
         known = self.schemas.get(channel.schema_id)
         if known is None:

@@ -174,14 +174,14 @@ class Fitter:
         columns = self.columns(hypothesis, seen)
         return _Linearisation(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
 
-    def _white(self, noise: Noise, values: Array) -> Array:
+    def _whiten(self, noise: Noise, values: Array) -> Array:
         white = noise.whiten(values)
         if self.held is not None:
             white = white[np.repeat(~self.held, self.problem.axes)]
         return white
 
     def _misfit(self, noise: Noise, residual: Array, hypothesis: Hypothesis) -> float:
-        white = self._white(noise, residual)
+        white = self._whiten(noise, residual)
         return float(white @ white + np.sum((hypothesis.vector() / prior_std(hypothesis)) ** 2))
 
     def fit(
@@ -259,8 +259,8 @@ class Fitter:
         for shaken in self.problem.shaken:
             seen = shaken.all_seen(hypothesis)
             other = replace(self, problem=shaken, _fits={})
-            white = self._white(noise, other.columns(hypothesis, seen) - columns)
-            own = self._white(noise, shaken.residual(seen) - residual - self.outliers)
+            white = self._whiten(noise, other.columns(hypothesis, seen) - columns)
+            own = self._whiten(noise, shaken.residual(seen) - residual - self.outliers)
             joined = np.column_stack([white, -own])
             gram = gram - joined.T @ joined
         found = replace(system, gram=gram)
@@ -269,7 +269,7 @@ class Fitter:
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
         """Return the whitened contribution (S n,) of simulated velocity noise to a hypothesis' residual (M, A)."""
         white = [
-            self._white(noise, shaken.residual(shaken.all_seen(hypothesis)) - residual)
+            self._whiten(noise, shaken.residual(shaken.all_seen(hypothesis)) - residual)
             for shaken in self.problem.shaken
         ]
         return np.concatenate(white)
@@ -277,7 +277,7 @@ class Fitter:
     def _system(self, noise: Noise, columns: Array, residual: Array, hypothesis: Hypothesis) -> WhitenedLeastSquares:
         """Return the system of the step (6 + p,) from a hypothesis."""
         return WhitenedLeastSquares.of(
-            self._white(noise, columns), -self._white(noise, residual), prior_std(hypothesis), -hypothesis.vector()
+            self._whiten(noise, columns), -self._whiten(noise, residual), prior_std(hypothesis), -hypothesis.vector()
         )
 
     def fit_kept(self, start: Hypothesis, noise: Noise) -> Fit:
@@ -317,10 +317,10 @@ class Fitter:
         for step in steps:
             for effect in fit.effects:
                 for spec in (spec for spec in effect.parameters if is_time_of_run(spec)):
-                    fit = self._finer(fit, effect, spec.name, step)
+                    fit = self._refine_event_time(fit, effect, spec.name, step)
         return fit
 
-    def _finer(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
+    def _refine_event_time(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
         at_rest: tuple[Fit, float] | None = None
         for sign in (-1.0, 1.0):
             per = fit.values[effect.name]
@@ -330,7 +330,7 @@ class Fitter:
             hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
             linearised = self._linearised(hypothesis, fit.noise)
             if at_rest is None or at_rest[0] is not fit:
-                at_rest = fit, self._promised(fit)
+                at_rest = fit, self._predicted_gain(fit)
             if self._is_surely_worse(hypothesis, linearised, fit.noise, fit.deviance, at_rest[1]):
                 continue
             trial = self.fit(hypothesis, fit.noise, 3, linearised=linearised)
@@ -338,7 +338,7 @@ class Fitter:
                 fit = trial
         return fit
 
-    def _promised(self, fit: Fit) -> float:
+    def _predicted_gain(self, fit: Fit) -> float:
         """Return the predicted gain of a linear step from a converged fit, which is not attainable."""
         system = self._system(fit.noise, fit.columns, fit.residual, fit.hypothesis)
         return self._misfit(fit.noise, fit.residual, fit.hypothesis) - system.misfit(system.solution())
@@ -349,7 +349,7 @@ class Fitter:
         """Return whether a hypothesis, fitted, would have a larger deviance, by one linear step.
 
         The step's predicted deviance is the minimum except for nonlinearity. promised: predicted gain from a nearby
-        converged fit of this deviance, subtracted as unattainable (`_promised`).
+        converged fit of this deviance, subtracted as unattainable (`_predicted_gain`).
         """
         own_noise = self._own_noise(hypothesis, noise, linearised.residual + self.outliers)
         least = linearised.system.misfit(linearised.system.solution())

@@ -94,7 +94,7 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
         found_events = [
             each
             for each in found_events
-            if _is_predictive(problem, fit, each.columns, least + _price(tested + each.tried, each.columns.shape[2]))
+            if _is_predictive(problem, fit, each.columns, least + _limit(tested + each.tried, each.columns.shape[2]))
         ]
     looked_at = float(np.log(tested))
     nominal = [
@@ -112,23 +112,23 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
     tests += [(each.log_p, each.about, each.columns) for each in found_events]
     best = min(tests, key=_first)
-    about = _plainest(tests, best[0])
+    about = _simplest(tests, best[0])
     log_p = best[0] + looked_at
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     tested = next((tested + each.tried for each in found_events if each.about == best[1]), tested)
-    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _price(tested, best[2].shape[2]))
+    found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _limit(tested, best[2].shape[2]))
     return found if found.found else replace(found, columns=nothing, clearest=nothing)
 
 
-def _price(tested: int, columns: int) -> float:
+def _limit(tested: int, columns: int) -> float:
     """Return the energy that the best of `tested` tests exceeds under the null with probability
     `SETTINGS.robust_level`."""
     return float(chi2_isf(SETTINGS.robust_level / tested, columns))
 
 
-def _plainest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
+def _simplest(tests: Sequence[tuple[float, str | float, Array]], log_p: float) -> tuple[float, str | float, Array]:
     """Return the candidate with the fewest columns among those within `AS_LIKELY` of log_p."""
     likely = (each for each in tests if each[0] <= log_p + AS_LIKELY)
     return min(likely, key=lambda each: (each[2].shape[2], each[0]))
