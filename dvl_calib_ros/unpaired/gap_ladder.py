@@ -197,7 +197,7 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
         with_quiet_reference(
             replace(
                 problem,
-                recordings=tuple(replace(one, reference=one.reference.shaken(rng)) for one in problem.recordings),
+                recordings=tuple(replace(one, reference=one.reference.perturbed(rng)) for one in problem.recordings),
             )
         )
         for _ in range(SIMULATED)

@@ -122,9 +122,9 @@ def _noise(recordings: Sequence[RecordedStreams], selection: EffectSelection) ->
     problem = with_quiet_reference(selection.fitter.problem)
     variances = []
     for index, recording in enumerate(recordings):
-        rest = recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
+        residual = recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
         own = recording.dvl.noise
-        variances.append(np.minimum(own, Curve(recording.dvl.time, rest).roughness) ** 2)
+        variances.append(np.minimum(own, Curve(recording.dvl.time, residual).roughness) ** 2)
     return np.asarray(np.sqrt(np.mean(variances, axis=0)))
 
 

@@ -63,9 +63,9 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
 
 def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
     scale = robust_std(innovations)
-    far = (np.abs(innovations) > SETTINGS.outlying * scale).any(axis=1)
-    off = problem.bursts // problem.grids[0].per_bin
-    count, n = int(np.count_nonzero(far)) + off, len(innovations) + off
+    is_outlier = (np.abs(innovations) > SETTINGS.outlying * scale).any(axis=1)
+    excluded = problem.bursts // problem.grids[0].per_bin
+    count, n = int(np.count_nonzero(is_outlier)) + excluded, len(innovations) + excluded
     spikes, received = (sum(getattr(r, name) for r in problem.recordings) for name in ("spikes", "received"))
     if spikes > count:
         count, n = spikes, received
@@ -133,11 +133,11 @@ def _time_constant(arma: Arma, interval: float) -> float:
 
 def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFinding | None]:
     found: list[NoiseFinding | None] = []
-    claimed = claimed_std(problem)
-    if claimed is not None:
+    reported = claimed_std(problem)
+    if reported is not None:
         errors = problem.errors(fit.seen)
         variance, error = high_frequency_variance(problem.sample_time, errors)
-        ratio = float(np.sqrt(variance.sum() / np.mean([np.sum(each**2) for each in claimed])))
+        ratio = float(np.sqrt(variance.sum() / np.mean([np.sum(each**2) for each in reported])))
         error = 0.5 * error
         if ratio > INFLATION:
             p = float(2.0 * normal_sf(np.log(ratio) / error))

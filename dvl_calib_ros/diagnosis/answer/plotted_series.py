@@ -113,7 +113,7 @@ class DiagnosisSeries:
 
 
 def collect_series(
-    selection: EffectSelection, residuals: HeldOutResiduals, rest: Unexplained, covariance: Array
+    selection: EffectSelection, residuals: HeldOutResiduals, unexplained: Unexplained, covariance: Array
 ) -> DiagnosisSeries:
     """Collect the series of a selection and its residual. covariance: (6 + p, 6 + p) of the fit."""
     fitter, fit = selection.fitter, selection.fit
@@ -138,9 +138,9 @@ def collect_series(
         phi=fit.hypothesis.phi,
         scale=fit.hypothesis.scale,
         calibration_std=np.sqrt(np.diag(covariance)[:6]),
-        rest=rest,
+        rest=unexplained,
         measured=problem.measured,
-        followed=what_it_follows(problem, fit, rest.about),
+        followed=what_it_follows(problem, fit, unexplained.about),
     )
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...calibration.numerics.robust import robust_std
 from ...effects.base import Effect
-from ..model.forward_model import Problem, SeenAgain
+from ..model.forward_model import LazySeen, Problem
 from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, whose_parameters
 from ..model.seen import Seen
 from ..model.settings import SETTINGS
@@ -77,14 +77,14 @@ class Fit:
         """Return derivatives of the residual, (M, A, 6 + p), on demand."""
         return self.made()
 
-    def gain_over(self, rest: Fit) -> float:
+    def gain_over(self, reduced: Fit) -> float:
         """Return the lower bound of the deviance gain over another fit.
 
         Fits with different noise differ in deviance by a normal variable of this size under the null hypothesis.
         """
-        other = self.own_noise - rest.own_noise
-        sure = rest.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
-        return sure - max(rest.of_tails - self.of_tails, 0.0)
+        other = self.own_noise - reduced.own_noise
+        sure = reduced.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
+        return sure - max(reduced.of_tails - self.of_tails, 0.0)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -117,9 +117,9 @@ class Fit:
     def scores(self, block: NDArray[np.intp]) -> Array:
         """Return sums (B, 6 + p) of whitened columns times residual over blocks (M,)."""
         white = self.noise.whiten(self.columns).reshape(len(block), -1, self.columns.shape[2])
-        left = self.noise.whiten(self.residual).reshape(len(block), -1)
-        each = np.einsum("map,ma->mp", white, left)
-        return np.stack([np.bincount(block, column) for column in each.T], axis=1)
+        residual = self.noise.whiten(self.residual).reshape(len(block), -1)
+        products = np.einsum("map,ma->mp", white, residual)
+        return np.stack([np.bincount(block, column) for column in products.T], axis=1)
 
 
 @dataclass(frozen=True)
@@ -243,8 +243,8 @@ class Fitter:
                 made = partial(self.problem.all_columns, hypothesis, seen)
         own_noise = self._own_noise(hypothesis, noise, residual + self.outliers)
         deviance = misfit - float(own_noise @ own_noise)
-        of_each = own_noise.reshape(len(self.problem.shaken), -1)
-        of_tails = float((np.array(self.problem.tails) - 1.0) @ (of_each**2).sum(axis=1))
+        of_each = own_noise.reshape(len(self.problem.perturbed), -1)
+        of_tails = float((np.array(self.problem.noise_excess) - 1.0) @ (of_each**2).sum(axis=1))
         return Fit(hypothesis, seen, residual, noise, made, system, deviance, own_noise, of_tails)
 
     def _without_own_noise(
@@ -256,11 +256,11 @@ class Fitter:
         in variables).
         """
         gram = system.gram
-        for shaken in self.problem.shaken:
-            seen = shaken.all_seen(hypothesis)
-            other = replace(self, problem=shaken, _fits={})
+        for perturbed in self.problem.perturbed:
+            seen = perturbed.all_seen(hypothesis)
+            other = replace(self, problem=perturbed, _fits={})
             white = self._whiten(noise, other.columns(hypothesis, seen) - columns)
-            own = self._whiten(noise, shaken.residual(seen) - residual - self.outliers)
+            own = self._whiten(noise, perturbed.residual(seen) - residual - self.outliers)
             joined = np.column_stack([white, -own])
             gram = gram - joined.T @ joined
         found = replace(system, gram=gram)
@@ -269,8 +269,8 @@ class Fitter:
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
         """Return the whitened contribution (S n,) of simulated velocity noise to a hypothesis' residual (M, A)."""
         white = [
-            self._whiten(noise, shaken.residual(shaken.all_seen(hypothesis)) - residual)
-            for shaken in self.problem.shaken
+            self._whiten(noise, perturbed.residual(perturbed.all_seen(hypothesis)) - residual)
+            for perturbed in self.problem.perturbed
         ]
         return np.concatenate(white)
 
@@ -299,7 +299,7 @@ class Fitter:
                 if self._misfit(noise, at_end[1], each) < self._misfit(noise, evaluated[1], nearest):
                     nearest, evaluated = each, at_end
             found = self.fit(nearest, noise, evaluated=evaluated)
-            seen = SeenAgain(self.problem, found.hypothesis)
+            seen = LazySeen(self.problem, found.hypothesis)
             made = partial(self.problem.all_columns, found.hypothesis, seen)
             self._fits[key] = replace(found, seen=seen, made=made)
             self.problem.fitted[model] = [self._fits[key].hypothesis]

@@ -83,7 +83,7 @@ def _moving(recording: RecordedStreams) -> RecordedStreams:
 
 def _drawn(recording: RecordedStreams, reference: Array, share: float, rng: np.random.Generator) -> RecordedStreams:
     def noisy(curve: Curve, values: Array) -> Curve:
-        noise = share * curve.noise * curve.loudness * rng.standard_normal(values.shape)
+        noise = share * curve.noise * curve.relative_noise * rng.standard_normal(values.shape)
         return Curve(curve.time, values + noise, curve.claimed, claims=curve.claims)
 
     return replace(

@@ -83,16 +83,16 @@ def log_p_value(drop: float, dof: float, tried: float = 1.0) -> float:
     return min(0.0, float(chi2_logsf(max(drop, 0.0), max(dof, 1e-3))) + float(np.log(tried)))
 
 
-def log_p_in_place(fitter: Fitter, fit: Fit, rest: Fit, effect: Effect) -> float:
-    """Return log p of an effect given all others and unobservable parameters. rest: the fit without it."""
+def log_p_in_place(fitter: Fitter, fit: Fit, reduced: Fit, effect: Effect) -> float:
+    """Return log p of an effect given all others and unobservable parameters. reduced: the fit without it."""
     problem = fitter.problem
-    gain = fit.gain_over(rest) - max(_told_by_unshown(problem, rest) - _told_by_unshown(problem, fit), 0.0)
-    return log_p_value(gain, fit.dof - rest.dof, times_tried(effect))
+    gain = fit.gain_over(reduced) - max(_absorbed(problem, reduced) - _absorbed(problem, fit), 0.0)
+    return log_p_value(gain, fit.dof - reduced.dof, times_tried(effect))
 
 
-def _told_by_unshown(problem: Problem, fit: Fit) -> float:
+def _absorbed(problem: Problem, fit: Fit) -> float:
     """Return the deviance that unobservable parameters would explain in addition to a fit, linearised."""
-    if not problem.lacks_columns(fit.hypothesis):
+    if not problem.has_unobservable(fit.hypothesis):
         return 0.0
     both = NuisanceFit.of_fit(problem, fit).step(fit.noise, fit.residual)
     alone = both.part(np.arange(fit.columns.shape[2]))
@@ -164,17 +164,17 @@ class NuisanceFit(NamedTuple):
     @staticmethod
     def of(problem: Problem, hypothesis: Hypothesis, seen: Sequence[Seen], columns: Array) -> NuisanceFit:
         """Return columns (M, A, k) of the first k parameters of a hypothesis, and u unobservable ones."""
-        unshown, sizes = problem.unshown_columns(hypothesis, seen)
+        unobservable, sizes = problem.unobservable_columns(hypothesis, seen)
         k, none = columns.shape[2], np.zeros(len(sizes))
         std, centre = np.append(prior_std(hypothesis)[:k], sizes), np.append(hypothesis.vector()[:k], none)
-        return NuisanceFit(np.concatenate([columns, unshown], axis=2), std, centre)
+        return NuisanceFit(np.concatenate([columns, unobservable], axis=2), std, centre)
 
     @staticmethod
     def of_fit(problem: Problem, fit: Fit) -> NuisanceFit:
         """Return all parameters of a fit and unobservable ones."""
         return NuisanceFit.of(problem, fit.hypothesis, fit.seen, fit.columns)
 
-    def and_rest(self, raw: Array, residual: Array) -> NuisanceFit:
+    def and_nuisance(self, raw: Array, residual: Array) -> NuisanceFit:
         """Add columns raw (M, A, c), scaled to unit size, that may explain a residual (M, A)."""
         size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
         # jointly no larger than the residual: stretches without a turn would otherwise not bound them
@@ -221,6 +221,6 @@ class SlowNoiseOfFit(NamedTuple):
         slow: SlowNoiseOfFit = fit.kept["slow noise"]
         return slow
 
-    def with_rest(self, problem: Problem, noise: Noise, columns: Array) -> SlowNoiseOfFit:
+    def with_nuisance(self, problem: Problem, noise: Noise, columns: Array) -> SlowNoiseOfFit:
         """Estimate again with columns (M, A, c) that may explain the residual."""
-        return SlowNoiseOfFit.of(problem, noise, self.known.and_rest(columns, self.residual), self.residual)
+        return SlowNoiseOfFit.of(problem, noise, self.known.and_nuisance(columns, self.residual), self.residual)

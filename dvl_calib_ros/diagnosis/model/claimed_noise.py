@@ -82,7 +82,7 @@ def followed(log_claims: Array, values: Array, names: Sequence[str], stretch: ND
 # ------------------------------------------------------------------ of one stream
 
 
-def loudness(time: Array, claims: Array | None, differences: Array, weights: Array) -> Array:
+def relative_noise(time: Array, claims: Array | None, differences: Array, weights: Array) -> Array:
     """Return the relative standard deviation (N, k) of a stream's samples, as far as reported values predict it.
 
     Parameters

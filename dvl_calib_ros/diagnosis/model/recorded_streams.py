@@ -76,8 +76,8 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
         if behind - first >= FEWEST and inside < LONGEST_S and is_mixed:
             once[first : behind + 2] = False
             found.append(SetBack(float(time[first]), float(time[behind + 1]), inside))
-    apart = np.abs(steps - usual) / usual
-    odd = np.flatnonzero(apart > np.clip(FAR * np.median(apart), *REGULAR))
+    relative = np.abs(steps - usual) / usual
+    odd = np.flatnonzero(relative > np.clip(FAR * np.median(relative), *REGULAR))
     short = odd[steps[odd] < usual]
     if not found and len(short) > 0 and len(odd) <= RARE:
         found = [SetBack(float(time[at]), float(time[at + 1]), UP_TO_S) for at in short.tolist()]

@@ -62,8 +62,8 @@ def _sloped(found: Sequence[Array], log_square: Array) -> tuple[Array, Array, fl
     x = np.column_stack([np.ones(len(log_square)), *(values - values.mean() for values in found)])
     inverse = np.linalg.pinv(x.T @ x)
     parameters = inverse @ x.T @ log_square
-    left = (log_square - x @ parameters)[:, None] * x
-    covariance = (inverse @ (left.T @ left) @ inverse * len(x) / max(len(x) - x.shape[1], 1))[1:, 1:]  # HC1
+    scores = (log_square - x @ parameters)[:, None] * x
+    covariance = (inverse @ (scores.T @ scores) @ inverse * len(x) / max(len(x) - x.shape[1], 1))[1:, 1:]  # HC1
     slopes = parameters[1:]
     return slopes, covariance, float(slopes @ np.linalg.solve(covariance, slopes))
 
@@ -76,25 +76,25 @@ def _common(values: Array) -> Array:
 
 
 def estimated(
-    problem: Problem, seen: Sequence[Seen], left: Array, rotation: Array | None, columns: Array, std: Array
+    problem: Problem, seen: Sequence[Seen], residual: Array, rotation: Array | None, columns: Array, std: Array
 ) -> tuple[Noise, Array]:
     """Estimate the noise of a residual (M, A) in a frame, with a significant level, and the winsorised residual.
 
     columns, std: (M, A, p) and (p,) of the fit that the residual is from, which has absorbed some of the noise.
     """
-    noise = white_noise(left, problem.segments, rotation, problem.interval).refitted(left)
+    noise = white_noise(residual, problem.segments, rotation, problem.interval).refitted(residual)
     for _ in range(2):  # colour and absorbed noise depend weakly on each other
         taken = noise.taken_by(columns, std)
-        noise = noise.refitted(noise.robust(left), taken=taken)
+        noise = noise.refitted(noise.robust(residual), taken=taken)
     names, log_claims = claims_of(problem, seen, rotation)
     if names:
-        innovations = noise.whiten(left).reshape(left.shape)
+        innovations = noise.whiten(residual).reshape(residual.shape)
         noise = replace(noise, level=noise.level * followed(log_claims, innovations, names, stretches_of(problem)))
-        noise = noise.refitted(noise.robust(left), taken=taken)
-    level = fit_level(problem, seen, noise.whiten(left).reshape(left.shape))
+        noise = noise.refitted(noise.robust(residual), taken=taken)
+    level = fit_level(problem, seen, noise.whiten(residual).reshape(residual.shape))
     if level is not None and level.p < SETTINGS.robust_level:
         noise = replace(noise, level=noise.level * level.values[:, None])
-    robust = noise.robust(left)
+    robust = noise.robust(residual)
     return noise.refitted(robust, taken=taken), robust
 
 

@@ -274,12 +274,12 @@ class Noise:
         beyond = np.zeros_like(scaled)
         for _ in range(WINSORISED_TIMES):
             cleaned = scaled - beyond * stds
-            off = beyond + np.stack(
+            deviation = beyond + np.stack(
                 [arma.deviations(series, self.segments) for arma, series in zip(self.axes, cleaned.T, strict=True)], 1
             )
-            scale = robust_std(off)
-            near = np.mean(np.abs(off) < HUBER * scale, axis=0)
-            beyond = off - np.clip(off, -HUBER * scale, HUBER * scale)
+            scale = robust_std(deviation)
+            near = np.mean(np.abs(deviation) < HUBER * scale, axis=0)
+            beyond = deviation - np.clip(deviation, -HUBER * scale, HUBER * scale)
         pseudo = (scaled - beyond * stds) / np.maximum(near, MOST_NEAR)
         return self._unscaled(np.where(near > MOST_NEAR, pseudo, scaled))
 

@@ -39,8 +39,8 @@ class WhitenedLeastSquares:
     @staticmethod
     def of(columns: Array, target: Array, std: Array, centre: Array) -> WhitenedLeastSquares:
         """Make the system of whitened columns (m, n) and target (m,)."""
-        along = columns.T @ target
-        gram = np.block([[columns.T @ columns, along[:, None]], [along, target @ target]])
+        xty = columns.T @ target
+        gram = np.block([[columns.T @ columns, xty[:, None]], [xty, target @ target]])
         return WhitenedLeastSquares(gram, std, centre)
 
     def part(self, at: NDArray[np.intp]) -> WhitenedLeastSquares:
@@ -81,7 +81,7 @@ class WhitenedLeastSquares:
         """Return the objective at x (n,)."""
         return self.squares(x) + float(np.sum(((x - self.centre) / self.std) ** 2))
 
-    def surprise(self) -> float:
+    def marginal_deviance(self) -> float:
         """Return -2 log marginal likelihood of the target, without constants and the prior's determinant."""
         return self.misfit(self.solution()) + float(np.linalg.slogdet(self._normal)[1])
 
@@ -119,12 +119,12 @@ class ScoreTest:
         """Test whitened columns (m, c), zero but from row `first` on, beside an orthonormal basis q for a series."""
         rows = slice(first, first + len(white_columns))
         known, square = q[rows].T @ white_columns, white_columns.T @ white_columns
-        left = square - known.T @ known
-        before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, left))
+        scatter = square - known.T @ known
+        before, after = (np.sqrt(np.maximum(np.diag(each), 0.0)) for each in (square, scatter))
         has = after > 0.02 * np.maximum(before, 1e-300)
         size = np.where(has, after, 1.0)
         along = white_columns.T @ white[rows] - known.T @ (q.T @ white)
-        return ScoreTest(left / np.outer(size, size), along / size, has)
+        return ScoreTest(scatter / np.outer(size, size), along / size, has)
 
     def energy(self, at: NDArray[np.intp]) -> tuple[float, int]:
         """Return the energy that columns `at` explain jointly, and their rank."""

@@ -53,13 +53,13 @@ def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
             continue
         spare = []
         for effect in fit.effects:
-            rest = fit_without(fitter, fit, effect)
+            reduced = fit_without(fitter, fit, effect)
             chance = price(effect, n_effects, n, times_tried(effect)) - n_amplitudes(effect, n)
-            spare.append((predictive_gain_of(problem, rest, fit) - chance, rest))
-        worst, rest = min(spare, key=lambda each: each[0])
+            spare.append((predictive_gain_of(problem, reduced, fit) - chance, reduced))
+        worst, reduced = min(spare, key=lambda each: each[0])
         if worst > 0.0:
             return fit
-        fit = rest
+        fit = reduced
     return fit
 
 
@@ -94,7 +94,7 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
     others = [effect for effect in fit.effects if effect.name != whole.name]
     (again,) = (spec.name for spec in whole.parameters if spec.name in whole.again and is_time_of_run(spec))
     seconds = max(recording.seconds for recording in fitter.problem.recordings)
-    left = fit.deviance - fitter.straight_on(fit, fit.hypothesis)[0]
+    gain = fit.deviance - fitter.straight_on(fit, fit.hypothesis)[0]
     tried = []
     times = np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist()
     if whole.name == LEAP:
@@ -103,7 +103,7 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
         values = tuple({**whole.defaults, **each, again: at} for each in fit.values[whole.name])
         start = fit.hypothesis.with_effects([*others, whole], len(values), {whole.name: values})
         misfit, start = fitter.straight_on(fit, start)
-        if misfit + left > limit:
+        if misfit + gain > limit:
             continue
         if at < values[0][whole.again[again]]:
             names = {**whole.again, **{first: second for second, first in whole.again.items()}}

@@ -271,26 +271,26 @@ def by_other_clocks(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> 
     A clock jump at the beginning is a constant DVL delay.
     """
     n, values = len(fit.seen), fit.values
-    said = (*CLOCKS, LEAP) if jumps_at_start(fitter, fit) else CLOCKS
-    if not set(said) & set(values):
+    clocks = (*CLOCKS, LEAP) if jumps_at_start(fitter, fit) else CLOCKS
+    if not set(clocks) & set(values):
         return []
     dvl, reference, attitude = (
         np.array([each["seconds"] for each in values[name]]) if name in values else np.zeros(n) for name in CLOCKS
     )
     dvl, reference = dvl - attitude, reference - attitude
-    if LEAP in said:
+    if LEAP in clocks:
         dvl = dvl + [each["seconds"] for each in values[LEAP]]
-    rest = [effect for effect in fit.effects if effect.name not in said]
-    told = [
+    kept = [effect for effect in fit.effects if effect.name not in clocks]
+    alternatives = [
         {ATTITUDE_CLOCK: -0.5 * (dvl + reference)}, {DVL_CLOCK: dvl - reference}, {REFERENCE_CLOCK: reference - dvl},
         {DVL_CLOCK: dvl, REFERENCE_CLOCK: reference},
     ]  # fmt: skip
     found = []
-    for one in told:
-        if set(one) <= set(effects) and len(rest) + len(one) <= SETTINGS.max_effects:
-            start: dict[str, tuple[Values, ...]] = _at_other_times(fit, rest, dvl + attitude - one.get(DVL_CLOCK, 0.0))
+    for one in alternatives:
+        if set(one) <= set(effects) and len(kept) + len(one) <= SETTINGS.max_effects:
+            start: dict[str, tuple[Values, ...]] = _at_other_times(fit, kept, dvl + attitude - one.get(DVL_CLOCK, 0.0))
             start |= {name: tuple({"seconds": float(s)} for s in seconds) for name, seconds in one.items()}
-            found.append(fit.hypothesis.with_effects([*rest, *(effects[name] for name in one)], n, start))
+            found.append(fit.hypothesis.with_effects([*kept, *(effects[name] for name in one)], n, start))
     return found
 
 
@@ -310,9 +310,9 @@ def _at_other_times(fit: Fit, effects: Sequence[Effect], later: Array) -> dict[s
 
 def _with_lag_or_delay(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     """Return the fit with a lag of the reference for its delay, or a delay for its lag."""
-    rest = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
+    others = [effect for effect in fit.effects if effect.name not in LAG_OR_DELAY]
     return [
-        fit.hypothesis.with_effects([*rest, *(effects[name] for name in start)], len(fit.seen), start)
+        fit.hypothesis.with_effects([*others, *(effects[name] for name in start)], len(fit.seen), start)
         for start in lags_and_delays(fit, effects)
     ]
 

@@ -132,10 +132,10 @@ def with_jumps_in_gaps(fitter: Fitter, fit: Fit) -> Fit:
             times = fitter.problem.time
             near = (times > min(at, values[at_s]) - abs(gap)) & (times < max(at, values[at_s]) + abs(gap))
             fair = replace(fitter, outliers=np.where(near[:, None], 0.0, fitter.outliers), _fits={})
-            left = [fair.fit(each, fit.noise) for each in (fit.hypothesis, tried)]
-            before, after = (float((each.noise.whiten(each.residual) ** 2).sum()) for each in left)
+            refitted = [fair.fit(each, fit.noise) for each in (fit.hypothesis, tried)]
+            before, after = (float((each.noise.whiten(each.residual) ** 2).sum()) for each in refitted)
             if after < before + OF_A_TIME:
-                fit = fitter.fit(left[1].hypothesis, fit.noise)
+                fit = fitter.fit(refitted[1].hypothesis, fit.noise)
     return fit
 
 
@@ -193,8 +193,8 @@ def _found(squares: Array) -> Delays:
     n = squares.shape[1]
 
     def best(a: int, b: int) -> tuple[float, int]:
-        left = until[:, b] - until[:, a]
-        return float(left.min()), int(left.argmin())
+        gains = until[:, b] - until[:, a]
+        return float(gains.min()), int(gains.argmin())
 
     none = best(0, n)
     places = range(FEWEST_PARTS, n - FEWEST_PARTS + 1)

@@ -36,7 +36,7 @@ from ..model.stream_curve import FAST_ENOUGH_S
 from ..noise.noise_level import estimated
 from ..noise.noise_model import Noise, white_noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
-from .arm_clock_ambiguity import ARM, OpenArm, guessed_arm
+from .arm_clock_ambiguity import ARM, ArmAmbiguity, guessed_arm
 from .backward_elimination import (
     eliminate,
     only_predictive,
@@ -59,9 +59,9 @@ ROBUST_ROUNDS = 3
 class EffectSelection:
     """Selected effects, strongest first, with the fits without (`base`) and with them under the same noise.
 
-    testable: effects with their observable parameters. opened: trade-off of lever arm and clock at one speed. moved: by
-    arm parameter, the difference (m) to a fit with another clock that explains the data equally well. wider: the
-    hypothesis with effects that slow noise explains as well, which may nevertheless be there.
+    testable: effects with their observable parameters. trade_off: ambiguity of lever arm and clock at one speed.
+    changes: by arm parameter, the difference (m) to a fit with another clock that explains the data equally well.
+    wider: the hypothesis with effects that slow noise explains equally well.
     """
 
     selected: tuple[Selected, ...]
@@ -70,8 +70,8 @@ class EffectSelection:
     fitter: Fitter
     guesses: tuple[FirstGuess, ...]
     testable: Mapping[str, Effect]
-    opened: OpenArm | None = None
-    moved: Mapping[str, float] = field(default_factory=dict)
+    trade_off: ArmAmbiguity | None = None
+    changes: Mapping[str, float] = field(default_factory=dict)
     wider: Hypothesis | None = None
 
     def without(self, names: Collection[str]) -> EffectSelection:
@@ -101,14 +101,14 @@ def started(
     problem = make_problem(recordings, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
     _check_size(problem)
     every, effects = effects, observable_parts({name: effect.once for name, effect in effects.items()}, problem)
-    problem = replace(problem, unshown=unobservable_parts(every, effects))
+    problem = replace(problem, unobservable=unobservable_parts(every, effects))
     found: dict[str, tuple[Values, ...]] = {
         ARM: (guessed_arm(guesses, effects),) * len(guesses),
         "dvl_time_offset": tuple({"seconds": guess.offsets.dvl} for guess in guesses),
         "reference_time_offset": tuple({"seconds": guess.offsets.reference} for guess in guesses),
     }
     present = [effects[name] for name in START if name in effects]
-    phi = problem.shown_turns @ np.median([guess.phi for guess in guesses], axis=0)
+    phi = problem.observable_turns @ np.median([guess.phi for guess in guesses], axis=0)
     start = no_effect(phi).with_effects(present, len(guesses), found)
     return problem, start, guesses, effects
 
@@ -127,7 +127,7 @@ def select(
     kept = without_slow_outliers(problem, fit.hypothesis)
     if kept is not None:
         problem = make_problem(kept, rotation_dvl_from_body, lever_arm, [guess.offsets for guess in guesses])
-        problem = replace(problem, unshown=fitter.problem.unshown)
+        problem = replace(problem, unobservable=fitter.problem.unobservable)
         fitter, fit = _first_fit(problem, fit.hypothesis)
     fitter, fit = with_noise_reestimated(fitter, fit, every)
     far = fitter.bursts(fit)
@@ -161,7 +161,7 @@ def select(
     found = identify_effects(fitter, fit, guesses, effects, alike)
     base = fitter.fit_kept(found.fit.hypothesis.with_effects([], len(recordings), {}), found.fit.noise)
     return EffectSelection(
-        found.selected, base, found.fit, fitter, guesses, effects, found.opened, found.moved, wider.hypothesis
+        found.selected, base, found.fit, fitter, guesses, effects, found.trade_off, found.changes, wider.hypothesis
     )
 
 
@@ -199,12 +199,12 @@ def with_noise_reestimated(fitter: Fitter, fit: Fit, effects: Mapping[str, Effec
     frames = _frames(problem)
     for _ in range(2):
         explained, std = _explained(noise, columns, raw - fitter.outliers, own)
-        left = raw - explained
+        corrected = raw - explained
         noise, robust = min(
-            (estimated(problem, fit.seen, left, rotation, columns, std) for rotation in frames),
+            (estimated(problem, fit.seen, corrected, rotation, columns, std) for rotation in frames),
             key=lambda each: each[0].deviance(each[1]),
         )
-        frames, fitter = [noise.rotation], Fitter(problem, left - robust)
+        frames, fitter = [noise.rotation], Fitter(problem, corrected - robust)
     return fitter, fitter.fit(fit.hypothesis, noise)
 
 
@@ -216,7 +216,7 @@ def _columns_of_all_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effe
 
 def _with_simulated_noise(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]) -> Iterator[tuple[Array, Array]]:
     """Yield the same columns (M, A, p) and residual (M, A) with simulated noise in each velocity in turn."""
-    for problem in fitter.problem.shaken:
+    for problem in fitter.problem.perturbed:
         other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
         again = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
         yield _columns_of_all_effects(other, again, effects), problem.residual(seen)
@@ -321,8 +321,8 @@ def _with_heading_in_place(fit: Fit, names: Collection[str], heading: Effect) ->
     start = tuple({name: each.get(name, value) for name, value in none.items()} for each in own)
     if not heading.of_the_day:
         start = ({name: sum(each[name] for each in start) / n for name in none},) * n
-    rest = [effect for effect in fit.effects if effect.name not in names]
-    return fit.hypothesis.with_effects([*rest, heading], n, {HEADING: start})
+    others = [effect for effect in fit.effects if effect.name not in names]
+    return fit.hypothesis.with_effects([*others, heading], n, {HEADING: start})
 
 
 # Robust standard deviations from the other stream; an outlier exceeds these and `SETTINGS.outlying` from its neighbours
@@ -387,10 +387,10 @@ def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -
         return np.asarray(np.einsum("nji,nj->ni", recording.rotation_enu_from_body(true), values)) * measured
 
     usual = _scatter(in_body(curve.from_neighbours))
-    off = in_body((curve.values - others(curve.time)) / curve.loudness)
-    along = (off * error).sum(axis=1) / np.maximum((off**2).sum(axis=1), 1e-300) / curve.loudness.mean(axis=1)
-    bad = suspicious & others.covers(curve.time) & (np.abs(off / usual).max(axis=1) > SETTINGS.outlying)
-    bad &= (along > ALIKE[0]) & (along < ALIKE[1])
+    dev = in_body((curve.values - others(curve.time)) / curve.relative_noise)
+    gain = (dev * error).sum(axis=1) / np.maximum((dev**2).sum(axis=1), 1e-300) / curve.relative_noise.mean(axis=1)
+    bad = suspicious & others.covers(curve.time) & (np.abs(dev / usual).max(axis=1) > SETTINGS.outlying)
+    bad &= (gain > ALIKE[0]) & (gain < ALIKE[1])
     return ~bad
 
 

@@ -18,7 +18,7 @@ from ...calibration.numerics.frames import Array
 from ...calibration.streams.interpolation import shortened
 from ...effects.base import Effect
 from ...verdict.reasons import Reason, finding
-from ..fit.cross_validation import predictive_gain, surprise_elsewhere
+from ..fit.cross_validation import held_out_deviance, predictive_gain
 from ..fit.gauss_newton import Fit, Fitter
 from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
 from ..fit.selection_criteria import NuisanceFit, SlowNoiseOfFit
@@ -73,7 +73,7 @@ class Unexplained:
         return finding("REST_FOLLOWS", about=self.about)
 
 
-def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
+def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     """Test the residual of a fit against the dictionary.
 
     The null distribution is from recordings simulated from the fit (parametric bootstrap).
@@ -83,9 +83,9 @@ def unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     nothing = raw["time"][:, :, :0]
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
-    left = noise.whiten(fit.residual)
-    left = left / np.sqrt(float(left @ left) / (left.size - basis.shape[1]))
-    followed = lines(problem, left.reshape(-1, problem.axes))
+    whitened = noise.whiten(fit.residual)
+    whitened = whitened / np.sqrt(float(whitened @ whitened) / (whitened.size - basis.shape[1]))
+    followed = lines(problem, whitened.reshape(-1, problem.axes))
     tested = len(score_tests) + len(followed)
     found_events = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
     if found_events:  # slow noise explains a step as well, unless the step predicts better
@@ -164,8 +164,8 @@ def _score_tests(
     known = NuisanceFit.of(problem, fit.hypothesis, seen, own)
     q, white = _orthogonal_to_nuisances(known, noise.whiten(known.columns), noise.whiten(residual))
     white = white - q @ (q.T @ white)
-    unshown = known.columns.shape[2] - own.shape[2]
-    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unshown))
+    unobservable = known.columns.shape[2] - own.shape[2]
+    white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unobservable))
     score_tests: list[FollowTest] = []
     raw: dict[str, Array] = {}
     for name, functions in dictionary(problem, seen).items():
@@ -237,15 +237,15 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
     return found
 
 
-def matters(problem: Problem, fit: Fit, rest: Unexplained) -> bool:
+def is_predictive(problem: Problem, fit: Fit, unexplained: Unexplained) -> bool:
     """Return whether the regressor of the residual predicts held-out data better than slow noise and chance do."""
-    return rest.found and _is_predictive(problem, fit, rest.clearest, rest.price)
+    return unexplained.found and _is_predictive(problem, fit, unexplained.clearest, unexplained.price)
 
 
 def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:
     """Return whether columns (M, A, c), added to a fit, gain more than the least in held-out deviance."""
     slow = SlowNoiseOfFit.of_fit(problem, fit)
-    gain = predictive_gain(problem, slow, slow.with_rest(problem, fit.noise, columns))
+    gain = predictive_gain(problem, slow, slow.with_nuisance(problem, fit.noise, columns))
     return gain > least - columns.shape[2]
 
 
@@ -256,28 +256,28 @@ def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Un
     cause and is no rival. Only effects below `SETTINGS.instead_of` are tested.
     """
     fitter, fit = selection.fitter, selection.fit
-    problem, rest = fitter.problem, unexplained(fitter, fit)
+    problem, unexplained = fitter.problem, find_unexplained(fitter, fit)
     best: tuple[float, EffectSelection, Unexplained] | None = None
     for out in _subsets(selection):
         reduced = selection.without({effect.name for effect in out})
         drop = reduced.fit.deviance - fit.deviance
         if drop > SETTINGS.instead_of:
             continue
-        other = unexplained(fitter, reduced.fit)
-        if not other.found or is_of_group(problem, fit, out, other.about) or not matters(problem, reduced.fit, other):
+        new = find_unexplained(fitter, reduced.fit)
+        if not new.found or is_of_group(problem, fit, out, new.about) or not is_predictive(problem, reduced.fit, new):
             continue
-        gain = _better_elsewhere(problem, fit, reduced.fit, other) - SETTINGS.indistinguishable - INEXACT * drop
+        gain = _held_out_gain(problem, fit, reduced.fit, new) - SETTINGS.indistinguishable - INEXACT * drop
         if gain > 0.0 and (best is None or gain > best[0]):
-            best = gain, reduced, other
-    return (selection, rest) if best is None else best[1:]
+            best = gain, reduced, new
+    return (selection, unexplained) if best is None else best[1:]
 
 
-def _better_elsewhere(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
+def _held_out_gain(problem: Problem, fit: Fit, reduced: Fit, other: Unexplained) -> float:
     """Return the held-out deviance gain of an unmodelled regressor over the removed effects."""
-    whole, rest = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
-    rest = rest.and_rest(other.clearest, reduced.residual)
-    effects = surprise_elsewhere(problem, fit.noise, whole, fit.residual)
-    return effects - surprise_elsewhere(problem, fit.noise, rest, reduced.residual)
+    full, reduced_fit = (NuisanceFit.of_fit(problem, each) for each in (fit, reduced))
+    reduced_fit = reduced_fit.and_nuisance(other.clearest, reduced.residual)
+    effects = held_out_deviance(problem, fit.noise, full, fit.residual)
+    return effects - held_out_deviance(problem, fit.noise, reduced_fit, reduced.residual)
 
 
 def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
@@ -285,11 +285,11 @@ def _subsets(selection: EffectSelection) -> list[tuple[Effect, ...]]:
     return [out for n in range(1, min(2, len(effects)) + 1) for out in itertools.combinations(effects, n)]
 
 
-def moved_by(problem: Problem, fit: Fit, rest: Unexplained) -> Array:
+def nuisance_shift(problem: Problem, fit: Fit, unexplained: Unexplained) -> Array:
     """Return the shift (6 + p,) of a fit's parameters with the most significant columns as nuisance."""
-    both = SlowNoiseOfFit.of_fit(problem, fit).with_rest(problem, fit.noise, rest.clearest)
-    stands = both.known._replace(centre=np.zeros_like(both.known.centre))  # linearised at the fit, whatever its prior
-    return stands.step(both.noise, fit.residual).solution()[: fit.columns.shape[2]]
+    slow = SlowNoiseOfFit.of_fit(problem, fit).with_nuisance(problem, fit.noise, unexplained.clearest)
+    system = slow.known._replace(centre=np.zeros_like(slow.known.centre))  # linearised at the fit, whatever its prior
+    return system.step(slow.noise, fit.residual).solution()[: fit.columns.shape[2]]
 
 
 def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: str | float) -> bool:
@@ -304,11 +304,11 @@ def is_of_group(problem: Problem, fit: Fit, effects: Sequence[Effect], about: st
     own = [6 + at for at, each in enumerate(parameters) if each.effect in effects]
     functions = _along_axes(groups[about], problem.axes)
     calibration = orthonormal(noise.whiten(fit.columns[:, :, :6]))
-    asked = noise.whiten(fit.columns[:, :, own])
-    asked = asked - calibration @ (calibration.T @ asked)
+    own_columns = noise.whiten(fit.columns[:, :, own])
+    own_columns = own_columns - calibration @ (calibration.T @ own_columns)
     group = orthonormal(np.concatenate([calibration, noise.whiten(functions)], axis=1))
-    left = asked - group @ (group.T @ asked)
-    return bool(((left**2).sum(axis=0) < OF_GROUP * (asked**2).sum(axis=0)).all())
+    residual = own_columns - group @ (group.T @ own_columns)
+    return bool(((residual**2).sum(axis=0) < OF_GROUP * (own_columns**2).sum(axis=0)).all())
 
 
 def _along_axes(functions: Array, axes: int) -> Array:

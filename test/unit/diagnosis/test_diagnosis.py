@@ -32,7 +32,7 @@ from dvl_calib_ros.diagnosis.model.time_grid import Grid, Offsets
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.noise.whitened_least_squares import WhitenedLeastSquares
 from dvl_calib_ros.diagnosis.search import candidates, observable_parameters
-from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, lags_and_delays, moved_arm, with_moved
+from dvl_calib_ros.diagnosis.search.arm_clock_ambiguity import CLOCKS, arm_change, lags_and_delays, with_changes
 from dvl_calib_ros.diagnosis.search.backward_elimination import (
     repeated_effects,
 )
@@ -285,7 +285,7 @@ def test_a_pitch_of_the_mounting_that_is_not_shown_is_no_coupling_to_tilt():
     errors = DvlErrors((0.02, 0.1, 0.01), (0.005,) * 3, beam_std=0.002)
     given = scenario(gnss_std=0.004, waves=Waves(0.06, 6.0), seed=1, dvl_rate=5.0, gnss_rate=5.0, errors=errors)
     diagnosis = diagnose_recordings([recording_of(simulate(given), given.gnss_frame, axes="xy")], Parameters())
-    assert diagnosis.selection is not None and np.trace(diagnosis.selection.fitter.problem.shown_turns) < 1.5
+    assert diagnosis.selection is not None and np.trace(diagnosis.selection.fitter.problem.observable_turns) < 1.5
     assert diagnosis.verdict not in CLAIMS
 
 
@@ -295,8 +295,8 @@ def test_a_turn_that_is_not_shown_and_that_the_mounting_found_has_is_not_left_at
     given = scenario(gnss_std=0.004, waves=Waves(0.06, 6.0), seed=1, dvl_rate=5.0, gnss_rate=5.0, errors=errors)
     recording = recording_of(simulate(given), given.gnss_frame, axes="xy")
     problem, start, (guess,), _ = started([recording], np.eye(3), np.zeros(3), EFFECTS)
-    assert guess.phi[1] == pytest.approx(-0.2, abs=0.05) and np.trace(problem.shown_turns) < 1.5
-    np.testing.assert_allclose(problem.shown_turns @ start.phi, start.phi, atol=1e-12)
+    assert guess.phi[1] == pytest.approx(-0.2, abs=0.05) and np.trace(problem.observable_turns) < 1.5
+    np.testing.assert_allclose(problem.observable_turns @ start.phi, start.phi, atol=1e-12)
     assert start.phi[2] == pytest.approx(-0.01, abs=0.02)
 
 
@@ -308,11 +308,13 @@ def test_what_is_not_shown_of_an_effect_is_its_where_it_is_named():
     problem, start, _, testable = started([recording], np.eye(3), np.zeros(3), every)
     tilt = every["tilt_coupling"]
     roll = tilt.without({spec.name for spec in tilt.parameters} - {"y_per_roll"})
-    problem = replace(problem, unshown=observable_parameters.unobservable_parts({tilt.name: tilt}, {tilt.name: roll}))
+    problem = replace(
+        problem, unobservable=observable_parameters.unobservable_parts({tilt.name: tilt}, {tilt.name: roll})
+    )
     seen = problem.all_seen(start)
-    turns = problem.unshown_columns(start, seen)[0].shape[2]
+    turns = problem.unobservable_columns(start, seen)[0].shape[2]
     named = start.with_effects([*start.effects, roll], 1, {roll.name: ({"y_per_roll": -0.9},)})
-    columns, sizes = problem.unshown_columns(named, seen)
+    columns, sizes = problem.unobservable_columns(named, seen)
     assert columns.shape[2] == len(sizes) == turns + 3
     of_pitch = problem.columns(named, seen, tilt, (tilt.defaults,))[:, :, 0]
     np.testing.assert_allclose(columns[:, :, turns], of_pitch, atol=1e-9)
@@ -1209,8 +1211,8 @@ def test_an_arm_that_may_be_another_is_so_after_an_effect_was_dropped():
     there_were, there_are = (no_effect().with_effects(some, 1, values) for some in ([lag, arm], [arm.without({"z_m"})]))
     fit = Mock(spec=Fit, hypothesis=there_were, values=there_were.values)
     near, far = ({arm.name: ({"x_m": x, "y_m": 0.2},)} for x in (0.6, 0.9))
-    moved = moved_arm(fit, [Mock(spec=Hypothesis, values=each) for each in (near, far, {})])
-    added = with_moved(Mock(spec=Fit, hypothesis=there_are), np.eye(8), moved) - np.eye(8)
+    moved = arm_change(fit, [Mock(spec=Hypothesis, values=each) for each in (near, far, {})])
+    added = with_changes(Mock(spec=Fit, hypothesis=there_are), np.eye(8), moved) - np.eye(8)
     expected = np.zeros((8, 8))
     expected[6:, 6:] = np.outer([0.4, 0.1], [0.4, 0.1])
     np.testing.assert_allclose(added, expected, atol=1e-12)

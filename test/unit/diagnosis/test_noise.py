@@ -376,8 +376,8 @@ def test_tails_of_noise_are_known_from_samples_that_are_close(rng, degrees, low,
     time = np.arange(1850) / 5.0
     white = rng.standard_t(degrees, (1850, 3)) / np.sqrt(3.0) if degrees else rng.standard_normal((1850, 3))
     curve = Curve(time, np.sin(time[:, None] / [3.0, 5.0, 7.0]) + 0.01 * white)
-    assert low <= curve.tails <= high
-    assert curve.part(np.arange(1850) % 5 == 0).tails == 1.0
+    assert low <= curve.noise_excess <= high
+    assert curve.part(np.arange(1850) % 5 == 0).noise_excess == 1.0
 
 
 def test_what_heavy_tails_add_to_the_noise_that_a_lag_takes_off_is_not_explained(monkeypatch):
@@ -388,8 +388,8 @@ def test_what_heavy_tails_add_to_the_noise_that_a_lag_takes_off_is_not_explained
     lag = EFFECTS["reference_lag"]
     start = no_effect().with_effects([lag], 1, {lag.name: ({"time_constant_s": 0.4},)})
     gains = []
-    for tails in ((1.0, 1.0), (1.5, 1.5)):
-        monkeypatch.setattr(Problem, "tails", tails[: len(problem.shaken)])
+    for noise_excess in ((1.0, 1.0), (1.5, 1.5)):
+        monkeypatch.setattr(Problem, "noise_excess", noise_excess[: len(problem.perturbed)])
         rest, fit = fitter.fit(no_effect(), noise), fitter.fit(start, noise, fixed=frozenset([lag.name]))
         gains.append(fit.gain_over(rest))
     taken_off = float(rest.own_noise @ rest.own_noise - fit.own_noise @ fit.own_noise)
