@@ -228,7 +228,7 @@ CONFIGURATIONS = on_page(
     reject(
         "REFERENCE_FRAME_OTHER",
         "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}, which is used",
-        means="A gnss_frame that is given is not questioned.",
+        means="A configured gnss_frame is used without a check.",
         remedy="correct the frame in the reference's driver",
     ),
     reject(
@@ -246,7 +246,7 @@ CONFIGURATIONS = on_page(
     reject(
         "TRAVELS_ASTERN",
         "with the mounting {given} the vehicle travels astern; it goes ahead with {found}",
-        means="A vehicle that drives astern looks the same; a mounting given with -p is not questioned.",
+        means="A vehicle that drives astern looks the same; a mounting configured with -p is used without a check.",
         remedy="try -p mounting_rpy:={option}{also}; if the vehicle did drive astern, record it driving ahead",
     ),
     marginal(

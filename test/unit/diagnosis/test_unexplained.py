@@ -80,7 +80,7 @@ def test_what_a_step_from_a_fit_at_rest_promises_is_promised_of_no_hypothesis_ne
     given = scenario("lawnmower", seconds=300.0, errors=errors, dvl_rate=1.0, gnss_rate=5.0, gnss_std=0.02)
     effects = {"lever_arm": {}, "dvl_time_offset": {}, "reference_time_offset": {}}
     fitter, fit, _ = fitted(given, effects)
-    promised, looked = fitter._promised(fit), fitter._linearised(fit.hypothesis, fit.noise)
+    promised, looked = fitter._predicted_gain(fit), fitter._linearised(fit.hypothesis, fit.noise)
 
     def is_surely_worse(by: float, promised: float) -> bool:
         return fitter._is_surely_worse(fit.hypothesis, looked, fit.noise, fit.deviance - by, promised)
