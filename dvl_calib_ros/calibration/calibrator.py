@@ -344,9 +344,9 @@ class Calibrator:
         return counted(self._aligner, self.selection.gnss.losses, self.restarts, restarted)
 
     @property
-    def refused_as(self) -> Mapping[str, set[str]]:
+    def reason_of_refusal(self) -> Mapping[str, set[str]]:
         """Names of the counters that hold refused messages, by stream."""
-        return self._aligner.refused_as
+        return self._aligner.reason_of_refusal
 
     @property
     def first_ns(self) -> int | None:

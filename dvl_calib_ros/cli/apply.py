@@ -171,9 +171,9 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
         found = "found" if calibrated.lever_arm_found else "as lever_arm says"
         lines.append(f"lever arm: {_metres(calibrated.lever_arm)} from the reference point, {found}")
     if calibrated.dvl_time_offset:
-        late = "late" if calibrated.dvl_time_offset > 0.0 else "early"
+        way = "late" if calibrated.dvl_time_offset > 0.0 else "early"
         lines.append(
-            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {late} against the IMU's in "
+            f"delay:  the DVL's stamps are {abs(calibrated.dvl_time_offset):.3f} s {way} against the IMU's in "
             "this recording: URDF and TF have no delay; --params writes dvl_time_offset, or set the DVL's clock"
         )
     if calibrated.position is not None:

@@ -299,25 +299,25 @@ def _number(text: str) -> float:
     return number if 0.0 < number < 1e9 else 0.0
 
 
-def _stream(status: Status, name: str, shown: str) -> str:
+def _stream(status: Status, name: str, label: str) -> str:
     age = status.get(f"{name} age [s]")
-    return f"{shown} none yet" if age == "-" else f"{shown} {status.get(f'{name} rate [Hz]')} Hz, {age} s ago"
+    return f"{label} none yet" if age == "-" else f"{label} {status.get(f'{name} rate [Hz]')} Hz, {age} s ago"
 
 
-def _quantity(status: Status, name: str, unit: str, shown: str) -> str:
+def _quantity(status: Status, name: str, unit: str, label: str) -> str:
     value, std = status.get(f"mounting {name} [{unit}]"), status.get(f"sigma mounting {name} [{unit}]")
     is_estimated = std[:1].isdigit() and status.values.get("samples used") != "0"  # without a sample σ is the prior's
-    return f"{name:5} {value:>7}" + (f" ±{std}{shown}" if is_estimated else f"{shown}, as set").ljust(11)
+    return f"{name:5} {value:>7}" + (f" ±{std}{label}" if is_estimated else f"{label}, as set").ljust(11)
 
 
-def _goal_row(status: Status, key: str, shown: str, width: int) -> Row:
+def _goal_row(status: Status, key: str, label: str, width: int) -> Row:
     """Return one row with a value, its progress bar, and the predicted drift."""
     percent = min(_number(status.get(f"goal {key} [%]")), 100.0)
     names = {"worth": "worth", "side": "worth to the side", "ahead": "worth ahead"}
     goal = f", goal {status.get('target')}" if key == "worth" else ""
     bar = max(0, min(BAR, width - 34))
     full = round(bar * percent / 100.0)
-    text = f"{shown:7}{'█' * full}{'░' * (bar - full)} {percent:3.0f} %  {status.get(names[key])} m/km{goal}"
+    text = f"{label:7}{'█' * full}{'░' * (bar - full)} {percent:3.0f} %  {status.get(names[key])} m/km{goal}"
     return Row(text, "green" if percent >= 100.0 else "yellow")
 
 

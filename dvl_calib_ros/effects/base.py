@@ -126,7 +126,7 @@ class EffectParameter:
     said: str | None = None
 
     @property
-    def spoken(self) -> str:
+    def display_name(self) -> str:
         """Return the displayed name before value and unit."""
         return self.name if self.said is None else self.said
 

@@ -144,8 +144,8 @@ def cross_check(
 
 def _notes_of(replayed: _Replayed, models: Sequence[str]) -> Iterator[str]:
     """Yield the notes on the models asked for; if all are, only on the selected one."""
-    asked = {replayed.selected[0]} if set(models) == set(BY_VELOCITY) else set(models)
-    others = tuple(f"{name}: " for name in MODELS if name not in asked)
+    requested = {replayed.selected[0]} if set(models) == set(BY_VELOCITY) else set(models)
+    others = tuple(f"{name}: " for name in MODELS if name not in requested)
     yield from (note for note in (*replayed.failed, *replayed.notes) if not note.startswith(others))
 
 
@@ -248,8 +248,8 @@ BEYOND = ("lever_arm_x", "lever_arm_y", "lever_arm_z", "time_offset")
 def _terms(estimate: Estimate) -> Terms:
     """Return the corrections by an estimate."""
     errors = MODELS[estimate.model].error_terms_from_state @ estimate.state
-    *arm, late = (estimate.state_of(name) for name in BEYOND)
-    return Terms(errors, np.array(arm), late)
+    *arm, delay = (estimate.state_of(name) for name in BEYOND)
+    return Terms(errors, np.array(arm), delay)
 
 
 def cross_check_document(check: CrossCheck) -> dict[str, Any]:

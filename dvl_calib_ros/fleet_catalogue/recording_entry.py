@@ -79,7 +79,7 @@ class StoredRecording:
         return as_text(folders[0] if len(folders) > 1 else PurePosixPath(self.place).name or self.place)
 
     @contextmanager
-    def at_hand(self) -> Iterator[Path]:
+    def local_copy(self) -> Iterator[Path]:
         """Yield a local path of the recording."""
         if not self.is_remote:
             if not os.path.exists(self.where):  # missing on another worker's machine; the recording itself has no fault
@@ -281,7 +281,7 @@ def entry_of(task: Task) -> Entry:
     """Calibrate with a recording. Any exception becomes the entry's error."""
     where = task.recording.name
     try:
-        with task.recording.at_hand() as path:
+        with task.recording.local_copy() as path:
             try:
                 return _calibrate(task, path)
             except InputError as error:
@@ -348,12 +348,12 @@ def _day(stamp_ns: int) -> date | None:
 def _quantities(result: Result) -> list[Row]:
     """Return rows of mounting, scale and delay, with σ of the filter, of this recording, and of the next."""
     estimate = result.estimate
-    claims = (estimate.filter_covariance, estimate.recording_covariance, estimate.covariance)
+    covariances = (estimate.filter_covariance, estimate.recording_covariance, estimate.covariance)
     by_claim = [
         quantities(
             replace(result, estimates={**result.estimates, result.selected: replace(estimate, covariance=claim)})
         )
-        for claim in claims
+        for claim in covariances
     ]
     return [
         {

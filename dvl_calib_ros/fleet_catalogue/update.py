@@ -322,9 +322,9 @@ def _read_catalogue(catalogue: Catalogue, calibrated: int, unchanged: int, notes
     )
 
 
-def _check_reach(left: Sequence[StoredRecording], workers: Workers) -> None:
+def _check_reach(remaining: Sequence[StoredRecording], workers: Workers) -> None:
     """Raise InputError for files that other processes cannot read."""
-    for each in left:
+    for each in remaining:
         if each.where.startswith("memory://") and (workers.dask or workers.jobs != 1):
             raise InputError(f"{each.where}: is in the memory of this process alone; read it with --jobs 1")
 

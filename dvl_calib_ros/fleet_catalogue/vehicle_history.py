@@ -39,15 +39,15 @@ class Catalogued:
     cause_of_scale: str = ""
 
     @staticmethod
-    def of(recording: str, vehicle: str, rows: Sequence[Row], told: Mapping[str, Any] | None) -> Catalogued:
+    def of(recording: str, vehicle: str, rows: Sequence[Row], document: Mapping[str, Any] | None) -> Catalogued:
         """Build from the plain data of a part."""
-        if told is None:
+        if document is None:
             return Catalogued(recording, vehicle, tuple(rows))
-        values = {field.name: told[field.name] for field in fields(Extrinsics) if field.name in told}
+        values = {field.name: document[field.name] for field in fields(Extrinsics) if field.name in document}
         for name in values.keys() & {"value", "covariance", "by_bias"}:
             values[name] = np.array(values[name])
         values["shown"] = np.array(values["shown"], dtype=bool)
-        covariance, cause = np.array(told["covariance_of_recording"]), str(told.get("cause_of_scale", ""))
+        covariance, cause = np.array(document["covariance_of_recording"]), str(document.get("cause_of_scale", ""))
         return Catalogued(recording, vehicle, tuple(rows), Extrinsics(**values), covariance, cause)
 
     @property

@@ -126,16 +126,16 @@ def instrument_settings(
 
 
 def _recorded_sound(
-    calibrated: CalibratedMounting, instrument: Instrument, told: Mapping[str, float]
+    calibrated: CalibratedMounting, instrument: Instrument, now: Mapping[str, float]
 ) -> dict[str, float]:
     """Return the speed of sound used in the recording. Raises InputError if another was given."""
     used = math.nan if calibrated.water is None else calibrated.water.used
     holds = instrument.ranges.get(SPEED_OF_SOUND)
     if holds is None or not holds.least <= used <= holds.most:
         return {}
-    if abs(told.get(SPEED_OF_SOUND, used) - used) > SAME_SPEED:
+    if abs(now.get(SPEED_OF_SOUND, used) - used) > SAME_SPEED:
         raise InputError(
-            f"{SPEED_OF_SOUND}={told[SPEED_OF_SOUND]:g}: the recording says that the DVL used {used:.1f} m/s; leave it "
+            f"{SPEED_OF_SOUND}={now[SPEED_OF_SOUND]:g}: the recording says that the DVL used {used:.1f} m/s; leave it "
             "out, or calibrate with a recording of that setting"
         )
     return {SPEED_OF_SOUND: round(used, 2)}
@@ -205,16 +205,16 @@ def _ardupilot(calibrated: CalibratedMounting, now: Mapping[str, float]) -> tupl
     rotation = calibrated.rotation_body_from_dvl
     clockwise = -math.atan2(rotation[1, 0], rotation[0, 0])
     quarters = round(clockwise / QUARTER)
-    off = math.remainder(clockwise - quarters * QUARTER, 2.0 * math.pi)
-    if abs(off) > NEAR_QUARTER:
+    error = math.remainder(clockwise - quarters * QUARTER, 2.0 * math.pi)
+    if abs(error) > NEAR_QUARTER:
         raise InputError(
             f"ardupilot: the DVL is rotated by {math.degrees(clockwise):+.1f}° (clockwise), and VISO_ORIENT has only "
             "quarter turns; set the rest in the DVL itself (--instrument waterlinked or cerulean)"
         )
     settings.append(Setting("VISO_ORIENT", now.get("VISO_ORIENT"), float(quarters % 4 * 2)))
-    if abs(off) > REPORTED_FROM_RAD:
+    if abs(error) > REPORTED_FROM_RAD:
         notes.append(
-            f"{math.degrees(off):+.2f}° of yaw (clockwise) remain: VISO_ORIENT has only quarter turns. Set them in "
+            f"{math.degrees(error):+.2f}° of yaw (clockwise) remain: VISO_ORIENT has only quarter turns. Set them in "
             "the DVL itself (--instrument waterlinked or cerulean)"
         )
     delay = round(1000.0 * calibrated.dvl_time_offset)
@@ -270,10 +270,10 @@ def _residual_notes(calibrated: CalibratedMounting, swing: Array) -> list[str]:
 
 def _delay(calibrated: CalibratedMounting) -> list[str]:
     """Return a note on a DVL delay, for which the instrument has no setting."""
-    late = calibrated.dvl_time_offset
+    delay_s = calibrated.dvl_time_offset
     return (
-        [f"the DVL's stamps are {late:+.3f} s late against the IMU's, for which the instrument has no setting"]
-        if late
+        [f"the DVL's stamps are {delay_s:+.3f} s late against the IMU's, for which the instrument has no setting"]
+        if delay_s
         else []
     )
 

@@ -62,8 +62,8 @@ def numbers_of(path: Path, rows: Sequence[Sequence[str]], at: Sequence[int], n_c
         try:
             values.append([math.nan if row[i].strip().lower() in NO_VALUE else _number(row[i]) for i in at])
         except ValueError:
-            shown = ",".join(row)[:SHOWN]
-            raise InputError(f"{path}: data row {number} is not all numbers: {shown}; expected {EXPECTED}") from None
+            excerpt = ",".join(row)[:SHOWN]
+            raise InputError(f"{path}: data row {number} is not all numbers: {excerpt}; expected {EXPECTED}") from None
     return np.array(values, dtype=float).reshape(-1, len(at))
 
 
@@ -398,8 +398,8 @@ def read_table(path: Path, text: str, start_ns: int, rotation: Array, std: float
             x, y, z = velocity.tolist()
             samples.append(DvlSample(stamp_ns, (x, y, z), covariance))
     if not samples:
-        shown = repr(",".join(rows[-1])[:SHOWN]) if rows else "it is empty"
-        raise InputError(f"{path}: no row with time and velocity in the columns of --columns; the last is {shown}")
+        excerpt = repr(",".join(rows[-1])[:SHOWN]) if rows else "it is empty"
+        raise InputError(f"{path}: no row with time and velocity in the columns of --columns; the last is {excerpt}")
     return DvlLog(sorted({each.stamp_ns: each for each in samples}.values(), key=lambda each: each.stamp_ns), left_out)
 
 

@@ -499,8 +499,8 @@ def may_be_recognised(name: str) -> bool:
 def velocity_type(parameter: str, name: str) -> VelocityType:
     """Return the type in parameter dvl_type or gnss_type (package/msg/Name or package/Name). Raises InputError."""
     types = TYPES_OF[parameter]
-    package, _, rest = name.partition("/")
-    found = types.get(f"{package}/msg/{rest.removeprefix('msg/')}")
+    package, _, name_in_package = name.partition("/")
+    found = types.get(f"{package}/msg/{name_in_package.removeprefix('msg/')}")
     if found is None:
         raise InputError(f"{parameter}: {name!r} is none of {', '.join(types)}")
     return found

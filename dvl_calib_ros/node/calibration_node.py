@@ -353,11 +353,11 @@ class CalibrationNode(AnsweringNode):
 
     def _use_claimed_heading_std(self, message: Any) -> None:
         """Restart with the heading accuracy in the first IMU message that states one, as a replay does."""
-        claimed = math.sqrt(heading_variance(message.orientation_covariance))
-        if math.isnan(claimed):
+        reported = math.sqrt(heading_variance(message.orientation_covariance))
+        if math.isnan(reported):
             return
         self._awaits_heading_std = False
-        std = believed_heading(claimed)
+        std = believed_heading(reported)
         if std is not None:
             self._start(self._calibrator.parameters.replace(heading_deviation_std=std), self._initial, self._feed)
 

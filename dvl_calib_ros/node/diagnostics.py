@@ -25,7 +25,7 @@ from ..calibration.numerics.kalman import GaussianState
 from ..calibration.numerics.samples import Stream
 from ..calibration.registration.clock_domains import arrival_offset
 from ..calibration.results.results import Estimate, scale_and_delay
-from ..calibration.streams.aligner import whereabouts
+from ..calibration.streams.aligner import counts_by_use
 from ..errors import printable
 from ..messages.drivers import VelocityType
 from ..verdict.kinds import Severity
@@ -108,7 +108,7 @@ class Silence:
         """Return the fault of each faulty stream. counts: the calibrator's current ones."""
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
-            lost = _NOT_TAKEN | calibrator.refused_as[stream]
+            lost = _NOT_TAKEN | calibrator.reason_of_refusal[stream]
             taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
             before = self._seen.get(stream)
             if before is None or before.taken != taken:
@@ -279,7 +279,7 @@ def _count_values(calibrator: Calibrator, estimate: Estimate, counts: Counts) ->
     """Return the counts of samples by use, and of messages by stream and reason, as text."""
     values, model = {"samples used": str(estimate.used), "samples gated": str(estimate.gated)}, MODELS[estimate.model]
     if not model.from_positions:  # these models use positions instead of DVL samples
-        where = whereabouts(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
+        where = counts_by_use(counts, model.needs, calibrator.n_given(model.name), estimate.used, estimate.gated)
         values |= {f"samples {name}": str(count) for name, count in where.items()}
     for stream, tally in counts.items():
         for name, count in tally.items():

@@ -64,11 +64,11 @@ class LateClocks:
         if self.stand or registration is None or registration is self._before:
             return None
         before, self._before = self._before, registration
-        late = registration.corrections
-        if before is None or not late or not _are_alike(before.corrections, late):
+        corrections = registration.corrections
+        if before is None or not corrections or not _are_alike(before.corrections, corrections):
             return None
         self.stand = True
-        taken = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in late.items()}
+        taken = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in corrections.items()}
         self.found = [
             finding("CLOCK_TAKEN_OFF", clock=registration.clock_reason(name), parameter=name, value=seconds)
             for name, seconds in taken.items()

@@ -104,11 +104,11 @@ DIFFERENCES_NOTE = (
 
 def _differences(differences: Sequence[Difference], names: Sequence[str]) -> Table:
     """Return the table of differences between calibrations, with σ and p of the mounting."""
-    shown = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
+    quantities = [each for each in QUANTITIES if any(pair.compared[each.component] for pair in differences)]
     columns: Columns[tuple[str, Difference, float]] = {
         "": lambda each: each[0],
         **columns_for(
-            {f"{each.name}, {each.unit}": each for each in shown},
+            {f"{each.name}, {each.unit}": each for each in quantities},
             lambda each, quantity: with_std(
                 quantity.factor * each[1].value[quantity.component],
                 quantity.factor * each[1].std[quantity.component],

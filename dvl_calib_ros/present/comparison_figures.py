@@ -86,8 +86,8 @@ def _draw_quantity(axes: Axes, comparison: Comparison, quantity: ComparedQuantit
         axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
     else:
         names = [each.name for each in comparison.calibrations]
-        shown = [name if len(name) <= 16 else f"{name[:7]}…{name[-8:]}" for name in names]
-        axes.set_xticks(range(len(names)), shown, rotation=30, ha="right")
+        labels = [name if len(name) <= 16 else f"{name[:7]}…{name[-8:]}" for name in names]
+        axes.set_xticks(range(len(names)), labels, rotation=30, ha="right")
         axes.set_xlim(-0.5, len(names) - 0.5)
     axes.margins(y=0.25)
     axes.set_ylabel(f"{quantity.name}, {quantity.unit}", color=INK)

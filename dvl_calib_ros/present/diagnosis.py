@@ -232,8 +232,8 @@ def _main_numbers(d: Diagnosis) -> list[Number]:
         found.append(Number("with the effects", f"{mm(gap.after)} mm/s", note="held-out rms, noise included"))
         note = f"of the gap beyond the noise, {share(low)} to {share(high)} (95 %)"
         found.append(Number("closed", share(gap.closure), note=note))
-    claimed = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
-    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white and slow, by likelihood{claimed}"))
+    reported = "" if gap.reported is None else f"; the messages claim {mm(gap.reported)} mm/s"
+    found.append(Number("noise", f"{mm(gap.noise_floor)} mm/s", note=f"white and slow, by likelihood{reported}"))
     return [*found, Number("not explained", f"{mm(gap.not_explained)} mm/s", note="beyond the noise")]
 
 
@@ -250,17 +250,17 @@ def _residual_items(d: Diagnosis) -> Iterator[Item]:
     if series is None:
         yield Sentence(amount)
         return
-    rest = series.rest
-    if rest.found:
-        text = rest.follows.full_sentence.removesuffix(".")
+    unexplained = series.rest
+    if unexplained.found:
+        text = unexplained.follows.full_sentence.removesuffix(".")
     else:
         text = "Nothing in it follows motion or time more than chance would"
-    p = p_value(math.exp(rest.log_p))
+    p = p_value(math.exp(unexplained.log_p))
     yield Sentence(f"{amount} {text} (p {p if p.startswith('<') else f'= {p}'}).")
     if series.followed:
         where, followed = series.axes[series.followed.axis], series.followed
         yield figure(
-            "diagnosis_pictures.against_what_it_follows",
+            "diagnosis_pictures.residual_over_regressor",
             f"Residual {where}, against {followed.label.partition(',')[0]}",
             f"Residual of the fit {where} against {followed.label}, with means of groups and their standard deviations",
             followed,
@@ -293,7 +293,7 @@ DETECTABLE_NOTE = (
 DETECTABLE: Columns[Detectable] = {
     "effect": lambda each: each.effect,
     "smallest size found": lambda each: Cell(
-        f"{each.spec.spoken if each.spec else each.parameter} {three(each.said[0][0])} {each.said[1]}".strip(),
+        f"{each.spec.display_name if each.spec else each.parameter} {three(each.said[0][0])} {each.said[1]}".strip(),
         "text" if each.spec is None else "text good" if each.size <= each.spec.typical else "text far",
     ),
     "relevant size": lambda each: f"{two(each.said[0][1])} {each.said[1]}" if each.spec else "–",

@@ -52,7 +52,7 @@ def over_time(time: TimeAxis, stamps_ns: Array, series: Mapping[str, Array], poi
         axes.plot(where[kept], mean[kept], color=colour, linewidth=width, label=name)
     axes.axhline(0.0, color=INK, linewidth=0.7)
     axes.set_ylabel(label)
-    time.dress(axes)
+    time.label_time(axes)
     legend_above(axes)
     return figure
 
@@ -162,13 +162,13 @@ def quantiles(values: Mapping[str, Array], noise: Array) -> Figure:
     return figure
 
 
-def against_what_it_follows(followed: Followed, label: str) -> Figure:
+def residual_over_regressor(followed: Followed, label: str) -> Figure:
     """Draw the residual against its explaining variable: samples, group means with two standard errors, and scatter."""
     figure, axes = new_figure(height=3.2)
     at, mean, std, error = followed.groups()
-    shown = slice(None, None, max(1, len(followed.at) // SCATTER_POINTS))
+    thinned = slice(None, None, max(1, len(followed.at) // SCATTER_POINTS))
     axes.plot(
-        followed.at[shown], MM * followed.left[shown], ".", color=FAINT, markersize=2.5, label="residual", zorder=1,
+        followed.at[thinned], MM * followed.left[thinned], ".", color=FAINT, markersize=2.5, label="residual", zorder=1,
         rasterized=True,
     )  # fmt: skip
     axes.fill_between(at, MM * (mean - std), MM * (mean + std), color=AFTER, alpha=0.15, linewidth=0.0, label="σ")

@@ -197,27 +197,27 @@ def _convergence(e: Evaluation) -> Section:
         for k, seconds in enumerate(TIMES_S)
     ]
     table = Table(("first", *(each.label for each in e.convergence)), rows, notes=(CONVERGENCE_NOTE,), dense=True)
-    shown = [each for each in e.convergence if each.name in MODELS]
+    curves = [each for each in e.convergence if each.name in MODELS]
     drawn = []
     for what, values in (
-        ("Pitch and yaw", [each.level_deg for each in shown]),
-        ("The whole angle", [each.angle_deg for each in shown]),
+        ("Pitch and yaw", [each.level_deg for each in curves]),
+        ("The whole angle", [each.angle_deg for each in curves]),
     ):
-        text = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(shown, values, strict=True))
+        text = "; ".join(f"{each.label}: {value[-1]:.2f}°" for each, value in zip(curves, values, strict=True))
         drawn.append(
             figure(
                 "evaluation_figures.misalignment_over_time",
                 f"{what}, error against time",
                 f"{what} against time; after {TIMES_S[-1]:g} s {text}",
                 TIMES_S,
-                [each.name for each in shown],
-                [each.gnss_std for each in shown],
+                [each.name for each in curves],
+                [each.gnss_std for each in curves],
                 values,
                 (PUBLISHED_S, PUBLISHED_DEG),
                 caption="rms over runs, combinations of errors and seeds. Star: published for a network.",
             )
         )
-    return section("How fast is the misalignment found?", SideBySide(drawn) if shown else None, table)
+    return section("How fast is the misalignment found?", SideBySide(drawn) if curves else None, table)
 
 
 def _coverage(coverages: Sequence[Coverage]) -> Iterable[Item]:

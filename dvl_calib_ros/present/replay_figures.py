@@ -67,7 +67,7 @@ def estimate_over_time(
         axes.plot(t, value, color=colour, linestyle=dashes, linewidth=width, zorder=2.0 - 0.1 * width, label=line.model)
     axes.set_ylim(*_settled_range(lines))
     axes.set_ylabel(label)
-    time.dress(axes)
+    time.label_time(axes)
     return figure
 
 
@@ -96,7 +96,7 @@ def velocity_over_time(
     axes.plot(t, before[kept], color=BAD, linewidth=1.0, label="DVL as measured")
     axes.plot(t, after[kept], color=AFTER, linewidth=1.0, label="DVL corrected")
     axes.set_ylabel(label)
-    time.dress(axes)
+    time.label_time(axes)
     legend_above(axes, markerscale=3.0)
     return figure
 
@@ -113,7 +113,7 @@ def residual_over_time(time: TimeAxis, stamps_ns: Array, before: Array, after: A
     spread = 1.2 * float(np.quantile(np.abs(np.concatenate([before, after])), 0.995))
     axes.set_ylim(-spread or -0.01, spread or 0.01)
     axes.set_ylabel(label)
-    time.dress(axes)
+    time.label_time(axes)
     legend_above(axes)
     return figure
 
@@ -134,7 +134,7 @@ def selection_over_time(
     axes.set_yticks(range(len(names) + 1), ["GNSS", *names])
     axes.set_ylim(len(names) + 0.6, -0.6)
     axes.grid(False, axis="y")
-    time.dress(axes)
+    time.label_time(axes)
     return figure
 
 
@@ -164,7 +164,7 @@ def innovations_over_time(time: TimeAxis, stamps_ns: Array, nis: Mapping[str, Ar
     axes.set_yscale("log")
     plain_log_ticks(axes.yaxis)
     axes.set_ylabel("NIS per measured component")
-    time.dress(axes)
+    time.label_time(axes)
     return figure
 
 
@@ -258,14 +258,14 @@ def _hull(axes_of: tuple[int, int, str], nominal: Array, found: Array, place: Se
 def _axes_of_dvl(axes: Axes, ends: Array, at: tuple[float, float], length: float, colour: str, label: str) -> None:
     """Draw the DVL's axes, ends (2, 3) in this view; one that points at the viewer is omitted."""
     for index, axis in enumerate("xyz"):
-        along = length * ends[:, index]
-        if float(np.hypot(*along)) < 0.3 * length:
+        arrow = length * ends[:, index]
+        if float(np.hypot(*arrow)) < 0.3 * length:
             continue
-        tip = at[0] + along[0], at[1] + along[1]
+        tip = at[0] + arrow[0], at[1] + arrow[1]
         axes.annotate("", tip, at, arrowprops={"arrowstyle": "->", "color": colour, "lw": 1.8})
         if colour == AFTER:
-            axes.text(at[0] + 1.15 * along[0], at[1] + 1.15 * along[1], axis, color=colour, ha="center", va="center")
-            axes.update_datalim([(at[0] + 1.3 * along[0], at[1] + 1.3 * along[1])])  # keeps letters off the title
+            axes.text(at[0] + 1.15 * arrow[0], at[1] + 1.15 * arrow[1], axis, color=colour, ha="center", va="center")
+            axes.update_datalim([(at[0] + 1.3 * arrow[0], at[1] + 1.3 * arrow[1])])  # keeps letters off the title
     axes.plot([], [], color=colour, label=label)
     axes.plot(*at, "o", color=colour, markersize=4.0)
 
@@ -327,11 +327,11 @@ def track_map(one: Navigation, corrected: Mapping[str, Navigation], time: TimeAx
 
 def _draw_coloured_track(figure: Figure, axes: Axes, one: Navigation) -> None:
     """Draw the corrected track, coloured by its distance from the reference's."""
-    off = np.linalg.norm(one.track_after - one.reference, axis=1)
+    distance = np.linalg.norm(one.track_after - one.reference, axis=1)
     parts = np.stack([one.track_after[:-1], one.track_after[1:]], axis=1)
     track = LineCollection(list(parts), cmap="viridis", linewidths=1.6, zorder=3.0)
-    track.set_array(0.5 * (off[:-1] + off[1:]))
-    track.set_clim(0.0, max(float(off.max()), 1e-3))
+    track.set_array(0.5 * (distance[:-1] + distance[1:]))
+    track.set_clim(0.0, max(float(distance.max()), 1e-3))
     axes.add_collection(track)
     bar = figure.colorbar(track, ax=axes, shrink=0.6, aspect=24, pad=0.02)
     bar.outline.set_visible(False)
@@ -503,17 +503,17 @@ def velocity_pictures(replayed: Replayed, history: RunHistory) -> list[Picture]:
     return pictures
 
 
-def data_pictures(result: Result, history: RunHistory, shown: Sequence[str]) -> list[Picture]:
+def data_pictures(result: Result, history: RunHistory, models: Sequence[str]) -> list[Picture]:
     """Draw the use of the samples, and the selected model over time."""
     time = TimeAxis(history.stamps_ns)
-    fates = {fate: [count(result, name) for name in shown] for fate, count in FATES.items()}
+    fates = {fate: [count(result, name) for name in models] for fate, count in FATES.items()}
     ends = [*(segment.from_ns for segment in result.segments[1:]), result.last_ns]
     segments = [(each.model, each.from_ns, end) for each, end in zip(result.segments, ends, strict=False)]
     switches = ", ".join(dict.fromkeys(name for name, _, _ in segments)) or "none"
     return [
         picture(
             "Samples by model", "How many DVL samples each model used, gated or was not given",
-            samples_by_fate, list(shown), fates,
+            samples_by_fate, list(models), fates,
             caption="Not given: without the GNSS velocity or attitude it needs, or in the window of its prior.",
         ),
         picture(

@@ -18,10 +18,10 @@ FORM = "NAME:PARAMETER=VALUE,PARAMETER=VALUE"
 
 def injection(text: str) -> Injection:
     """Parse ``lever_arm:x_m=0.3,z_m=-0.1``; missing parameters keep their defaults. Raises InputError."""
-    name, _, rest = text.strip().partition(":")
+    name, _, values = text.strip().partition(":")
     effect = _effect(name.strip())
     given: dict[str, str] = {}
-    for assignment in filter(str.strip, rest.split(",")):
+    for assignment in filter(str.strip, values.split(",")):
         parameter, equals, number = (part.strip() for part in assignment.partition("="))
         if not equals:
             raise InputError(f"effect {name}: {assignment.strip()!r} is no PARAMETER=VALUE; it has {_listed(effect)}")

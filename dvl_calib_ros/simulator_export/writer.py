@@ -170,11 +170,11 @@ def beams_of(noise_std: tuple[float, float, float] | None, default_angle: float)
     """
     if noise_std is None:
         return None
-    across, along = math.hypot(noise_std[0], noise_std[1]) / math.sqrt(2.0), noise_std[2]
-    angle = math.atan2(math.sqrt(2.0) * along, across) if across > 0.0 else 0.0
+    horizontal, vertical = math.hypot(noise_std[0], noise_std[1]) / math.sqrt(2.0), noise_std[2]
+    angle = math.atan2(math.sqrt(2.0) * vertical, horizontal) if horizontal > 0.0 else 0.0
     is_found = PLAUSIBLE_ANGLES[0] <= angle <= PLAUSIBLE_ANGLES[1]
     angle = angle if is_found else default_angle
-    return Beams(angle, is_found, math.sqrt(2.0) * math.sin(angle) * across)
+    return Beams(angle, is_found, math.sqrt(2.0) * math.sin(angle) * horizontal)
 
 
 def equal_std(noise_std: tuple[float, float, float]) -> float:

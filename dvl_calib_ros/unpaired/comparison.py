@@ -454,7 +454,7 @@ class _Compared:
 
     def untested(self, name: str) -> ComparedEffect:
         """Report an effect that one side cannot be tested for, or whose observable parts differ between the sides."""
-        shown = [side[name].intervals() if name in side else {} for side in self._per_side]
+        sizes = [side[name].intervals() if name in side else {} for side in self._per_side]
         effect = self._effects[name]
         needs = f"no common part of it is observable in both logs: {effect.manoeuvre}"
         for side, selection in zip(("vehicle", "simulator"), self._selections, strict=True):
@@ -463,7 +463,7 @@ class _Compared:
                 needs = f"the {side}'s log lacks {'a second recording' if effect.relative_to_first else lacks}"
                 break
         return ComparedEffect(
-            name, ComparisonStatus.CANNOT_TELL, self._equivalent(name), shown[0], shown[1], float("nan"), needs=needs
+            name, ComparisonStatus.CANNOT_TELL, self._equivalent(name), sizes[0], sizes[1], float("nan"), needs=needs
         )
 
     def _equivalent(self, name: str) -> tuple[str, ...]:

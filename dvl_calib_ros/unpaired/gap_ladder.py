@@ -64,8 +64,8 @@ def models(sizes: Mapping[str, tuple[Size, Size, ComparisonStatus]], vehicle: Se
     ]
     ladder = [SimulatedModel(AS_IT_IS, (), kept)]
     for effect in lacking:
-        rest = {name: each for name, each in kept.items() if name != effect.name}
-        ladder.append(SimulatedModel(f"with {effect.name}", (effect,), rest))
+        others = {name: each for name, each in kept.items() if name != effect.name}
+        ladder.append(SimulatedModel(f"with {effect.name}", (effect,), others))
     if len(lacking) != 1 or set(vehicle) != set(lacking) or kept:
         ladder.append(SimulatedModel(ALL, tuple(vehicle), {}))
     return [*ladder, SimulatedModel(NOISE, tuple(vehicle), {}, vehicle_noise=True)]
@@ -130,13 +130,13 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
     for model in ladder:
         is_everything = set(model.added) == set(ladder[-1].added) and not model.kept
         predicted = everything if is_everything else _held_out(selection, model)
-        off = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
+        difference = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
         noise = own_noise if model.vehicle_noise else drawn
         made = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
-        known = np.isfinite(off).all(axis=1)
+        known = np.isfinite(difference).all(axis=1)
         distance, null95, p = two_samples(recorded[known], made[known], windows[known], rng)
-        errors[model.name] = off
-        rungs.append(Rung(model.name, _rms(off[known]), distance, null95, p))
+        errors[model.name] = difference
+        rungs.append(Rung(model.name, _rms(difference[known]), distance, null95, p))
     gap = vehicle.diagnosis.gap
     beyond_noise = max(0.0, gap.after**2 - gap.noise_floor**2)
     floor = float(np.sqrt(max(0.0, rungs[-1].error_mps ** 2 - beyond_noise)))
@@ -178,10 +178,10 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     return predicted
 
 
-def _fold_of(problem: Problem, index: int) -> Array:
+def _fold_of(problem: Problem, recording: int) -> Array:
     """Return the fold (N,) of each DVL sample of a recording: stretches of time in turn; -1 outside the fit."""
-    time = problem.recordings[index].dvl.time - problem.grids[index].delay_s
-    of = problem.grids[index].bin_time
+    time = problem.recordings[recording].dvl.time - problem.grids[recording].delay_s
+    of = problem.grids[recording].bin_time
     fold = stretch_of(time) % SETTINGS.folds
     inside = (time >= of[0]) & (time <= of[-1]) if len(of) else np.zeros(len(time), dtype=bool)
     return np.where(inside, fold, -1)

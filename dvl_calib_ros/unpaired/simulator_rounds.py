@@ -106,8 +106,8 @@ class ClosedGap(Answering):
         found = tuple(each for each in first.comparison.reasons if each.code in (*CLAIMED.values(), "SIMULATOR_FRAME"))
         remaining = tuple(each for each in best.comparison.reasons if each.code in REMAINING)
         names = ", ".join(each.name for each in best.comparison.effects if each.status.is_claim)
-        left = (finding("SIMULATOR_NOT_ADDED", names=names),) if names and self.best else ()
-        return (outcome, *found, *left, *remaining)
+        not_added = (finding("SIMULATOR_NOT_ADDED", names=names),) if names and self.best else ()
+        return (outcome, *found, *not_added, *remaining)
 
 
 def close_gap(
@@ -154,7 +154,7 @@ def close_gap(
     document = None if real.diagnosis.dvl is None else diagnosis_document(real.diagnosis)
     while document is not None and found[-1].claims and len(found) <= rounds:
         if len(found) > 1:
-            corrected = put_right(document, found[-1].comparison, effects)
+            corrected = corrected_document(document, found[-1].comparison, effects)
             if corrected == document:
                 break
             document = corrected
@@ -200,7 +200,7 @@ def against(
         return close_gap(vehicle, simulator, rounds, Path(folder), on_progress)
 
 
-def put_right(
+def corrected_document(
     document: Mapping[str, Any], comparison: UnpairedComparison, effects: Mapping[str, Effect] = EFFECTS
 ) -> dict[str, Any]:
     """Return a DVL's document corrected by the differences in effects, noise and rate."""

@@ -104,9 +104,9 @@ def _spikes(values: Array) -> int:
     """Count samples far from the prediction by four neighbours, and farther than these."""
     if len(values) < 10:
         return 0
-    off = deviation_from_neighbours(values)
-    scale = np.maximum(robust_std(off), DITHER_MPS)
-    size = (np.abs(off) / scale).max(axis=1)
+    deviation = deviation_from_neighbours(values)
+    scale = np.maximum(robust_std(deviation), DITHER_MPS)
+    size = (np.abs(deviation) / scale).max(axis=1)
     return int(np.count_nonzero((size > OUTLIER) & (size > neighbours(size))))
 
 
@@ -117,9 +117,9 @@ def _exact(vehicle: Log, simulator: Log) -> Candidate | None:
         return None
     how = "without any noise" if simulator.exact or vehicle.exact else "with the noise of its own reference"
     who = "the simulator's" if leaks[1] else "the vehicle's"
-    shown: list[Triple] = [(float(leak),) * 3 for leak in leaks]
+    values: list[Triple] = [(float(leak),) * 3 for leak in leaks]
     p = 0.0 if leaks[0] != leaks[1] else 1.0
-    return Candidate("truth_leaks", "yes", shown[0], shown[1], p, (leaks[0], leaks[1]), note=f"{who} DVL is {how}")
+    return Candidate("truth_leaks", "yes", values[0], values[1], p, (leaks[0], leaks[1]), note=f"{who} DVL is {how}")
 
 
 def _dropouts(vehicle: Log, simulator: Log) -> Candidate | None:
@@ -151,8 +151,8 @@ def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
     if not np.isfinite(rates).all():
         return None
     change = abs(rates[0] / rates[1] - 1.0)
-    shown: list[Triple] = [(rate, rate * (1.0 - 0.5 * RATE_SHARE), rate * (1.0 + 0.5 * RATE_SHARE)) for rate in rates]
-    return Candidate("rate", "Hz", shown[0], shown[1], 0.0 if change > RATE_SHARE else 1.0, matters=change > RATE_SHARE)
+    spans: list[Triple] = [(rate, rate * (1.0 - 0.5 * RATE_SHARE), rate * (1.0 + 0.5 * RATE_SHARE)) for rate in rates]
+    return Candidate("rate", "Hz", spans[0], spans[1], 0.0 if change > RATE_SHARE else 1.0, matters=change > RATE_SHARE)
 
 
 def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
@@ -188,14 +188,14 @@ def _compare_times(name: str, vehicle: Array, simulator: Array, threshold_s: flo
     """Compare the means of block values (B,) s of both sides; differences below a threshold do not matter."""
     if min(len(vehicle), len(simulator)) < FEWEST_BLOCKS:
         return None
-    shown: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
+    means: list[Triple] = [tuple(mean_of(each).tolist()) for each in (vehicle, simulator)]  # type: ignore[misc]
     is_present = tuple(abs(float(each.mean())) > threshold_s for each in (vehicle, simulator))
     gap = abs(float(vehicle.mean() - simulator.mean()))
     return Candidate(
         name,
         "s",
-        shown[0],
-        shown[1],
+        means[0],
+        means[1],
         welch(vehicle, simulator),
         (is_present[0], is_present[1]),
         matters=gap > threshold_s,

@@ -100,7 +100,7 @@ FINDINGS = (
     warning(
         "MODEL_RESTARTED",
         "{model}: the filter diverged {count} times and went on from its last good state",
-        means="Data and parameters contradict each other, for instance a wrong mounting with the outlier gate switched off.",
+        means="Data and parameters contradict each other, for instance a wrong mounting with the gate switched off.",
         remedy="check mounting_rpy and lever_arm, and do not switch the gate off (gate_probability 0 or 1)",
     ),
     # two publishers, wrong types, quality of service

@@ -248,7 +248,7 @@ def salvage_mcap_stream(file: BinaryIO, size: int) -> Iterator[Salvaged]:
     damage, summary = Damage(), None
     with suppress(DamagedError):  # the summary repeats schemas and channels, whose own chunk may be damaged
         summary = _summary(file)
-    repeated = Tables(summary) if summary else _unreferenced_tables(file, size).unmet()
+    repeated = Tables(summary) if summary else _unreferenced_tables(file, size).mark_replaceable()
     announced = Counter(summary.statistics.channel_message_counts if summary and summary.statistics else {})
     file.seek(0)
     is_cut = file.read(len(MCAP_MAGIC)) != MCAP_MAGIC and not holes_in(file, 0, len(MCAP_MAGIC))

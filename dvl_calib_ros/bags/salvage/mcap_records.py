@@ -81,8 +81,8 @@ class Tables:
         self._met = {(SCHEMA, each) for each in self.schemas} | {(CHANNEL, each) for each in self.channels}
         self._made: dict[int, tuple[str, str, str, str]] = {}
         if summary and summary.statistics and summary.statistics.message_count:
-            self.meet(summary.statistics.message_start_time)
-            self.meet(summary.statistics.message_end_time)
+            self.note_era(summary.statistics.message_start_time)
+            self.note_era(summary.statistics.message_end_time)
 
     def copy(self) -> Tables:
         """Return a copy."""
@@ -91,12 +91,12 @@ class Tables:
         copied.eras, copied._met = set(self.eras), set(self._met)
         return copied
 
-    def unmet(self) -> Tables:
+    def mark_replaceable(self) -> Tables:
         """Mark a summary's tables as replaceable, because it may belong to another recording. Return self."""
         self._met.clear()
         return self
 
-    def meet(self, log_ns: int) -> None:
+    def note_era(self, log_ns: int) -> None:
         """Note the era of a log time."""
         era = log_ns >> ERA_BITS
         if era not in self.eras:
@@ -285,7 +285,7 @@ def message_head(
         if by_usual == ALIKE and (usual < length or by_own < ENOUGH_ALIKE):
             raise DamagedError(f"at byte {at}: the length of a message is damaged")
     tables.lengths[channel] = length
-    tables.meet(log_ns)
+    tables.note_era(log_ns)
     return channel, log_ns
 
 
