@@ -257,13 +257,13 @@ def _residual_items(d: Diagnosis) -> Iterator[Item]:
         text = "Nothing in it follows motion or time more than chance would"
     p = p_value(math.exp(unexplained.log_p))
     yield Sentence(f"{amount} {text} (p {p if p.startswith('<') else f'= {p}'}).")
-    if series.followed:
-        where, followed = series.axes[series.followed.axis], series.followed
+    if series.by_regressor:
+        where, plotted = series.axes[series.by_regressor.axis], series.by_regressor
         yield figure(
             "diagnosis_pictures.residual_over_regressor",
-            f"Residual {where}, against {followed.label.partition(',')[0]}",
-            f"Residual of the fit {where} against {followed.label}, with means of groups and their standard deviations",
-            followed,
+            f"Residual {where}, against {plotted.label.partition(',')[0]}",
+            f"Residual of the fit {where} against {plotted.label}, with means of groups and their standard deviations",
+            plotted,
             f"residual {where}, mm/s",
             caption="Dots: residual, averaged over two samples of the slower stream. Band: standard deviation of a "
             "group about its mean; bars: of the mean, twice.",

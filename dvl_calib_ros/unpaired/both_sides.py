@@ -12,7 +12,7 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import SampleBlock, Stamps
 from ..diagnosis.answer.results import Diagnosis
-from ..diagnosis.answer.simulated_twin import simulated, with_quiet_reference
+from ..diagnosis.answer.simulated_twin import simulated, with_smooth_reference
 from ..diagnosis.diagnose import diagnose_recordings
 from ..diagnosis.model.recorded_streams import RecordedStreams, load_recordings, zeros_while_moving
 from ..diagnosis.model.stream_curve import Curve
@@ -164,12 +164,12 @@ def dithered(recording: RecordedStreams) -> RecordedStreams:
     """Return the recording with white noise added to its DVL, the same at every call."""
     dvl = recording.dvl
     noise = DITHER_MPS * np.random.default_rng(0).standard_normal(dvl.values.shape)
-    return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.claimed, claims=dvl.claims))
+    return replace(recording, dvl=Curve(dvl.time, dvl.values + noise, dvl.reported, sample_std=dvl.sample_std))
 
 
 def dvl_residuals(selection: EffectSelection) -> tuple[Array, ...]:
     """Return (N, 3) m/s per recording: recorded minus fitted, DVL frame, with a noise-free reference."""
-    problem = with_quiet_reference(selection.fitter.problem)
+    problem = with_smooth_reference(selection.fitter.problem)
     return tuple(
         recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
         for index, recording in enumerate(problem.recordings)

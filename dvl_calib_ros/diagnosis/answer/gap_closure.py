@@ -103,7 +103,7 @@ def held_out(selection: EffectSelection, unexplained: Unexplained) -> HeldOutRes
         at = (fold_of == fold)[problem.bin_of]
         for fitted, into in zip(each, (before, after), strict=True):
             if len(problem.recordings) > 1:
-                of_day = _with_its_own_day(selection, fitted.hypothesis, fold)
+                of_day = _fit_own_parameters(selection, fitted.hypothesis, fold)
                 into[at] = only(problem, fold).errors(of_day.seen)
             else:
                 into[at] = problem.errors(fitted.seen)[at]
@@ -131,7 +131,7 @@ def _error_variance(fit: Fit, at: Integers) -> Array:
     return np.asarray(np.einsum("map,map->ma", columns @ covariance, columns))
 
 
-def _with_its_own_day(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
+def _fit_own_parameters(selection: EffectSelection, hypothesis: Hypothesis, recording: int) -> Fit:
     """Fit one recording's own parameters, with the vehicle's parameters from the others."""
     problem, noise = selection.fitter.problem, selection.fit.noise
     alone = only(problem, recording)
@@ -301,7 +301,7 @@ def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:
     return np.asarray((second**2).mean(axis=0) / 6.0), float(np.sqrt(3.9 / len(second)))
 
 
-def claimed_std(problem: Problem) -> list[Array] | None:
+def reported_std(problem: Problem) -> list[Array] | None:
     """Return the reported standard deviation (3,) m/s of the difference per recording, None if any is missing."""
     found = []
     for recording in problem.recordings:
@@ -314,7 +314,7 @@ def claimed_std(problem: Problem) -> list[Array] | None:
 
 
 def _reported(problem: Problem) -> float | None:
-    reported = claimed_std(problem)
+    reported = reported_std(problem)
     return None if reported is None else float(np.sqrt(np.mean([np.sum(each**2) for each in reported])))
 
 

@@ -13,12 +13,12 @@ from ...calibration.numerics.robust import robust_std
 from ...calibration.numerics.tests import holm
 from ..fit.gauss_newton import OF_INTERVAL, Fit, Fitter, around
 from ..fit.parametric_bootstrap import SIMULATED, simulated_recordings
-from ..model.claimed_noise import followed
+from ..model.claimed_noise import relative_std
 from ..model.forward_model import Problem
 from ..model.settings import SETTINGS
-from ..noise.noise_level import claims_of, fit_claims, fit_level, stretches_of
+from ..noise.noise_level import fit_claims, fit_level, log_reported, stretches_of
 from ..noise.noise_model import Arma, Noise
-from .gap_closure import claimed_std, high_frequency_variance
+from .gap_closure import high_frequency_variance, reported_std
 
 # Rate of repeats under the null hypothesis, with a coarse resolution
 CHANCE_OF_REPEAT = 1e-3
@@ -133,7 +133,7 @@ def _time_constant(arma: Arma, interval: float) -> float:
 
 def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFinding | None]:
     found: list[NoiseFinding | None] = []
-    reported = claimed_std(problem)
+    reported = reported_std(problem)
     if reported is not None:
         errors = problem.errors(fit.seen)
         variance, error = high_frequency_variance(problem.sample_time, errors)
@@ -143,9 +143,9 @@ def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFind
             p = float(2.0 * normal_sf(np.log(ratio) / error))
             low, high = float(ratio * np.exp(-OF_INTERVAL * error)), float(ratio * np.exp(OF_INTERVAL * error))
             found.append(NoiseFinding("noise_inflation", {"factor": (ratio, low, high)}, p))
-    names, log_claims = claims_of(problem, fit.seen, fit.noise.rotation)
+    names, log_claims = log_reported(problem, fit.seen, fit.noise.rotation)
     even = innovations * fit.noise.level
-    even = even / followed(log_claims, even, names, stretches_of(problem))
+    even = even / relative_std(log_claims, even, names, stretches_of(problem))
     level = fit_level(problem, fit.seen, even)
     if level is not None and level.p < SETTINGS.robust_level:
         units = {"speed": "log_per_mps", "turn_rate": "log_per_radps"}

@@ -41,7 +41,7 @@ def twins(selection: EffectSelection) -> tuple[Twin, ...]:
     return tuple(found)
 
 
-def with_quiet_reference(problem: Problem) -> Problem:
+def with_smooth_reference(problem: Problem) -> Problem:
     """Remove the noise of every reference at frequencies without motion."""
     quiet = tuple(replace(one, reference=one.reference.quiet) for one in problem.recordings)
     return replace(problem, recordings=quiet)

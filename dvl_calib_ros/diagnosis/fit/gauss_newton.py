@@ -83,8 +83,8 @@ class Fit:
         Fits with different noise differ in deviance by a normal variable of this size under the null hypothesis.
         """
         other = self.own_noise - reduced.own_noise
-        sure = reduced.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
-        return sure - max(reduced.of_tails - self.of_tails, 0.0)
+        bound = reduced.deviance - self.deviance - CHANCE_GAIN_Z * 2.0 * float(np.sqrt(other @ other))
+        return bound - max(reduced.of_tails - self.of_tails, 0.0)
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -99,7 +99,7 @@ class Fit:
     @property
     def dof(self) -> float:
         """Return the degrees of freedom of the effects."""
-        return float(self.system.freedom()[6:].sum())
+        return float(self.system.effective_dof()[6:].sum())
 
     def covariance(self, block: NDArray[np.intp]) -> Array:
         """Return the covariance (6 + p, 6 + p) from the noise model or from blocks (M,), whichever is larger.
@@ -305,7 +305,7 @@ class Fitter:
             self.problem.fitted[model] = [self._fits[key].hypothesis]
         return self._fits[key]
 
-    def straight_on(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:
+    def one_step(self, fit: Fit, start: Hypothesis) -> tuple[float, Hypothesis]:
         """Return the misfit after one linear step, and the step's end; start: a hypothesis with the same evaluation."""
         columns = self.columns(start, fit.seen)
         system = self._system(fit.noise, columns, fit.residual, start)

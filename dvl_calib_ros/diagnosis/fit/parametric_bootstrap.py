@@ -28,7 +28,7 @@ from .gauss_newton import Fit
 SIMULATED = 12
 
 
-class _OtherWay(Curve):
+class _AkimaCurve(Curve):
     """A curve through the same samples on Akima's cubics, which bend within two samples of a corner."""
 
     @cached_property
@@ -73,7 +73,7 @@ def _moving(recording: RecordedStreams) -> RecordedStreams:
     def through(curve: Curve | None) -> Curve | None:
         if curve is None or curve.interval <= FAST_ENOUGH_S or len(curve.time) < 5:
             return curve
-        return _OtherWay(curve.time, curve.values)
+        return _AkimaCurve(curve.time, curve.values)
 
     dvl = recording.dvl.smooth
     return replace(
@@ -84,7 +84,7 @@ def _moving(recording: RecordedStreams) -> RecordedStreams:
 def _drawn(recording: RecordedStreams, reference: Array, share: float, rng: np.random.Generator) -> RecordedStreams:
     def noisy(curve: Curve, values: Array) -> Curve:
         noise = share * curve.noise * curve.relative_noise * rng.standard_normal(values.shape)
-        return Curve(curve.time, values + noise, curve.claimed, claims=curve.claims)
+        return Curve(curve.time, values + noise, curve.reported, sample_std=curve.sample_std)
 
     return replace(
         recording,

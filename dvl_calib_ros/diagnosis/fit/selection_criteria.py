@@ -44,7 +44,7 @@ def windows(effect: Effect, seconds: float) -> list[dict[str, float]]:
     return [whole, *(part for part in parts if part != {times[0]: 0.0, times[-1]: seconds})]
 
 
-def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0) -> float:
+def penalty(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0) -> float:
     """Return the deviance that the best of all effects explains under the null with probability `SETTINGS.level`."""
     dof = n_amplitudes(effect, n_recordings)
     return float(chi2_isf(SETTINGS.level / n_effects / tried, dof))
@@ -53,7 +53,7 @@ def price(effect: Effect, n_effects: int, n_recordings: int, tried: float = 1.0)
 def criterion(fit: Fit, n_effects: int) -> float:
     """Return the deviance plus the price of every effect."""
     n = len(fit.seen)
-    return fit.deviance + sum(price(effect, n_effects, n, times_tried(effect)) for effect in fit.effects)
+    return fit.deviance + sum(penalty(effect, n_effects, n, times_tried(effect)) for effect in fit.effects)
 
 
 def times_tried(effect: Effect) -> float:
@@ -178,7 +178,7 @@ class NuisanceFit(NamedTuple):
         """Add columns raw (M, A, c), scaled to unit size, that may explain a residual (M, A)."""
         size = np.maximum(np.sqrt((raw**2).mean(axis=(0, 1))), 1e-12)
         # jointly no larger than the residual: stretches without a turn would otherwise not bound them
-        std, none = np.full(raw.shape[2], _likely(raw, residual)), np.zeros(raw.shape[2])
+        std, none = np.full(raw.shape[2], _usual_size(raw, residual)), np.zeros(raw.shape[2])
         columns = np.concatenate([self.columns, raw / size], axis=2)
         return NuisanceFit(columns, np.append(self.std, std), np.append(self.centre, none))
 
@@ -187,7 +187,7 @@ class NuisanceFit(NamedTuple):
         return WhitenedLeastSquares.of(noise.whiten(self.columns), -noise.whiten(residual), self.std, -self.centre)
 
 
-def _likely(raw: Array, residual: Array) -> float:
+def _usual_size(raw: Array, residual: Array) -> float:
     """Return the size of each of columns (M, A, c) of unit size that jointly equal a residual (M, A) in size."""
     return float(np.sqrt(np.mean(residual**2) / max(raw.shape[2] / raw.shape[1], 1.0)))
 

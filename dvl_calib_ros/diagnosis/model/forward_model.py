@@ -263,17 +263,17 @@ class Problem:
         dvl, attitude = (time + late(injections, clock, time) for clock in (ActsOn.DVL_CLOCK, ActsOn.ATTITUDE_CLOCK))
         rotation, rates = self._oriented(stream, attitude)
         raw, smooth = measured_velocity(stream.dvl, dvl, self.grids[recording].clock is ActsOn.DVL_CLOCK)
-        followed = raw if unsmoothed and stream.dvl.interval > FAST_ENOUGH_S else smooth
+        velocity = raw if unsmoothed and stream.dvl.interval > FAST_ENOUGH_S else smooth
         lever = np.zeros(3) if rates is None or not self.lever_arm.any() else cross(rates, self.lever_arm)
         nominal = self.rotation_dvl_from_body
         turn: Array = np.zeros(3)
         matrix = hypothesis.body_from_measured(nominal)
-        measured = EffectInput(time, rotate_vectors(matrix, followed), nominal, rotation, rates, stream.frame, 0.0)
+        measured = EffectInput(time, rotate_vectors(matrix, velocity), nominal, rotation, rates, stream.frame, 0.0)
         if any(each.effect.acts_on is ActsOn.MOUNTING for each in injections):
             # a small rotation does not change the speed
             turn = turns(injections, undo_effects(injections, measured, ActsOn.DVL, matrix @ nominal)[0])
             matrix = hypothesis.body_from_measured(nominal, turn)
-            measured = replace(measured, velocity_body=rotate_vectors(matrix, followed))
+            measured = replace(measured, velocity_body=rotate_vectors(matrix, velocity))
         at_dvl, of_dvl = undo_effects(injections, measured, ActsOn.DVL, matrix @ nominal)
         motion = replace(at_dvl, velocity_body=at_dvl.velocity_body - lever)
         motion, of_motion = undo_effects(injections, motion, ActsOn.MOTION, None)
@@ -481,7 +481,7 @@ class Problem:
         """Return d e / d parameters of an effect, (F, 3, p), body frame."""
         specs = amplitudes(effect)
         if isinstance(effect, ClockEffect):
-            by_late = self._by_late(seen, effect.acts_on)
+            by_late = self._delay_columns(seen, effect.acts_on)
             slopes = [central_difference(spec, values, lambda at: effect.late(seen.motion.time, at)) for spec in specs]
             return np.stack([by_late * slope[:, None] for slope in slopes], axis=2)
         if isinstance(effect, MountingEffect):
@@ -494,7 +494,7 @@ class Problem:
         of_dvl = trace_columns(effect, seen.at_dvl, values)
         return np.asarray(seen.body_from_measured @ self.rotation_dvl_from_body @ of_dvl)
 
-    def _by_late(self, seen: Seen, clock: ActsOn) -> Array:
+    def _delay_columns(self, seen: Seen, clock: ActsOn) -> Array:
         """Return d e / d delay of a clock, (F, 3), m/s per s, body frame."""
         if clock is ActsOn.DVL_CLOCK:
             return rotate_vectors(seen.body_from_measured, seen.rate_of_change)

@@ -47,7 +47,7 @@ TOO_SHORT = 0.5
 UP_TO_S, LONGEST_S = 2.0, 5.0
 
 
-class SetBack(NamedTuple):
+class BackwardStep(NamedTuple):
     """Backward clock step between stamps `before` and `after` (s). by: s; upper bound if unknown."""
 
     before: float
@@ -55,7 +55,7 @@ class SetBack(NamedTuple):
     by: float
 
 
-def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray[np.bool_]]:
+def backward_steps(time: Array, velocity: Array) -> tuple[tuple[BackwardStep, ...], NDArray[np.bool_]]:
     """Find backward steps of a clock, and the samples (N,) outside doubly stamped times.
 
     time: (N,) s, sorted stamps. velocity: (N, 3) m/s of these samples. A backward step of two seconds stamps two
@@ -75,12 +75,12 @@ def set_back(time: Array, velocity: Array) -> tuple[tuple[SetBack, ...], NDArray
         is_mixed = np.median(bent[first:behind]) > TO_AND_FRO * np.median(bent)
         if behind - first >= FEWEST and inside < LONGEST_S and is_mixed:
             once[first : behind + 2] = False
-            found.append(SetBack(float(time[first]), float(time[behind + 1]), inside))
+            found.append(BackwardStep(float(time[first]), float(time[behind + 1]), inside))
     relative = np.abs(steps - usual) / usual
     odd = np.flatnonzero(relative > np.clip(FAR * np.median(relative), *REGULAR))
     short = odd[steps[odd] < usual]
     if not found and len(short) > 0 and len(odd) <= RARE:
-        found = [SetBack(float(time[at]), float(time[at + 1]), UP_TO_S) for at in short.tolist()]
+        found = [BackwardStep(float(time[at]), float(time[at + 1]), UP_TO_S) for at in short.tolist()]
         once[short[steps[short] < TOO_SHORT * usual] + 1] = False
     return tuple(found), once
 
@@ -104,8 +104,8 @@ class RecordedStreams:
     attitude: (A, 4) unit quaternions of ``rotation_enu_from_body``, of continuous sign. rates: (G, 3) rad/s, body.
     dvl_std, reference_std: (3,) m/s, RMS of reported standard deviations, the reference's in its frame; None if not
     reported. measured: (3,) axes that the reference measures. repeats: number of the `received` DVL samples that equal
-    the previous velocity; spikes: number of outliers removed. registration: initial guess, if known. set_back: backward
-    steps of the DVL's clock.
+    the previous velocity; spikes: number of outliers removed. registration: initial guess, if known.
+    backward_steps: of the DVL's clock.
     """
 
     name: str
@@ -122,7 +122,7 @@ class RecordedStreams:
     spikes: int = 0
     first_ns: int = 0
     registration: Registration | None = None
-    set_back: tuple[SetBack, ...] = ()
+    backward_steps: tuple[BackwardStep, ...] = ()
 
     @property
     def available(self) -> frozenset[EffectNeeds]:
@@ -195,7 +195,7 @@ def make_recording(
     axes: As gnss_axes.
     first_ns: Stamp of the DVL's first sample.
     """
-    events, once = set_back(*dvl)
+    events, once = backward_steps(*dvl)
     if not once.all():
         dvl, dvl_std = (dvl[0][once], dvl[1][once]), dvl_std if dvl_std is None or dvl_std.ndim == 1 else dvl_std[once]
     time, velocity = dvl
@@ -206,14 +206,14 @@ def make_recording(
     def clean(stream: tuple[Array, Array] | None, std: Array | None = None) -> Curve | None:
         if stream is None or len(stream[0]) < 2:
             return None
-        return _claiming(stream, std).without_spikes()
+        return _with_reported(stream, std).without_spikes()
 
     def curve(stream: tuple[Array, Array] | None, std: Array | None = None, rate: float = rate) -> Curve | None:
         found = clean(stream, std)
         return None if found is None else found.averaged(rate)
 
     if attitude is not None:
-        attitude = attitude[0], _alike_in_sign(attitude[1])
+        attitude = attitude[0], _continuous_sign(attitude[1])
     without_spikes = clean(dvl, dvl_std)
     spikes = 0 if without_spikes is None else len(time) - len(without_spikes.time)
     dvl_curve = None if without_spikes is None else without_spikes.averaged(rate)
@@ -225,7 +225,7 @@ def make_recording(
     return RecordedStreams(
         name, dvl_curve, reference_curve, frame, curve(attitude), curve(rates), _rms(dvl_std), _rms(reference_std),
         _measured_axes(reference[1], _usual(reference_std), axes), repeats, len(time), spikes, first_ns,
-        set_back=events,
+        backward_steps=events,
     )  # fmt: skip
 
 
@@ -245,17 +245,17 @@ def _rms(std: Array | None) -> Array | None:
     return np.where(usual < SETTINGS.unmeasured_std, rms, usual)
 
 
-def _claiming(stream: tuple[Array, Array], std: Array | None) -> Curve:
+def _with_reported(stream: tuple[Array, Array], std: Array | None) -> Curve:
     """Return a curve with reported standard deviations (3,) or (N, 3); missing ones (-1) are the median."""
     usual = _usual(std)
     if std is None or usual is None or std.ndim == 1:
         return Curve(*stream, std)
     finite = np.where(np.isfinite(usual), usual, SETTINGS.unmeasured_std)
-    claims = np.where(np.isfinite(std) & (std**2 >= SMALLEST_VARIANCE), std, finite)
-    return Curve(*stream, usual, claims=np.minimum(claims, SETTINGS.unmeasured_std))
+    sample_std = np.where(np.isfinite(std) & (std**2 >= SMALLEST_VARIANCE), std, finite)
+    return Curve(*stream, usual, sample_std=np.minimum(sample_std, SETTINGS.unmeasured_std))
 
 
-def _alike_in_sign(quaternions: Array) -> Array:
+def _continuous_sign(quaternions: Array) -> Array:
     turned = np.sign(np.einsum("ni,ni->n", quaternions[1:], quaternions[:-1]))
     signs = np.cumprod(np.concatenate([[1.0], np.where(turned == 0.0, 1.0, turned)]))
     return quaternions * signs[:, None]
@@ -411,7 +411,7 @@ def _recording(name: str, blocks: list[SampleBlock], parameters: Parameters, not
         first_ns=first_ns,
     )
     if twice := len(dvl_stream[0]) - recording.received:
-        when = " and ".join(f"{event.after:.0f} s" for event in recording.set_back)
+        when = " and ".join(f"{event.after:.0f} s" for event in recording.backward_steps)
         notes.append(f"dvl: its clock was set back at {when}; {twice} samples of what it stamped twice are left out")
     return recording
 

@@ -35,7 +35,7 @@ SURELY_HEAVY = 3.0 * 1.6
 MAX_NEIGHBOUR_PRODUCT = 0.4
 
 
-class Remembered:
+class EvaluationCache:
     """Cache of values at the last few sets of times: fits evaluate the same times repeatedly."""
 
     _LIMIT = 8
@@ -55,16 +55,16 @@ class Remembered:
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Stream as a function of time, cubic between samples. time: (N,) s, increasing. values: (N, k). claimed: (k,)
+    """Stream as a function of time, cubic between samples. time: (N,) s, increasing. values: (N, k). reported: (k,)
     reported standard deviation. like: curve of the same stream without simulated noise, which defines the noise level.
-    claims: (N, k) standard deviation reported per sample."""
+    sample_std: (N, k) standard deviation reported per sample."""
 
     time: Array
     values: Array
-    claimed: Array | None = None
+    reported: Array | None = None
     like: Curve | None = None
-    claims: Array | None = None
-    kept: Remembered = field(init=False, default_factory=Remembered, repr=False)
+    sample_std: Array | None = None
+    kept: EvaluationCache = field(init=False, default_factory=EvaluationCache, repr=False)
 
     @cached_property
     def interval(self) -> float:
@@ -151,12 +151,12 @@ class Curve:
         """Return each sample's noise level (N, k) relative to the usual one, if reported values predict it."""
         if self.like is not None:
             return self.like.relative_noise
-        return relative_noise(self.time, self.claims, np.diff(self.values, 4, axis=0), FOURTH)
+        return relative_noise(self.time, self.sample_std, np.diff(self.values, 4, axis=0), FOURTH)
 
     def part(self, kept: NDArray[np.bool_]) -> Curve:
         """Return the samples selected by a mask (N,)."""
-        claims = None if self.claims is None else self.claims[kept]
-        return Curve(self.time[kept], self.values[kept], self.claimed, claims=claims)
+        sample_std = None if self.sample_std is None else self.sample_std[kept]
+        return Curve(self.time[kept], self.values[kept], self.reported, sample_std=sample_std)
 
     @cached_property
     def from_neighbours(self) -> Array:
@@ -181,9 +181,9 @@ class Curve:
         """
         if self.like is not None:
             return self.like.noise
-        if self.claimed is None or self.interval <= FAST_ENOUGH_S:
+        if self.reported is None or self.interval <= FAST_ENOUGH_S:
             return self.roughness
-        return np.minimum(self.roughness, self.claimed)
+        return np.minimum(self.roughness, self.reported)
 
     def perturbed(self, rng: np.random.Generator) -> Curve:
         """Return the curve with additional simulated noise of the same size."""
@@ -215,11 +215,11 @@ class Curve:
         starts = np.flatnonzero(np.diff(group, prepend=-1.0))
         counts = np.diff(np.append(starts, len(self.time)))
         time = np.add.reduceat(self.time, starts) / counts
-        claimed = None if self.claimed is None else self.claimed / np.sqrt(every)
-        claims = self.claims
-        if claims is not None:
-            claims = np.sqrt(np.add.reduceat(claims**2, starts, axis=0)) / counts[:, None]
-        return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], claimed, claims=claims)
+        reported = None if self.reported is None else self.reported / np.sqrt(every)
+        each = self.sample_std
+        if each is not None:
+            each = np.sqrt(np.add.reduceat(each**2, starts, axis=0)) / counts[:, None]
+        return Curve(time, np.add.reduceat(self.values, starts, axis=0) / counts[:, None], reported, sample_std=each)
 
 
 def _on_cubics(values: Array) -> Array:

@@ -114,7 +114,7 @@ def make_grid(recording: RecordedStreams, offsets: Offsets) -> Grid:
         for at in (base_delay_s - delay_s, -MARGIN_S, MARGIN_S):
             known &= curve.covers(true + delay_s + at)
     if not by_dvl:  # the DVL has no samples while its clock repeats, whatever its delay
-        for event in recording.set_back:
+        for event in recording.backward_steps:
             of_dvl, around = true + offsets.dvl, event.by + MARGIN_S
             known &= (of_dvl < event.before - around) | (of_dvl > event.after + around)
     for oriented in (recording.attitude, recording.rates):

@@ -192,7 +192,7 @@ class Noise:
         return np.clip(0.5 * (power[:, half] + power[:, -half]), 0.0, MOST_TAKEN)
 
     @property
-    def fading(self) -> int:
+    def memory_samples(self) -> int:
         """Return the number of samples in which whitened values fade to `FADED` after the last that is not zero."""
         most = max(abs(arma.ma) for arma in self.axes)
         return 1 + (int(np.log(FADED) / np.log(most)) if most else 0)
@@ -311,7 +311,7 @@ def _fit_arma(
     """
     spectrum, best = _spectrum(series, taken), (np.inf, 0.0, 0.0)
     for p, q in orders:
-        deviance, ar, ma = spectrum.searched(memory, p, q)
+        deviance, ar, ma = spectrum.best_arma(memory, p, q)
         best = min(best, (deviance + (p + q) * np.log(len(series)), ar, ma))
     return spectrum.arma(*best[1:], series, segments)
 
@@ -352,7 +352,7 @@ class _Spectrum:
         value = self.n * (self.left * np.log(np.maximum(mean, 1e-300) / self.left) + logarithm)
         return np.asarray(np.where(ars + mas >= -1e-12, value, np.inf))
 
-    def searched(self, memory: float, p: int, q: int) -> tuple[float, float, float]:
+    def best_arma(self, memory: float, p: int, q: int) -> tuple[float, float, float]:
         """Return deviance, ar and ma of the best ARMA(p, q), by a grid search refined about its best point."""
         bound = float(np.arctanh(memory))
         centre, reach = np.zeros(2), np.array([bound if p else 0.0, MA_REACH if q else 0.0])

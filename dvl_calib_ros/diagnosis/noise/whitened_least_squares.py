@@ -89,7 +89,7 @@ class WhitenedLeastSquares:
         """Return the covariance (n, n) of the solution, for noise of unit variance."""
         return np.asarray(np.linalg.inv(self._normal))
 
-    def freedom(self) -> Array:
+    def effective_dof(self) -> Array:
         """Return the degrees of freedom (n,) per parameter, less than one where the prior contributes."""
         return np.asarray(1.0 - np.diag(self.covariance()) / self.std**2)
 

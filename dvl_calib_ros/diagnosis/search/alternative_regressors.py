@@ -58,8 +58,8 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
         rate = motion.angular_velocity
         turning = rate[:, 2]
         found["turn rate"] = np.column_stack([turning, np.abs(turning), turning * s, np.abs(turning) * s, turning**2])
-        fading = [faded(motion.time, turning, seconds) for seconds in FADES_S]
-        found["turns before"] = np.column_stack([*fading, _side_of_last_turn(turning)])
+        turn_memories = [low_passed(motion.time, turning, seconds) for seconds in FADES_S]
+        found["turns before"] = np.column_stack([*turn_memories, _side_of_last_turn(turning)])
         found["roll and pitch rate"] = np.column_stack([rate[:, :2], np.abs(rate[:, :2])])
     return {name: grid.averaged(values) for name, values in found.items()}
 
@@ -68,7 +68,7 @@ def _spread(speed: Array) -> float:
     return max(float(np.quantile(speed, 0.99) - np.quantile(speed, 0.01)), 1e-3)
 
 
-def faded(time: Array, values: Array, seconds: float) -> Array:
+def low_passed(time: Array, values: Array, seconds: float) -> Array:
     """Return (N,) values (N,) low-pass filtered with a time constant."""
     steps = np.clip(np.diff(time, prepend=time[0]), 0.0, 10.0)
     decay = np.exp(-steps / seconds)

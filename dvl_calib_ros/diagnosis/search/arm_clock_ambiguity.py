@@ -154,7 +154,7 @@ def with_clocks(
 
 def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
     """Return the lever arm's parameters (p,) and standard deviations (p,) from blocks."""
-    at = [*_places(fit, ARM).values()]
+    at = [*_indices(fit, ARM).values()]
     return fit.hypothesis.vector()[at], np.sqrt(np.diag(fit.covariance(block))[at])
 
 
@@ -192,7 +192,7 @@ def lag_change(fit: Fit, joint: Fit) -> dict[str, float]:
 def with_changes(fit: Fit, covariance: Array, moved: Mapping[str, float]) -> Array:
     """Return a covariance (6 + p, 6 + p) that includes changes from `arm_change` and `lag_change`."""
     step = np.zeros(len(covariance))
-    for name, i in (_places(fit, ARM) | _places(fit, LAG)).items():
+    for name, i in (_indices(fit, ARM) | _indices(fit, LAG)).items():
         step[i] = moved.get(name, 0.0)
     return np.asarray(covariance + np.outer(step, step))
 
@@ -204,7 +204,7 @@ def with_ambiguity(fit: Fit, covariance: Array, trade_off: ArmAmbiguity | None) 
     clock = [6 + i for i, each in enumerate(fit.hypothesis.parameters()) if each.effect.name == REFERENCE_CLOCK]
     step = np.zeros(len(covariance))
     step[clock] = 1.0
-    for name, i in _places(fit, ARM).items():
+    for name, i in _indices(fit, ARM).items():
         step[i] = trade_off.by[name]
     known = max(np.diag(covariance)[clock].tolist(), default=0.0)
     return np.asarray(covariance + max(trade_off.delay_std_s**2 - known, 0.0) * np.outer(step, step))
@@ -212,7 +212,7 @@ def with_ambiguity(fit: Fit, covariance: Array, trade_off: ArmAmbiguity | None) 
 
 def ambiguous_combination(fit: Fit, covariance: Array, trade_off: ArmAmbiguity | None) -> Combination | None:
     """Return the observable combination of arm and reference clock from a fit of one recording without that clock."""
-    at = _places(fit, ARM)
+    at = _indices(fit, ARM)
     if trade_off is None or not at or len(fit.seen) > 1:
         return None
     name = max(at, key=lambda each: abs(trade_off.by[each]))
@@ -222,7 +222,7 @@ def ambiguous_combination(fit: Fit, covariance: Array, trade_off: ArmAmbiguity |
 
 def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
     """Return the observable combination of arm and clock of one recording from their covariance (6 + p, 6 + p)."""
-    arm, delay = _places(fit, ARM), _places(fit, clock).get("seconds")
+    arm, delay = _indices(fit, ARM), _indices(fit, clock).get("seconds")
     if delay is None or not arm or len(fit.seen) > 1:
         return None
     vector = fit.hypothesis.vector()
@@ -234,7 +234,7 @@ def combination(fit: Fit, covariance: Array, clock: str) -> Combination | None:
     return Combination(name, clock, speed, around(value, std))
 
 
-def _places(fit: Fit, effect: str) -> dict[str, int]:
+def _indices(fit: Fit, effect: str) -> dict[str, int]:
     """Return the index of each parameter of an effect in a fit's vector; of the last recording."""
     parameters = enumerate(fit.hypothesis.parameters(), start=6)
     return {each.spec.name: i for i, each in parameters if each.effect.name == effect}

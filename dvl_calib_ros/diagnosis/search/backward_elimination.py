@@ -14,7 +14,7 @@ from ..fit.selection_criteria import (
     best_of,
     fit_without,
     log_p_in_place,
-    price,
+    penalty,
     robust_covariance,
     robust_p,
     times_tried,
@@ -37,7 +37,7 @@ def eliminate(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     return fit
 
 
-def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
+def without_chance(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
     """Return a fit without effects that chance or slow noise explains as well.
 
     An effect is kept if the covariance of its interval makes it significant, and it predicts held-out data beyond its
@@ -54,7 +54,7 @@ def only_predictive(fitter: Fitter, fit: Fit, n_effects: int) -> Fit:
         spare = []
         for effect in fit.effects:
             reduced = fit_without(fitter, fit, effect)
-            chance = price(effect, n_effects, n, times_tried(effect)) - n_amplitudes(effect, n)
+            chance = penalty(effect, n_effects, n, times_tried(effect)) - n_amplitudes(effect, n)
             spare.append((predictive_gain_of(problem, reduced, fit) - chance, reduced))
         worst, reduced = min(spare, key=lambda each: each[0])
         if worst > 0.0:
@@ -79,22 +79,22 @@ def repeated_effects(
             continue
         best = best_of(own, effects)
         if whole.again.keys() <= best.values[name][0].keys():
-            starts = either_alone(best, effects[name], whole)
+            starts = single_occurrences(best, effects[name], whole)
         else:
             n = len(best.seen)
-            once, twice = (price(each, len(effects), n, times_tried(each)) for each in (effects[name], whole))
+            once, twice = (penalty(each, len(effects), n, times_tried(each)) for each in (effects[name], whole))
             limit = best.deviance + once - twice
-            starts = _a_second_time(fitter, best, whole, limit)
+            starts = _second_occurrences(fitter, best, whole, limit)
         found += [fitter.fit(start, best.noise) for start in starts]
     return found
 
 
-def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> list[Hypothesis]:
+def _second_occurrences(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> list[Hypothesis]:
     """Return the best starts below a deviance `limit` with a second occurrence, both in order of time."""
     others = [effect for effect in fit.effects if effect.name != whole.name]
     (again,) = (spec.name for spec in whole.parameters if spec.name in whole.again and is_time_of_run(spec))
     seconds = max(recording.seconds for recording in fitter.problem.recordings)
-    gain = fit.deviance - fitter.straight_on(fit, fit.hypothesis)[0]
+    gain = fit.deviance - fitter.one_step(fit, fit.hypothesis)[0]
     tried = []
     times = np.linspace(0.0, seconds, 2 * WINDOW_STEPS + 1)[1:-1].tolist()
     if whole.name == LEAP:
@@ -102,7 +102,7 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
     for at in times:
         values = tuple({**whole.defaults, **each, again: at} for each in fit.values[whole.name])
         start = fit.hypothesis.with_effects([*others, whole], len(values), {whole.name: values})
-        misfit, start = fitter.straight_on(fit, start)
+        misfit, start = fitter.one_step(fit, start)
         if misfit + gain > limit:
             continue
         if at < values[0][whole.again[again]]:
@@ -113,7 +113,7 @@ def _a_second_time(fitter: Fitter, fit: Fit, whole: Effect, limit: float) -> lis
     return [start for _, start in sorted(tried, key=lambda each: each[0])[:KEPT_VARIANTS]]
 
 
-def either_alone(fit: Fit, once: Effect, whole: Effect) -> list[Hypothesis]:
+def single_occurrences(fit: Fit, once: Effect, whole: Effect) -> list[Hypothesis]:
     """Return starts with the first or the second occurrence alone, if the other is near zero in σ."""
     std = np.sqrt(np.diag(fit.system.covariance()))
     clear = {

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...calibration.numerics.frames import Array
 from ...effects.base import Effect
 from ..fit.gauss_newton import PRIOR_IN_TYPICAL, Fit, Fitter, prior_std
-from ..fit.selection_criteria import price, step_of_times, windows
+from ..fit.selection_criteria import penalty, step_of_times, windows
 from ..model.forward_model import Problem
 from ..model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run, no_effect
 from ..model.settings import SETTINGS
@@ -50,7 +50,7 @@ class Variant:
         return self.columns.shape[2]
 
     @property
-    def comes_and_goes(self) -> bool:
+    def is_intermittent(self) -> bool:
         """Return whether the effect acts during a part of the run only."""
         times = [spec.name for spec in self.effect.parameters if is_time_of_run(spec)]
         return any(each[name] != self.effect.defaults[name] for each in self.values for name in times)
@@ -96,7 +96,7 @@ def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]
     come = [
         chosen
         for chosen in to_fit
-        if any(i >= own and table.variants[i].comes_and_goes for i in chosen) and table.misfit(chosen) < most
+        if any(i >= own and table.variants[i].is_intermittent for i in chosen) and table.misfit(chosen) < most
     ]
     return [combined(fitter, fit, table, chosen) for chosen in come[:KEPT_VARIANTS]]
 
@@ -107,7 +107,7 @@ def _combinations(
     """Return the linearised model about a fit, and its combinations of effects to fit, best first."""
     table = linearised(fitter, fit, effects)
     n = len(fitter.problem.recordings)
-    cost = [price(v.effect, len(effects), n, v.tried) for v in table.variants]
+    cost = [penalty(v.effect, len(effects), n, v.tried) for v in table.variants]
     own = list(range(len(fit.effects)))
     usable = _shortlisted(table, own, cost)
     scored: list[tuple[float, tuple[int, ...]]] = []
@@ -319,7 +319,7 @@ def _with_lag_or_delay(fit: Fit, effects: Mapping[str, Effect]) -> list[Hypothes
 
 def jumps_at_start(fitter: Fitter, fit: Fit) -> bool:
     """Return whether the fit has one clock jump only, before the first time that is tried."""
-    leaps = fit.values.get(LEAP, ())
+    jumps = fit.values.get(LEAP, ())
     first = step_of_times(fitter.problem)
-    twice = any(np.isfinite(leap.get("again_at_s", np.inf)) for leap in leaps)
-    return bool(leaps) and not twice and all(leap["at_s"] < first for leap in leaps)
+    twice = any(np.isfinite(jump.get("again_at_s", np.inf)) for jump in jumps)
+    return bool(jumps) and not twice and all(jump["at_s"] < first for jump in jumps)

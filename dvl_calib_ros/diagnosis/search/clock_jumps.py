@@ -64,8 +64,8 @@ def hypotheses_with_jumps(
     values = {"seconds": steps[0], "at_s": times[0]}
     if len(steps) > 1:
         values |= {"again_seconds": steps[1], "again_at_s": max(times[1], times[0])}
-    leap = every[LEAP] if len(steps) > 1 else once[LEAP]
-    return _hypotheses(fit, rest, once, leap, values, found.seconds[0])
+    jump = every[LEAP] if len(steps) > 1 else once[LEAP]
+    return _hypotheses(fit, rest, once, jump, values, found.seconds[0])
 
 
 def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
@@ -80,23 +80,23 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     stamps = recording.dvl.time
     steps = np.diff(stamps)
     usual = float(np.median(steps))
-    back = [(event.before, -event.by) for event in recording.set_back]
-    for event in recording.set_back:
+    back = [(event.before, -event.by) for event in recording.backward_steps]
+    for event in recording.backward_steps:
         steps[(stamps[:-1] <= event.before) & (stamps[1:] >= event.after)] = usual
     largest = np.argsort(-steps)[:GAPS]
     ahead = zip(stamps[largest].tolist(), (steps[largest] - usual).tolist(), strict=True)
     injections = [each for each in fit.hypothesis.injections(0) if each.effect.name != LEAP]
-    leaps: list[tuple[float, float]] = []  # stamps (s) of the jumps, and sizes (s)
+    jumps: list[tuple[float, float]] = []  # stamps (s) of the jumps, and sizes (s)
     for each in fit.values.get(LEAP, ()):
         for at_s, seconds in (("at_s", "seconds"), ("again_at_s", "again_seconds")):
             if np.isfinite(each.get(at_s, np.inf)):
                 own = late(injections, ActsOn.DVL_CLOCK, np.array([each[at_s]]))[0]
-                leaps.append((each[at_s] + float(own) + sum(by for _, by in leaps), each[seconds]))
+                jumps.append((each[at_s] + float(own) + sum(by for _, by in jumps), each[seconds]))
     found = []
     for stamp, gap in (*back, *ahead):
-        alike = [each for each in leaps if _is_as_large(each[1], gap)]
+        alike = [each for each in jumps if _is_as_large(each[1], gap)]
         its = min(alike, key=lambda each: abs(each[0] - stamp), default=None)  # the jump that may have left the gap
-        others = [each for each in leaps if each != its]
+        others = [each for each in jumps if each != its]
         before = sum(by for at, by in others if at < stamp)
         at = stamp - before - float(late(injections, ActsOn.DVL_CLOCK, np.array([stamp]))[0]) + 0.5 * usual
         if abs(gap) > GAP_FROM_S and at > 0.0:
@@ -154,7 +154,7 @@ def time_by_stamps(fitter: Fitter, fit: Fit, at_s: str) -> tuple[float, float, f
 
 
 def _hypotheses(
-    fit: Fit, rest: Sequence[Effect], once: Mapping[str, Effect], leap: Effect, values: Values, before: float
+    fit: Fit, rest: Sequence[Effect], once: Mapping[str, Effect], jump: Effect, values: Values, before: float
 ) -> list[Hypothesis]:
     """Return hypotheses with a jump, with and without a delay before it, next to all or only the usual effects."""
     usual = [effect for effect in rest if effect.name in (*OF_TIME, ARM)]
@@ -166,8 +166,8 @@ def _hypotheses(
     for others, lag, clock in itertools.product((list(rest), usual), lags, clocks):
         if lag:
             others = [effect for effect in others if effect.name not in LAG_OR_DELAY]
-        effects = [*others, *(once[name] for name in (*lag, *clock)), leap]
-        start: dict[str, tuple[Values, ...]] = {**lag, leap.name: (values,)}
+        effects = [*others, *(once[name] for name in (*lag, *clock)), jump]
+        start: dict[str, tuple[Values, ...]] = {**lag, jump.name: (values,)}
         start |= {name: ({"seconds": seconds},) for name, seconds in clock.items()}
         if len(effects) <= SETTINGS.max_effects:
             names = frozenset(effect.name for effect in effects)

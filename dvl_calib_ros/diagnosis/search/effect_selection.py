@@ -33,14 +33,14 @@ from ..model.hypothesis import Hypothesis, Values, is_time_of_run, no_effect
 from ..model.recorded_streams import RecordedStreams
 from ..model.settings import SETTINGS
 from ..model.stream_curve import FAST_ENOUGH_S
-from ..noise.noise_level import estimated
+from ..noise.noise_level import estimate_noise
 from ..noise.noise_model import Noise, white_noise
 from ..noise.whitened_least_squares import WhitenedLeastSquares
 from .arm_clock_ambiguity import ARM, ArmAmbiguity, guessed_arm
 from .backward_elimination import (
     eliminate,
-    only_predictive,
     repeated_effects,
+    without_chance,
 )
 from .candidates import intermittent_effects, proposed, variants_about
 from .clock_jumps import hypotheses_with_jumps, with_jumps_in_gaps
@@ -154,9 +154,9 @@ def select(
             break
         seen_before.add(names)
     wider = eliminate(fitter, fit, len(effects))
-    fit = only_predictive(fitter, wider, len(effects))
+    fit = without_chance(fitter, wider, len(effects))
     fitter, fit = with_noise_reestimated(fitter, fit, every)
-    fitter, fit, effects = _with_what_is_shown_of_the_arm(fitter, fit, every, effects)
+    fitter, fit, effects = _with_observable_arm(fitter, fit, every, effects)
     fit, alike = heading_first(fitter, fit, heading)
     found = identify_effects(fitter, fit, guesses, effects, alike)
     base = fitter.fit_kept(found.fit.hypothesis.with_effects([], len(recordings), {}), found.fit.noise)
@@ -201,7 +201,7 @@ def with_noise_reestimated(fitter: Fitter, fit: Fit, effects: Mapping[str, Effec
         explained, std = _explained(noise, columns, raw - fitter.outliers, own)
         corrected = raw - explained
         noise, robust = min(
-            (estimated(problem, fit.seen, corrected, rotation, columns, std) for rotation in frames),
+            (estimate_noise(problem, fit.seen, corrected, rotation, columns, std) for rotation in frames),
             key=lambda each: each[0].deviance(each[1]),
         )
         frames, fitter = [noise.rotation], Fitter(problem, corrected - robust)
@@ -239,7 +239,7 @@ def _explained(noise: Noise, columns: Array, residual: Array, own: Sequence[Arra
     return np.asarray(columns @ system.solution_without(of_noise)), ridge
 
 
-def _with_what_is_shown_of_the_arm(
+def _with_observable_arm(
     fitter: Fitter, fit: Fit, every: Mapping[str, Effect], effects: Mapping[str, Effect]
 ) -> tuple[Fitter, Fit, Mapping[str, Effect]]:
     """Return a fit and effects with only the observable parts of the lever arm.
@@ -272,10 +272,10 @@ def with_two_cycles(fitter: Fitter, fit: Fit, heading: Effect | None) -> list[Hy
     """
     if heading is None or len(fit.seen) < 2:
         return []
-    found = [_with_heading_in_place(fit, BY_YAW, each) for each in _two_cycles(heading)]
+    found = [_with_heading_instead(fit, BY_YAW, each) for each in _two_cycles(heading)]
     if BY_YAW & fit.values.keys():
         return found
-    straight = [fitter.straight_on(fit, each) for each in (fit.hypothesis, *found)]
+    straight = [fitter.one_step(fit, each) for each in (fit.hypothesis, *found)]
     return [each for misfit, each in straight[1:] if misfit < straight[0][0] - SETTINGS.conclusive]
 
 
@@ -287,13 +287,13 @@ def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit
     if DRIFT in fit.values:
         own = next((_names(each) for each in fit.effects if each.name == HEADING), frozenset())
         drifting = heading.without(_names(heading) - own - {OF_DRIFT})
-        found = fitter.fit_kept(_with_heading_in_place(fit, {DRIFT, HEADING}, drifting), fit.noise)
+        found = fitter.fit_kept(_with_heading_instead(fit, {DRIFT, HEADING}, drifting), fit.noise)
         if found.deviance < fit.deviance + SETTINGS.indistinguishable:
             fit = found
             alike[HEADING] = DRIFT
     if MOVED in fit.values:
         of_vehicle, of_day = (
-            fitter.fit_kept(_with_heading_in_place(fit, {MOVED, HEADING}, each), fit.noise)
+            fitter.fit_kept(_with_heading_instead(fit, {MOVED, HEADING}, each), fit.noise)
             for each in _two_cycles(heading)
         )
         if of_vehicle.deviance < fit.deviance + SETTINGS.indistinguishable:
@@ -313,7 +313,7 @@ def _names(effect: Effect) -> frozenset[str]:
     return frozenset(spec.name for spec in effect.parameters)
 
 
-def _with_heading_in_place(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
+def _with_heading_instead(fit: Fit, names: Collection[str], heading: Effect) -> Hypothesis:
     """Return the hypothesis of a fit with a heading error in place of the named effects."""
     n = len(fit.seen)
     none = {name: value for name, value in heading.defaults.items() if name in _names(heading)}
@@ -342,14 +342,14 @@ def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[Rec
     hypothesis: Robust fit, so that lever arm and delays do not resemble outliers.
 
     """
-    found = [_without(problem, hypothesis, index) for index in range(len(problem.recordings))]
+    found = [_without_outliers(problem, hypothesis, index) for index in range(len(problem.recordings))]
     return None if all(one is two for one, two in zip(found, problem.recordings, strict=True)) else tuple(found)
 
 
-def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedStreams:
+def _without_outliers(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedStreams:
     recording = problem.recordings[index]
-    dvl = _kept(problem, hypothesis, index, ActsOn.DVL_CLOCK)
-    reference = _kept(problem, hypothesis, index, ActsOn.REFERENCE_CLOCK)
+    dvl = _inliers(problem, hypothesis, index, ActsOn.DVL_CLOCK)
+    reference = _inliers(problem, hypothesis, index, ActsOn.REFERENCE_CLOCK)
     if dvl.all() and reference.all():
         return recording
     return replace(
@@ -360,7 +360,7 @@ def _without(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedSt
     )
 
 
-def _kept(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -> NDArray[np.bool_]:
+def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn) -> NDArray[np.bool_]:
     """Return (N,) whether each sample of one stream is no outlier."""
     recording = problem.recordings[index]
     of_dvl = clock is ActsOn.DVL_CLOCK

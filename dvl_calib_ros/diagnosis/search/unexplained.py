@@ -50,7 +50,7 @@ class Unexplained:
     """Result of the score tests. log_p: of the best entry or of all jointly, adjusted for multiple tests.
 
     about: name of the regressor, or a period (s). columns: (M, A, f), the dictionary; empty if insignificant. clearest:
-    (M, A, c), the most significant columns. price: quantile of the best test under the null at
+    (M, A, c), the most significant columns. penalty: quantile of the best test under the null at
     `SETTINGS.robust_level`.
     """
 
@@ -58,7 +58,7 @@ class Unexplained:
     about: str | float
     columns: Array
     clearest: Array
-    price: float = 0.0
+    penalty: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -85,8 +85,8 @@ def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     # follow the vehicle's speed and have its periods.
     whitened = noise.whiten(fit.residual)
     whitened = whitened / np.sqrt(float(whitened @ whitened) / (whitened.size - basis.shape[1]))
-    followed = lines(problem, whitened.reshape(-1, problem.axes))
-    tested = len(score_tests) + len(followed)
+    spectral = lines(problem, whitened.reshape(-1, problem.axes))
+    tested = len(score_tests) + len(spectral)
     found_events = [each for each in events(problem, fit, basis, white) if each.log_p < np.log(SETTINGS.robust_level)]
     if found_events:  # slow noise explains a step as well, unless the step predicts better
         base = fitter.fit_kept(fit.hypothesis.with_effects([], len(fit.seen), {}), fit.noise)
@@ -100,7 +100,7 @@ def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     nominal = [
         *(each.log_p for each in found_events),
         *(test.log_p() for test in score_tests),
-        *(line.log_p for line in followed),
+        *(line.log_p for line in spectral),
     ]
     if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
         return Unexplained(min(min(nominal) + looked_at, 0.0), "", nothing, nothing)
@@ -109,13 +109,13 @@ def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     tests = [
         (test.log_p(by), test.name, raw[test.name][:, :, test.at]) for test, by in zip(score_tests, grown, strict=True)
     ]
-    tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in followed]
+    tests += [(line.log_p, line.period_s, _along_axes(line.waves, problem.axes)) for line in spectral]
     tests += [(each.log_p, each.about, each.columns) for each in found_events]
     best = min(tests, key=_first)
     about = _simplest(tests, best[0])
     log_p = best[0] + looked_at
     # the best of many lines would always explain some of the noise
-    clear = [_along_axes(line.waves, problem.axes) for line in followed if line.log_p < np.log(SETTINGS.robust_level)]
+    clear = [_along_axes(line.waves, problem.axes) for line in spectral if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     tested = next((tested + each.tried for each in found_events if each.about == best[1]), tested)
     found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _limit(tested, best[2].shape[2]))
@@ -239,7 +239,7 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
 
 def is_predictive(problem: Problem, fit: Fit, unexplained: Unexplained) -> bool:
     """Return whether the regressor of the residual predicts held-out data better than slow noise and chance do."""
-    return unexplained.found and _is_predictive(problem, fit, unexplained.clearest, unexplained.price)
+    return unexplained.found and _is_predictive(problem, fit, unexplained.clearest, unexplained.penalty)
 
 
 def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:

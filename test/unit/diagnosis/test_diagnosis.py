@@ -326,7 +326,7 @@ def test_messages_that_claim_another_noise_than_they_have_make_no_effect(share):
     given = scenario(seconds=600.0, dvl_rate=5.0, gnss_rate=5.0, gnss_std=0.015, seed=11)
     honest = recording_of(simulate(given))
     dvl_std, reference_std = np.full(3, share * 0.004), np.full(3, share * 0.015)
-    dvl, reference = replace(honest.dvl, claimed=dvl_std), replace(honest.reference, claimed=reference_std)
+    dvl, reference = replace(honest.dvl, reported=dvl_std), replace(honest.reference, reported=reference_std)
     claiming = replace(honest, dvl=dvl, reference=reference, dvl_std=dvl_std, reference_std=reference_std)
     assert diagnose_recordings([claiming], Parameters()).verdict not in CLAIMS
 

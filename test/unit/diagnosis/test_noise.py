@@ -15,7 +15,7 @@ from dvl_calib_ros.diagnosis.answer.results import DiagnosisVerdict
 from dvl_calib_ros.diagnosis.diagnose import diagnose_recordings
 from dvl_calib_ros.diagnosis.fit.gauss_newton import Fitter
 from dvl_calib_ros.diagnosis.fit.selection_criteria import blocks_of
-from dvl_calib_ros.diagnosis.model.claimed_noise import exponents, followed
+from dvl_calib_ros.diagnosis.model.claimed_noise import exponents, relative_std
 from dvl_calib_ros.diagnosis.model.forward_model import Problem, make_problem
 from dvl_calib_ros.diagnosis.model.hypothesis import no_effect
 from dvl_calib_ros.diagnosis.model.recorded_streams import RecordedStreams, make_recording
@@ -23,7 +23,7 @@ from dvl_calib_ros.diagnosis.model.settings import SETTINGS
 from dvl_calib_ros.diagnosis.model.stream_curve import Curve
 from dvl_calib_ros.diagnosis.model.time_grid import Offsets
 from dvl_calib_ros.diagnosis.noise import noise_level
-from dvl_calib_ros.diagnosis.noise.noise_level import claims_of
+from dvl_calib_ros.diagnosis.noise.noise_level import log_reported
 from dvl_calib_ros.diagnosis.noise.noise_model import Arma, Noise, white_noise
 from dvl_calib_ros.diagnosis.search.effect_selection import without_slow_outliers
 from dvl_calib_ros.effects.registry import EFFECTS
@@ -143,8 +143,8 @@ def test_the_exponent_of_a_claim_is_found_whatever_the_noise_is_in_all():
         values = 0.02 * np.exp(exponent * claims) * rng.standard_normal(claims.shape)
         found = exponents(["reference"], claims[:, :, None], values, stretch)
         assert found.exponents[0] == pytest.approx(exponent, abs=4.0 * found.stds[0])
-        assert bool(found.sure[0]) == (exponent > 0.0)
-        relative = followed(claims[:, :, None], values, ["reference"], stretch)
+        assert bool(found.is_significant[0]) == (exponent > 0.0)
+        relative = relative_std(claims[:, :, None], values, ["reference"], stretch)
         assert np.std(np.log(relative) - exponent * (claims - claims.mean(axis=0))) < 0.1
 
 
@@ -160,7 +160,7 @@ def test_claims_of_the_earths_axes_are_turned_into_the_frame_of_the_noise():
     problem = make_problem([run], np.eye(3), np.zeros(3), [Offsets()])
     seen = problem.all_seen(no_effect())
     for rotation, order in ((None, [1, 0, 2]), (problem.earth_from_compared, [0, 1, 2])):
-        names, claims = claims_of(problem, seen, rotation)
+        names, claims = log_reported(problem, seen, rotation)
         assert names == ("reference",)
         early = problem.time < 49.0
         expected = np.log(np.array([0.1, 0.02, 0.05])[order])
@@ -418,7 +418,7 @@ def test_an_outlier_does_not_shift_the_level_of_slow_noise():
 def test_an_event_is_whitened_from_the_bins_about_it_alone(rng):
     arma = Arma(np.array([0.95]), -0.6, 0.02, 1.5)
     noise = Noise((slice(0, 150), slice(150, 400)), None, rng.uniform(0.5, 2.0, (400, 3)), (arma,) * 3)
-    event, about = np.zeros((400, 3)), slice(139, 164 + noise.fading)
+    event, about = np.zeros((400, 3)), slice(139, 164 + noise.memory_samples)
     event[140:164] = rng.normal(size=(24, 3))
     whole = noise.whiten(event).reshape(400, 3)
     np.testing.assert_allclose(noise.part(about).whiten(event[about]).reshape(-1, 3), whole[about], atol=1e-9)
