@@ -468,7 +468,7 @@ def _warnings(result: Result, topics: Topics, decoder: MessageDecoder) -> list[R
 
 
 def _refusal_advice(decoder: MessageDecoder, counts: Mapping[str, int]) -> str:
-    """Return what is known about refused DVL messages."""
+    """Return the likely cause of refused DVL messages."""
     known = [str(found) for kind, found in decoder.problems.items() if kind.startswith("dvl")]
     known += map(str, decoder.dvl_type.advice(counts))
     return ". ".join(known) or "Valid is finite, with variances that are not negative, and not above max_speed."

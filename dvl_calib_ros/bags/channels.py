@@ -215,7 +215,7 @@ def _parsed(definition: Definition, msgtype: str) -> dict[str, Any]:
 
 
 def _without_constants(types: dict[str, Any]) -> dict[str, Any]:
-    """Remove the constants from types. Raises DefinitionError for definitions that no driver has."""
+    """Remove the constants from message types. Raises DefinitionError for an invalid name or array size."""
     for name, (_, fields) in types.items():
         for field, (kind, description) in fields:
             if not _TYPE.fullmatch(name) or not _FIELD.fullmatch(field):

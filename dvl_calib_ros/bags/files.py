@@ -182,7 +182,7 @@ def _natural_order(path: Path) -> list[tuple[int, str]]:
 
 
 def decompressed(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
-    """Decompress a file, as far as it is readable."""
+    """Decompress the readable part of a file."""
     target = new_folder() / (path.stem if path.suffix == ".zstd" else path.name)
     most = max(SMALL_FILE, LARGEST_RATIO * path.stat().st_size)
     try:

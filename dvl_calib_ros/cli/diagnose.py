@@ -149,7 +149,7 @@ def _apply_paths(path: Path | None, names: Sequence[str]) -> dict[str, Path]:
 
 
 def _samples(words: Sequence[str] | None) -> tuple[int, Path | None]:
-    """Return number and file of --samples, 0 and None without. Raises InputError."""
+    """Return the number of posterior samples and their file, 0 and None without --samples. Raises InputError."""
     if words is None:
         return 0, None
     if not words[0].isdecimal() or not 1 <= int(words[0]) <= MOST_SAMPLES:

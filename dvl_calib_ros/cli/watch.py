@@ -338,7 +338,7 @@ def line(status: Status) -> str:
 
 
 class Keys:
-    """Keyboard commands to a node. `said` is the last answer, `page` the number of presses of w.
+    """Keyboard commands to a node. `last_answer` is the answer of the last service, `page` the number of presses of w.
 
     ends_node: whether the node ends with the view. Then q saves first, and asks before a better result is replaced.
     """
@@ -352,7 +352,7 @@ class Keys:
         self.page = 0
 
     @property
-    def said(self) -> str:
+    def last_answer(self) -> str:
         """Last answer."""
         return self._own or self._listener.answer
 
@@ -429,7 +429,7 @@ def show(
                     return
             if keys.has_left():
                 return
-            news = (_message(log[-1]) if log else "", keys.said)
+            news = (_message(log[-1]) if log else "", keys.last_answer)
             event = next((new for new, old in zip(news, before, strict=True) if new != old), event)
             before = news
             live.update(View(status, now_s, log, event, keys.page), refresh=True)

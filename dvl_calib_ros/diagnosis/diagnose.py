@@ -89,7 +89,7 @@ def diagnose_recordings(
     effects: Mapping[str, Effect] = EFFECTS,
     with_series: bool = False,
 ) -> Diagnosis:
-    """Diagnose recordings in memory. Raises InputError for clock offsets too large to compare."""
+    """Select, fit and validate effects on recordings in memory. Raises InputError for too large clock offsets."""
     insufficiency = _insufficiency(recordings)
     if insufficiency:
         return _undiagnosed(insufficiency, notes)

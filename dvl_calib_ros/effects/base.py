@@ -111,7 +111,7 @@ class EffectParameter:
     """One parameter of an effect.
 
     typical: a relevant size, in `unit`. low, high: bounds. default: value if not given; an effect with all defaults
-    does nothing. linear: the trace is linear in it, with the others fixed. said: displayed name before value and unit,
+    does nothing. linear: the trace is linear in it, with the others fixed. said: text displayed before value and unit,
     '' if the effect's name suffices; None: `name`.
     """
 

@@ -34,7 +34,7 @@ class Outliers(NoiseEffect):
         return velocity + hit[:, None] * rng.normal(0.0, values["std_mps"], velocity.shape)
 
     def following(self, values: Mapping[str, float], rng: np.random.Generator) -> Disturbance:
-        """Return the same with the same probability; the samples hit differ from those of one call."""
+        """Return `disturb` for consecutive batches; the probability is equal, the outliers are other samples."""
         return lambda velocity, motion: self.disturb(velocity, motion, values, rng)
 
 

@@ -143,14 +143,14 @@ def cross_check(
 
 
 def _notes_of(replayed: _Replayed, models: Sequence[str]) -> Iterator[str]:
-    """Yield the notes on the models asked for; if all are, only on the selected one."""
+    """Yield the notes on the requested models; if all are requested, only on the selected one."""
     requested = {replayed.selected[0]} if set(models) == set(BY_VELOCITY) else set(models)
     others = tuple(f"{name}: " for name in MODELS if name not in requested)
     yield from (note for note in (*replayed.failed, *replayed.notes) if not note.startswith(others))
 
 
 def _with_own_delay(terms: Terms, verified: _Replayed) -> Terms:
-    """Replace the delay by the verifying bag's, because clocks are synchronised anew in each recording."""
+    """Replace the delay by the verifying bag's, because each recording synchronises its clocks differently."""
     delayed = next(iter(verified.delayed.values()), None)
     return terms if delayed is None else terms._replace(time_offset=delayed.time_offset)
 

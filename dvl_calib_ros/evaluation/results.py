@@ -37,7 +37,7 @@ class Improvement(NamedTuple):
 
     @staticmethod
     def of(models: Sequence[str], corrected: Array, uncorrected: Array) -> Improvement:
-        """Compute from corrected (M, ...) and uncorrected (...) errors of M models, where both are known."""
+        """Return the improvement by the best of M models, from corrected (M, ...) and uncorrected (...) errors, m/s."""
         candidates = []
         for name, after in zip(models, corrected, strict=True):
             known = np.isfinite(after) & np.isfinite(uncorrected)

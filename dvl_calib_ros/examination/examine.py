@@ -87,7 +87,7 @@ class Examination(Answering):
 
     @property
     def has_reference(self) -> bool:
-        """Whether there is a reference velocity."""
+        """Return whether there is a reference velocity."""
         return any(content.role == "reference" for content in self.contents)
 
     @property

@@ -73,7 +73,7 @@ class CalibratedMounting:
 
     @property
     def lever_arm_found(self) -> bool:
-        """Whether the estimated lever arm replaces the configured one."""
+        """Return whether the estimated lever arm replaces the configured one."""
         return self.lever_arm != self.parameters.lever_arm
 
     @property

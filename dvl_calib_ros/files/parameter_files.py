@@ -106,7 +106,7 @@ def _number_or_degrees(value: Any) -> Any:
 
 
 def _node_parameters(path: Path, text: str | None = None) -> dict[str, Any]:
-    """Return the parameters of this node in a ROS parameter file, without those of ROS itself."""
+    """Return this node's parameters in a ROS parameter file, without use_sim_time and the like."""
     sections = _own_sections(path, NODE_NAME, section_is_ours, text)
     values: dict[str, Any] = {}
     for _, body in sections:

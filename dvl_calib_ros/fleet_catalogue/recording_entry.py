@@ -65,7 +65,7 @@ class StoredRecording:
 
     @property
     def is_remote(self) -> bool:
-        """Whether it must be copied for reading."""
+        """Return whether the recording must be copied before it can be read."""
         return "://" in self.where
 
     def vehicle(self, pattern: re.Pattern[str] | None) -> str:
@@ -178,7 +178,7 @@ def _local_file(path: str) -> StoredFile:
 
 
 def _in_store(place: str) -> _Files:
-    """Return root and files by folder of an object store. Raises InputError."""
+    """Return the root of a place in an object store, and its recordings' files by folder. Raises InputError."""
     store, root = _open_store(place)
     try:
         found: Mapping[str, Mapping[str, Any]] = store.find(root, detail=True)

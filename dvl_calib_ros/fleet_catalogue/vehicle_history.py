@@ -57,7 +57,7 @@ class Catalogued:
 
     @property
     def is_usable(self) -> bool:
-        """Whether its values and σ are valid."""
+        """Return whether the estimated values and σ are valid."""
         return self.extrinsics is not None and not self.extrinsics.rejected
 
 

@@ -322,9 +322,10 @@ def _instrument_from_beams(fixed: bytes) -> Array:
 
 
 def _applied_rotation(roll: float, pitch: float, heading: float, fixed: bytes) -> Array:
-    """Return the rotation (3, 3) that the instrument applied: by beam 3's heading and, if set, by its tilts.
+    """Return the rotation (3, 3) that the instrument applied: heading of beam 3 and, if configured, tilts.
 
-    (Same document, eq. 18.) Its transpose undoes it, whatever the accuracy of the heading.
+    fixed: fixed leader. (Same document, eq. 18.) The transpose undoes the rotation exactly, even if the heading is
+    inaccurate.
     """
     if not fixed[25] & 4:
         roll = pitch = 0.0

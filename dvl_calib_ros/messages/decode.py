@@ -66,7 +66,7 @@ HALF_TURN, QUARTER_TURN = Axes((0, 1, 2), (1.0, -1.0, -1.0)), Axes((1, 0, 2), (-
 class DeclaredFrame(NamedTuple):
     """A frame of reference velocities: the core's frame, and the axes from which messages are converted to it.
 
-    body_axes: flu or frd, if the body's axes are named; empty for those of base_frame.
+    body_axes: flu or frd, if the body's axes are named; empty for the axes of base_frame.
     """
 
     frame: VelocityFrame
@@ -325,7 +325,7 @@ class MessageDecoder:
 
     @property
     def turns_dvl(self) -> bool:
-        """Whether the DVL's data are rotated by 180° about x, to the axes of base_frame."""
+        """Return whether the DVL's data are rotated by 180° about x, to the axes of base_frame."""
         return turns_dvl(self.dvl_type, self.dvl_frame or "", self.parameters)
 
     def note_axes(self) -> None:

@@ -159,7 +159,7 @@ class KeptMessages(RowTable):
 
     @property
     def is_kept(self) -> bool:
-        """Whether all messages so far are kept."""
+        """Return whether all messages so far are kept."""
         return self._is_kept
 
     @property

@@ -213,8 +213,8 @@ class CalibrationNode(AnsweringNode):
         self._adapted = self._feed.decoder.adapted
         self._awaits_heading_std = self._awaits_heading_std and "heading_deviation_std" not in discovery.values
         now_s = self._pauses.running_s(steady_s())
-        heard = {name_used: subscription.topic_name for name_used, subscription in self._inputs.items()}
-        self._silence, self._recent, self._card = Silence(now_s, heard), RecentCounts(), Card(now_s)
+        n_messages = {name_used: subscription.topic_name for name_used, subscription in self._inputs.items()}
+        self._silence, self._recent, self._card = Silence(now_s, n_messages), RecentCounts(), Card(now_s)
         self._correction, self._mounting_published = None, ("", 0)
 
     def _start(
@@ -233,12 +233,12 @@ class CalibrationNode(AnsweringNode):
 
         message: the DVL message that is fed next.
         """
-        if self._transforms is None or not self._transforms.heard:
+        if self._transforms is None or not self._transforms.n_messages:
             return
         decoder = self._feed.decoder
         _, reference, imu = decoder.frame_ids
         dvl = decoder.dvl_frame or frame_name(decoder.dvl_type.frame_id(message))
-        tried = (self._transforms.heard, (dvl, reference, imu))
+        tried = (self._transforms.n_messages, (dvl, reference, imu))
         if tried == self._transforms_tried:
             return
         self._transforms_tried = tried

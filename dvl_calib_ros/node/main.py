@@ -72,13 +72,13 @@ def run_until(ending: Ending, args: Sequence[str]) -> int:
         executor = ReceivingExecutor(node)
         gc.freeze()  # objects of the start stay; a collection that examines them would delay a message by 0.01 s
         # spin_until_future_complete would keep one more callback for every message
-        ending.tell(lambda: executor.create_task(lambda: None))
+        ending.call_on_request(lambda: executor.create_task(lambda: None))
         while not ending.requested:
             executor.spin_once()
     except (ParameterError, InputError) as error:
         return _report_refusal(error)
     finally:
-        ending.heard()
+        ending.stop_calling()
         if node is not None:
             is_saved = node.finish()
             node.destroy_node()

@@ -72,7 +72,7 @@ class SimulatorNode(AnsweringNode):
 
     @property
     def is_heard(self) -> bool:
-        """Whether every topic has a subscriber."""
+        """Return whether every topic has a subscriber."""
         return all(each.get_subscription_count() > 0 for each in (self._dvl, self._gnss, self._imu_message))
 
     def publish(self, samples: Sequence[Sample]) -> None:
@@ -158,7 +158,7 @@ def run_until(
         node = SimulatorNode(outputs, max(QUEUE, len(samples)))
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        ending.tell(lambda: executor.create_task(lambda: None))
+        ending.call_on_request(lambda: executor.create_task(lambda: None))
         while wait and not node.is_heard and not ending.requested:
             executor.spin_once(timeout_sec=BREATH_S)
         if follow is not None:
@@ -169,7 +169,7 @@ def run_until(
             _play(node, executor, ending, samples, speed)
         return node.sent
     finally:
-        ending.heard()
+        ending.stop_calling()
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()

@@ -282,7 +282,7 @@ class Detectable(NamedTuple):
     spec: EffectParameter | None
 
     @property
-    def said(self) -> tuple[list[float], str]:
+    def sizes(self) -> tuple[list[float], str]:
         """Detectable and typical size, and their common unit."""
         return quantity((self.size, self.spec.typical), self.spec.unit) if self.spec else ([self.size], "")
 
@@ -293,10 +293,10 @@ DETECTABLE_NOTE = (
 DETECTABLE: Columns[Detectable] = {
     "effect": lambda each: each.effect,
     "smallest size found": lambda each: Cell(
-        f"{each.spec.display_name if each.spec else each.parameter} {three(each.said[0][0])} {each.said[1]}".strip(),
+        f"{each.spec.display_name if each.spec else each.parameter} {three(each.sizes[0][0])} {each.sizes[1]}".strip(),
         "text" if each.spec is None else "text good" if each.size <= each.spec.typical else "text far",
     ),
-    "relevant size": lambda each: f"{two(each.said[0][1])} {each.said[1]}" if each.spec else "–",
+    "relevant size": lambda each: f"{two(each.sizes[0][1])} {each.sizes[1]}" if each.spec else "–",
 }
 
 

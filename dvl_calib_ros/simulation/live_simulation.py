@@ -47,7 +47,7 @@ class MotionSample:
 class Follower:
     """Sensors of a scenario that follow a given motion; stamps are `start_ns` plus the time of the motion.
 
-    Samples equal those of `simulate` for the same motion, except for the random outliers and the IMU's noise. Raises
+    Samples equal the output of `simulate` for the same motion, except for random outliers and the IMU's noise. Raises
     InputError for a noise effect that cannot be generated sample by sample.
     """
 

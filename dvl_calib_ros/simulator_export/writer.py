@@ -34,7 +34,7 @@ class Settings:
 
     text: the file. found: settings by name from the description. defaults: the simulator's own ones. noise_std: (3,)
     m/s of its axes with these settings; None at the default noise. scale: the common error of all axes. remarks: for
-    the user of the file. represented: which of `scale` and `velocity_bias` are in the file.
+    the user of the file. represented: effects in the file, `scale` or `velocity_bias`.
     """
 
     text: str
@@ -140,7 +140,7 @@ def _noise(settings: Settings, description: DvlDescription) -> list[Missing]:
 
 
 def mixed_scale(description: DvlDescription) -> float:
-    """Return the single scale-factor error that best replaces those of the three axes, at the speeds driven."""
+    """Return the single scale error that best replaces the errors of the three axes, at the speeds driven."""
     scale = np.array(description.scale)
     if description.speed is None:
         return float(scale[0])  # ahead, the main direction of vehicles

@@ -557,7 +557,7 @@ def _reasons(
 
 
 def _nothing_to_compare(vehicle: Diagnosis, simulator: Diagnosis) -> UnpairedComparison:
-    """Return the comparison for sides of which at least one could not be diagnosed."""
+    """Return the comparison if at least one side could not be diagnosed."""
     reasons = tuple(
         finding("SIMULATOR_NOTHING_COMPARED", side=side, why=diagnosis.reasons)
         for side, diagnosis in (("vehicle", vehicle), ("simulator", simulator))

@@ -92,7 +92,7 @@ class Size:
 
 
 def compared_names(vehicle: Size, simulator: Size) -> list[str]:
-    """Return the compared parameters: those of both sides and, for an effect found on both, of a second occurrence.
+    """Return the names of parameters on both sides and, for an effect found on both, of a second occurrence.
 
     A side without the second occurrence has 0 for it.
     """

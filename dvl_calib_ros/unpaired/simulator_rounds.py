@@ -41,7 +41,7 @@ MOST_ROUNDS = 9
 # the simulator's velocity is exact: only the corners between its samples are smoothed
 SMOOTHING_S = 0.2
 TRUTH_HZ = 10.0
-# codes of a comparison's reasons that hold beside the differences in effects
+# codes of a comparison's reasons that remain valid next to the differences in effects
 REMAINING = ("SIMULATOR_NOISE", "SIMULATOR_UNKNOWN_REST")
 
 

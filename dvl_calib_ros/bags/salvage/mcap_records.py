@@ -467,7 +467,7 @@ def chunk_head(file: BinaryIO, at: int) -> ChunkHead:
 
 
 def is_chunk(file: BinaryIO, at: int, length: int) -> bool:
-    """Return whether a record looks like a chunk, apart from its opcode."""
+    """Return whether a record with a damaged opcode looks like a chunk."""
     with suppress(DamagedError):
         head = chunk_head(file, at)
         return head.size + head.packed_size == length and 0 < head.unpacked_size <= LARGEST_RECORD

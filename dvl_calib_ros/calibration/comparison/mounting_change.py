@@ -202,7 +202,7 @@ def contradicts(found: Extrinsics, initial: Extrinsics) -> Difference | None:
 
 
 def check_distinct(calibrations: Sequence[Extrinsics]) -> None:
-    """Raise InputError if two names refer to one calibration, which would confirm itself."""
+    """Raise InputError for a calibration that is given twice: its differences would be zero."""
     for one, other in combinations(calibrations, 2):
         of_one, of_other = ((each.model, each.first_ns, each.last_ns, each.used) for each in (one, other))
         if of_one == of_other and np.allclose(one.covariance, other.covariance, rtol=1e-6, atol=0.0):

@@ -61,7 +61,7 @@ def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: in
 
 
 def _minima(misfit: Array, by_reference: Array, by_dvl: Array, most: int) -> list[ClockPlace]:
-    """Return the lowest local minima of the misfit."""
+    """Return at most `most` lowest local minima of a misfit (R, D) over reference and DVL delays (R,) and (D,), s."""
     around = np.pad(misfit, 1, constant_values=np.inf)  # only local minima, so that flanks of a broad one do not count
     is_lowest = np.minimum(misfit, np.minimum(around[2:, 1:-1], around[:-2, 1:-1])) == misfit
     is_lowest &= np.minimum(misfit, np.minimum(around[1:-1, 2:], around[1:-1, :-2])) == misfit

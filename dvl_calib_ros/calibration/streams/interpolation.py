@@ -75,7 +75,7 @@ class TurnRates(NamedTuple):
 
 
 def shortened(pauses: Array, most: float) -> Array:
-    """Return pauses (N,), the longest of them cut to one length so that all together last `most` at most."""
+    """Clip the longest pauses (N,), s, to a common length so that their sum is at most `most`, s."""
     if pauses.sum() <= most:
         return pauses
     in_order = np.sort(pauses)

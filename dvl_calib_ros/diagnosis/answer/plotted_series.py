@@ -170,7 +170,7 @@ class RegressorPlot:
 
 
 def residual_by_regressor(problem: Problem, fit: Fit, about: str | float) -> RegressorPlot | None:
-    """Return the residual against its strongest regressor among those of a name. Return None if there is none.
+    """Return the residual against the strongest regressor of a group, by the group's name. Return None without any.
 
     Strongest: axis and regressor whose group means scatter most relative to their standard errors.
     """

@@ -146,7 +146,7 @@ class Fitter:
         return replace(self, held=held, _fits={})
 
     def bursts(self, fit: Fit) -> Mask:
-        """Return (M,) bins with large errors for some seconds, too few for an effect.
+        """Return a mask (M,) of bins in short bursts of large errors, too rare for an effect.
 
         The residual is not whitened: bursts would determine the noise's colour.
         """

@@ -235,7 +235,7 @@ def _usual(std: Array | None) -> Array | None:
 
 
 def _rms(std: Array | None) -> Array | None:
-    """Return the RMS (3,) of standard deviations (3,) or (N, 3), without those of unmeasured axes."""
+    """Return the RMS (3,) of standard deviations (3,) or (N, 3); unmeasured axes are ignored."""
     usual = _usual(std)
     if std is None or usual is None or std.ndim == 1:
         return std

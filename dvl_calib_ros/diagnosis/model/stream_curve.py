@@ -207,7 +207,7 @@ class Curve:
         return known & (product <= MAX_NEIGHBOUR_PRODUCT * self.interval**2)
 
     def averaged(self, rate_hz: float) -> Curve:
-        """Average groups of samples to at most a given rate."""
+        """Return the curve averaged over groups of samples, so that its rate is at most `rate_hz`."""
         every = int(np.ceil(1.0 / (rate_hz * self.interval) - 0.05))
         if every <= 1:
             return self

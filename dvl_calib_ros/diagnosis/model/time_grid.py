@@ -75,7 +75,7 @@ class Grid:
 
     @cached_property
     def _least(self) -> Array:
-        """Return the least time (F,) s since the first sample; cached, as it is the same for all hypotheses."""
+        """Return the least time (F,) s since the first sample; cached, because no hypothesis changes it."""
         steps = np.diff(self.stamps, prepend=self.stamps[:1])
         return np.asarray(0.5 * np.cumsum(np.minimum(steps, np.median(steps))))
 

@@ -69,7 +69,7 @@ def _fit_slopes(found: Sequence[Array], log_square: Array) -> tuple[Array, Array
 
 
 def _clip_extremes(values: Array) -> Array:
-    """Clip values (M,) to the range without `FEW` extreme rows: these may be quiet by chance and bias a slope."""
+    """Clip values (M,) to the range without `FEW` extreme rows: an accidentally small one biases a slope."""
     ordered = np.sort(values)
     few = min(FEW, (len(values) - 1) // 2)
     return np.clip(values, ordered[few], ordered[-1 - few])

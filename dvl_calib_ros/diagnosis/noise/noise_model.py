@@ -394,6 +394,6 @@ def _spectrum(series: Array, taken: Array | None) -> _Spectrum:
 
 
 def _ratio(ar: Array, ma: float) -> float:
-    """Return the standard deviation of the noise over that of its innovations."""
+    """Return the standard deviation of the noise divided by the standard deviation of its innovations."""
     a = float(ar[0]) if len(ar) else 0.0
     return float(np.sqrt(1.0 + (a + ma) ** 2 / (1.0 - a**2)))

@@ -38,7 +38,7 @@ class WhitenedLeastSquares:
 
     @staticmethod
     def of(columns: Array, target: Array, std: Array, centre: Array) -> WhitenedLeastSquares:
-        """Make the system of whitened columns (m, n) and target (m,)."""
+        """Return the system of whitened columns (m, n) and target (m,). std, centre: (n,) of the parameters' prior."""
         xty = columns.T @ target
         gram = np.block([[columns.T @ columns, xty[:, None]], [xty, target @ target]])
         return WhitenedLeastSquares(gram, std, centre)

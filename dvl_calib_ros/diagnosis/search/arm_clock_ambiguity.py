@@ -128,7 +128,7 @@ def with_clocks(
     block: Index,
     trade_off: ArmAmbiguity | None,
 ) -> Fit | None:
-    """Return a fit with both clocks in addition, if part of the lever arm is equally likely theirs; else the fit.
+    """Return a fit with both clock offsets, if they explain part of the lever arm equally well; else the fit.
 
     Return None where arm and clock are inseparable. block: (M,) of each bin, for σ. trade_off: from `arm_ambiguity`; if
     given, a part that changes significantly with free clocks is ambiguous as well.

@@ -52,7 +52,7 @@ def _observable_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> 
 
 
 def without_insignificant(problem: Problem, fit: Fit) -> Effect | None:
-    """Return the lever arm without parts below 2 σ of the model error. Return None if all are significant."""
+    """Return the lever arm effect without components below 2 σ of the model error, None if all are significant."""
     known = _model_error(problem, fit)
     faint = {name for name, std in known.items() if abs(fit.values[ARM][0][name]) < OF_INTERVAL * std}
     (arm,) = (effect for effect in fit.effects if effect.name == ARM) if faint else (None,)
