@@ -76,29 +76,29 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
     layouts = _Layouts(bag.decoder)
     arrived = 0
     for batches in _windows(bag.batches(topics)):
-        places = np.cumsum([0, *(batch.size for batch in batches)])
+        offsets = np.cumsum([0, *(batch.size for batch in batches)])
         log_ns = np.concatenate([np.minimum(batch.log_ns, LATEST_NS).astype(np.int64) for batch in batches])
         by_kind: dict[tuple[int, int], list[tuple[Batch, Index, Index]]] = {}
-        for batch, first in zip(batches, places.tolist(), strict=False):
-            for number, length, at in _kinds(batch):
+        for batch, first in zip(batches, offsets.tolist(), strict=False):
+            for number, length, index in _kinds(batch):
                 # the channel's id is cheap; its hash would take most of the time
                 kind = (id(batch.channels[number]), length)
-                by_kind.setdefault(kind, []).append((batch, at, first + at))
+                by_kind.setdefault(kind, []).append((batch, index, first + index))
         parts = []
-        for (_, length), found in by_kind.items():
-            batch, at, _ = found[0]
-            channel = batch.channels[int(batch.number[at[0]])]
-            place = np.concatenate([place for *_, place in found])
+        for (_, length), chunks in by_kind.items():
+            batch, index, _ = chunks[0]
+            channel = batch.channels[int(batch.number[index[0]])]
+            position = np.concatenate([position for *_, position in chunks])
             if channel.topic in one_by_one or not length:
-                data = [each for batch, at, _ in found for each in batch.part(at).data()]
-                parts.append(Part(channel, place + arrived, log_ns[place], None, data, bag.decoder))
+                data = [each for batch, index, _ in chunks for each in batch.part(index).data()]
+                parts.append(Part(channel, position + arrived, log_ns[position], None, data, bag.decoder))
                 continue
-            rows_of = [batch.rows(at, length) for batch, at, _ in found]
+            rows_of = [batch.rows(index, length) for batch, index, _ in chunks]
             contents = rows_of[0] if len(rows_of) == 1 else np.concatenate(rows_of)
             for columns, rows in layouts.split(channel, contents):
-                own = place if len(rows) == len(place) else place[rows]
+                positions = position if len(rows) == len(position) else position[rows]
                 data = [] if columns is not None else [each.tobytes() for each in contents[rows]]
-                parts.append(Part(channel, own + arrived, log_ns[own], columns, data, bag.decoder))
+                parts.append(Part(channel, positions + arrived, log_ns[positions], columns, data, bag.decoder))
         arrived += len(log_ns)
         yield Window(parts, int(log_ns[-1]))
 

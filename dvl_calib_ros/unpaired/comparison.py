@@ -80,13 +80,13 @@ class Scatter:
 def compare_noise(vehicle: Log, simulator: Log) -> list[Candidate]:
     """Compare all properties observable on both sides."""
     found: list[Candidate | None] = []
-    both = [scatter(log) for log in (vehicle, simulator)]
-    if all(both) and not (vehicle.exact or simulator.exact):
-        slopes = [slopes_of(side) for side in both]
-        even = at_one_motion(both, slopes)
-        found += [_level(even[0], even[1], axis) for axis in range(3)]
+    sides = [scatter(log) for log in (vehicle, simulator)]
+    if all(sides) and not (vehicle.exact or simulator.exact):
+        slopes = [slopes_of(side) for side in sides]
+        scaled = at_one_motion(sides, slopes)
+        found += [_level(scaled[0], scaled[1], axis) for axis in range(3)]
         found += _growth(slopes)
-        found += [_tails(even[0], even[1])]
+        found += [_tails(scaled[0], scaled[1])]
     found.append(_colour(vehicle, simulator))
     return [each for each in found if each is not None]
 
@@ -213,21 +213,21 @@ def _is_significant(slopes: Slopes, name: str) -> bool:
     return bool(2.0 * norm.sf(abs(value) / std) < GROWS)
 
 
-def at_one_motion(both: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
+def at_one_motion(sides: Sequence[Sequence[Scatter]], slopes: Sequence[Slopes]) -> list[list[Scatter]]:
     """Scale the noise to a common motion of both sides, by the significant growth."""
-    columns = [[_covariates(each) for each in side] for side in both]
-    names = [name for name in SPREAD if any(name in of and _is_significant(of, name) for of in slopes)]
-    even = [list(side) for side in both]
+    columns = [[_covariates(each) for each in side] for side in sides]
+    names = [name for name in SPREAD if any(name in slope and _is_significant(slope, name) for slope in slopes)]
+    scaled = [list(side) for side in sides]
     for name in names:
         if not all(name in each for side in columns for each in side):
             continue
-        usual = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
-        for side, of, own_columns in zip(even, slopes, columns, strict=True):
-            if name in of and _is_significant(of, name):
+        mean = float(np.mean([np.mean(np.concatenate([each[name] for each in side])) for side in columns]))
+        for side, slope, own_columns in zip(scaled, slopes, columns, strict=True):
+            if name in slope and _is_significant(slope, name):
                 for index, each in enumerate(side):
-                    quieter = np.exp(-of[name][0] * (own_columns[index][name] - usual))
+                    quieter = np.exp(-slope[name][0] * (own_columns[index][name] - mean))
                     side[index] = replace(each, values=each.values * quieter[:, None])
-    return even
+    return scaled
 
 
 def _covariates(scattered: Scatter) -> dict[str, Array]:

@@ -201,7 +201,7 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
 
     rng = np.random.default_rng(0)
     spread = np.sqrt(blocks / rng.chisquare(blocks, (RESAMPLES, 1)))  # the scatter of blocks is itself estimated
-    moved = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
+    draws = spread * rng.multivariate_normal(np.zeros(p), covariance[6:, 6:], RESAMPLES, method="eigh")
     columns = without_calibration(fit.columns[:, :, 6:])
     others = [rival for selected in selection.selected for rival in selected.rivals]
     if selection.wider is not None and len(selection.wider.effects) > len(fit.effects):
@@ -212,10 +212,10 @@ def with_closure(gap: Gap, selection: EffectSelection, covariance: Array, residu
     of_cause = rows * max(remainder(selection, residuals), gap.not_expected**2 if gap.fails_held_out else 0.0)
     gram = columns.T @ columns
     shares = []
-    for true, step in zip(truths, np.array_split(moved, len(truths)), strict=True):
-        around = np.einsum("ri,ij,rj->r", step, gram, step)
-        residual, error = true - corrected, true
-        of_residual, of_error = (each @ each - 2.0 * step @ (columns.T @ each) + around for each in (residual, error))
+    for true_error, step in zip(truths, np.array_split(draws, len(truths)), strict=True):
+        variance = np.einsum("ri,ij,rj->r", step, gram, step)
+        residual, error = true_error - corrected, true_error
+        of_residual, of_error = (each @ each - 2.0 * step @ (columns.T @ each) + variance for each in (residual, error))
         share = 1.0 - (of_residual + of_cause) / np.maximum(of_error + of_cause, 1e-300)
         shares.append(np.clip(share, -1.0, 1.0))
     low, high = np.percentile(np.concatenate(shares), [2.5, 97.5]).tolist()

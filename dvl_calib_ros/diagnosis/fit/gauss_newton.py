@@ -153,8 +153,8 @@ class Fitter:
         raw = (fit.residual + self.outliers) / fit.noise.level
         size = np.abs(raw / np.maximum(robust_std(raw), 1e-12)).max(axis=1)
         run = np.cumsum(np.diff(size > 0.5 * SETTINGS.outlying, prepend=False))  # odd in the runs, even between them
-        far = np.isin(run, run[size > SETTINGS.outlying])
-        return far & (np.count_nonzero(far) <= RARE * len(far))
+        in_burst = np.isin(run, run[size > SETTINGS.outlying])
+        return in_burst & (np.count_nonzero(in_burst) <= RARE * len(in_burst))
 
     def evaluated(self, hypothesis: Hypothesis) -> tuple[tuple[Seen, ...], Array]:
         """Evaluate a hypothesis; return the evaluation and the residual (M, A)."""
@@ -199,8 +199,8 @@ class Fitter:
         fixed: names of effects whose values are fixed. linearised, evaluated: linearisation or evaluation of the
         start, if known.
         """
-        kept = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
-        kept |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
+        is_fixed = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
+        is_fixed |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
         hypothesis = start
         if linearised is not None:
             evaluated = linearised.seen, linearised.residual
@@ -209,21 +209,21 @@ class Fitter:
         for _ in range(max_steps):
             linearised = linearised or self._linearised(hypothesis, noise, seen, residual)
             system = linearised.system
-            free = np.flatnonzero(~kept)
-            step = np.zeros(len(kept))
+            free = np.flatnonzero(~is_fixed)
+            step = np.zeros(len(is_fixed))
             step[free] = system.part(free).solution() if len(free) else 0.0
             if misfit - system.misfit(step) < GAINS_NOTHING:
                 break
-            moved, tried = False, step
+            improved, trial_step = False, step
             for _ in range(HALVINGS):
-                trial = hypothesis.moved(tried)
+                trial = hypothesis.moved(trial_step)
                 trial_seen, trial_residual = self.evaluated(trial)
                 trial_misfit = self._misfit(noise, trial_residual, trial)
                 if trial_misfit <= misfit:
-                    moved = True
+                    improved = True
                     break
-                tried = 0.4 * tried
-            if not moved:
+                trial_step = 0.4 * trial_step
+            if not improved:
                 break
             linearised = None
             hypothesis, seen, residual, misfit = trial, trial_seen, trial_residual, trial_misfit
@@ -231,9 +231,9 @@ class Fitter:
         columns, plain = linearised.columns, linearised.system
         made: Callable[[], Array] = partial(np.asarray, columns)
         system = self._without_own_noise(plain, hypothesis, noise, columns, residual)
-        free = np.flatnonzero(~kept)
+        free = np.flatnonzero(~is_fixed)
         if len(free):
-            step = np.zeros(len(kept))
+            step = np.zeros(len(is_fixed))
             step[free] = system.part(free).solution()
             last = hypothesis.moved(step)
             last_seen, last_residual = self.evaluated(last)
@@ -258,13 +258,13 @@ class Fitter:
         gram = system.gram
         for perturbed in self.problem.perturbed:
             seen = perturbed.all_seen(hypothesis)
-            other = replace(self, problem=perturbed, _fits={})
-            white = self._whiten(noise, other.columns(hypothesis, seen) - columns)
-            own = self._whiten(noise, perturbed.residual(seen) - residual - self.outliers)
-            joined = np.column_stack([white, -own])
+            fitter = replace(self, problem=perturbed, _fits={})
+            white = self._whiten(noise, fitter.columns(hypothesis, seen) - columns)
+            noise_part = self._whiten(noise, perturbed.residual(seen) - residual - self.outliers)
+            joined = np.column_stack([white, -noise_part])
             gram = gram - joined.T @ joined
-        found = replace(system, gram=gram)
-        return found if found.is_definite else system
+        corrected = replace(system, gram=gram)
+        return corrected if corrected.is_definite else system
 
     def _own_noise(self, hypothesis: Hypothesis, noise: Noise, residual: Array) -> Array:
         """Return the whitened contribution (S n,) of simulated velocity noise to a hypothesis' residual (M, A)."""
@@ -289,19 +289,19 @@ class Fitter:
             for spec in effect.parameters
             if is_time_of_run(spec)
         )
-        of = sorted((effect.name, len(effect.parameters), effect.of_the_day) for effect in start.effects)
-        model = tuple(of), windows
+        effects = sorted((effect.name, len(effect.parameters), effect.of_the_day) for effect in start.effects)
+        model = tuple(effects), windows
         key = (id(noise), *model)
         if key not in self._fits:
             nearest, evaluated = start, self.evaluated(start)
             for each in self.problem.fitted.get(model, []):  # optima under other noise are near
-                at_end = self.evaluated(each)
-                if self._misfit(noise, at_end[1], each) < self._misfit(noise, evaluated[1], nearest):
-                    nearest, evaluated = each, at_end
-            found = self.fit(nearest, noise, evaluated=evaluated)
-            seen = LazySeen(self.problem, found.hypothesis)
-            made = partial(self.problem.all_columns, found.hypothesis, seen)
-            self._fits[key] = replace(found, seen=seen, made=made)
+                other = self.evaluated(each)
+                if self._misfit(noise, other[1], each) < self._misfit(noise, evaluated[1], nearest):
+                    nearest, evaluated = each, other
+            fit = self.fit(nearest, noise, evaluated=evaluated)
+            seen = LazySeen(self.problem, fit.hypothesis)
+            columns = partial(self.problem.all_columns, fit.hypothesis, seen)
+            self._fits[key] = replace(fit, seen=seen, made=columns)
             self.problem.fitted[model] = [self._fits[key].hypothesis]
         return self._fits[key]
 
@@ -321,17 +321,17 @@ class Fitter:
         return fit
 
     def _refine_event_time(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
-        at_rest: tuple[Fit, float] | None = None
+        converged: tuple[Fit, float] | None = None
         for sign in (-1.0, 1.0):
-            per = fit.values[effect.name]
-            if not all(np.isfinite(each[name]) for each in per):
+            values = fit.values[effect.name]
+            if not all(np.isfinite(each[name]) for each in values):
                 continue
-            moved = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in per)
-            hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: moved})
+            shifted = tuple({**each, name: max(0.0, each[name] + sign * step)} for each in values)
+            hypothesis = replace(fit.hypothesis, values={**fit.values, effect.name: shifted})
             linearised = self._linearised(hypothesis, fit.noise)
-            if at_rest is None or at_rest[0] is not fit:
-                at_rest = fit, self._predicted_gain(fit)
-            if self._is_surely_worse(hypothesis, linearised, fit.noise, fit.deviance, at_rest[1]):
+            if converged is None or converged[0] is not fit:
+                converged = fit, self._predicted_gain(fit)
+            if self._is_surely_worse(hypothesis, linearised, fit.noise, fit.deviance, converged[1]):
                 continue
             trial = self.fit(hypothesis, fit.noise, 3, linearised=linearised)
             if trial.deviance < fit.deviance:
@@ -352,13 +352,13 @@ class Fitter:
         converged fit of this deviance, subtracted as unattainable (`_predicted_gain`).
         """
         own_noise = self._own_noise(hypothesis, noise, linearised.residual + self.outliers)
-        least = linearised.system.misfit(linearised.system.solution())
-        gained = self._misfit(noise, linearised.residual, hypothesis) - least
-        least -= float(own_noise @ own_noise)
-        if least > deviance + SURELY + BENT * gained:
+        minimum = linearised.system.misfit(linearised.system.solution())
+        gain = self._misfit(noise, linearised.residual, hypothesis) - minimum
+        minimum -= float(own_noise @ own_noise)
+        if minimum > deviance + SURELY + BENT * gain:
             return True
-        alike = min(promised, gained)
-        return least + alike > deviance + 2.0 * SURELY + BENT * (gained - alike)
+        unattainable = min(promised, gain)
+        return minimum + unattainable > deviance + 2.0 * SURELY + BENT * (gain - unattainable)
 
     def time_interval(self, fit: Fit, effect: Effect, name: str, recording: int) -> tuple[float, float, float]:
         """Return the time at which an effect begins or ends, with its 95 per cent interval."""

@@ -49,22 +49,22 @@ def simulated_recordings(problem: Problem, fit: Fit, count: int) -> Iterator[tup
     rng = np.random.default_rng(0)
     moving = replace(problem, recordings=tuple(map(_moving, problem.recordings)))
     truth = [_reference(moving, fit.hypothesis, index) for index in range(len(problem.recordings))]
-    wanted = float(np.mean(fit.noise.whiten(fit.residual) ** 2))
+    target = float(np.mean(fit.noise.whiten(fit.residual) ** 2))
     share = 1.0
     for number in range(-1, count):
-        drawn = [
+        recordings = [
             _drawn(recording, reference, share, rng)
             for recording, reference in zip(problem.recordings, truth, strict=True)
         ]
-        other = replace(problem, recordings=tuple(drawn))
-        seen = other.all_seen(fit.hypothesis)
-        residual = other.residual(seen)
-        made = float(np.mean(fit.noise.whiten(residual) ** 2))
+        simulated = replace(problem, recordings=tuple(recordings))
+        seen = simulated.all_seen(fit.hypothesis)
+        residual = simulated.residual(seen)
+        achieved = float(np.mean(fit.noise.whiten(residual) ** 2))
         if number < 0:  # a slow stream is rough from turns too
-            share = min(1.0, float(np.sqrt(wanted / max(made, 1e-300))))
+            share = min(1.0, float(np.sqrt(target / max(achieved, 1e-300))))
             continue
-        beyond = np.sqrt(max(0.0, wanted - made))
-        yield other, seen, residual + beyond * fit.noise.unwhiten(rng.standard_normal(residual.size))
+        excess = np.sqrt(max(0.0, target - achieved))
+        yield simulated, seen, residual + excess * fit.noise.unwhiten(rng.standard_normal(residual.size))
 
 
 def _moving(recording: RecordedStreams) -> RecordedStreams:

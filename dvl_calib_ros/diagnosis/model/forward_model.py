@@ -440,10 +440,10 @@ class Problem:
         variance that they explain is not evidence for it.
         """
         parts, sizes = [], []
-        held, turns = np.linalg.eigh(np.eye(3) - self.observable_turns)
-        if (held > 0.5).any():
-            turned = replace(self, observable_turns=np.eye(3)).calibration_columns(hypothesis, seen)[:, :, :3]
-            parts.append(turned @ turns[:, held > 0.5])
+        eigenvalues, turns = np.linalg.eigh(np.eye(3) - self.observable_turns)
+        if (eigenvalues > 0.5).any():
+            by_rotation = replace(self, observable_turns=np.eye(3)).calibration_columns(hypothesis, seen)[:, :, :3]
+            parts.append(by_rotation @ turns[:, eigenvalues > 0.5])
             sizes.append(np.full(parts[-1].shape[2], SETTINGS.prior_angle))
         for effect in self.unobservable:
             named = hypothesis.values.get(effect.name)

@@ -62,27 +62,27 @@ def backward_steps(time: Array, velocity: Array) -> tuple[tuple[BackwardStep, ..
     seconds twice. A driver that requires increasing stamps drops two seconds instead: one short step, of which at most
     one sample is kept. A DVL that pings faster for a while has short steps for longer, and a smooth velocity.
     """
-    once = np.ones(len(time), dtype=bool)
+    is_unique = np.ones(len(time), dtype=bool)
     if len(time) < 4 * FEWEST:
-        return (), once
+        return (), is_unique
     steps = np.diff(time)
-    usual = float(np.median(steps))
-    crowded = time[2:] - time[:-2] < TWO_STEPS * usual
-    bent = np.linalg.norm(velocity[1:-1] - 0.5 * (velocity[:-2] + velocity[2:]), axis=1)
-    found = []
-    for first, behind in np.flatnonzero(np.diff(np.pad(crowded, 1).astype(int))).reshape(-1, 2).tolist():
-        inside = float(time[behind + 1] - time[first])
-        is_mixed = np.median(bent[first:behind]) > TO_AND_FRO * np.median(bent)
-        if behind - first >= FEWEST and inside < LONGEST_S and is_mixed:
-            once[first : behind + 2] = False
-            found.append(BackwardStep(float(time[first]), float(time[behind + 1]), inside))
-    relative = np.abs(steps - usual) / usual
+    interval = float(np.median(steps))
+    crowded = time[2:] - time[:-2] < TWO_STEPS * interval
+    bending = np.linalg.norm(velocity[1:-1] - 0.5 * (velocity[:-2] + velocity[2:]), axis=1)
+    events = []
+    for first, end in np.flatnonzero(np.diff(np.pad(crowded, 1).astype(int))).reshape(-1, 2).tolist():
+        duration = float(time[end + 1] - time[first])
+        is_mixed = np.median(bending[first:end]) > TO_AND_FRO * np.median(bending)
+        if end - first >= FEWEST and duration < LONGEST_S and is_mixed:
+            is_unique[first : end + 2] = False
+            events.append(BackwardStep(float(time[first]), float(time[end + 1]), duration))
+    relative = np.abs(steps - interval) / interval
     odd = np.flatnonzero(relative > np.clip(FAR * np.median(relative), *REGULAR))
-    short = odd[steps[odd] < usual]
-    if not found and len(short) > 0 and len(odd) <= RARE:
-        found = [BackwardStep(float(time[at]), float(time[at + 1]), UP_TO_S) for at in short.tolist()]
-        once[short[steps[short] < TOO_SHORT * usual] + 1] = False
-    return tuple(found), once
+    short = odd[steps[odd] < interval]
+    if not events and len(short) > 0 and len(odd) <= RARE:
+        events = [BackwardStep(float(time[index]), float(time[index + 1]), UP_TO_S) for index in short.tolist()]
+        is_unique[short[steps[short] < TOO_SHORT * interval] + 1] = False
+    return tuple(events), is_unique
 
 
 SECOND_NS = 1_000_000_000

@@ -138,12 +138,12 @@ def _clock_or_arm(
     n_effects: int,
     selection: Sequence[Effect],
     trade_off: ArmAmbiguity | None,
-    known: Collection[str] = (),
+    clear: Collection[str] = (),
 ) -> list[Selected]:
     """Merge lever arm and clock into one entry if each is insignificant given the other.
 
     selection: selected effects; a further clock is named only if significant. trade_off: from `arm_ambiguity`; a
-    reference delay within that ambiguity is insignificant. known: from `separable_clocks`; an insignificant arm is no
+    reference delay within that ambiguity is insignificant. clear: from `separable_clocks`; an insignificant arm is no
     alternative to these clocks.
     """
     threshold, covariance = float(np.log(SETTINGS.level / n_effects)), robust_covariance(fitter.problem, fit)
@@ -151,28 +151,28 @@ def _clock_or_arm(
     delays = [abs(each["seconds"]) for each in fit.values.get(REFERENCE_CLOCK, ())]
     is_late = trade_off is None or max(delays, default=0.0) >= OF_INTERVAL * trade_off.delay_std_s
 
-    def is_shown(each: Selected) -> bool:
+    def passes(each: Selected) -> bool:
         if each.effect.name == REFERENCE_CLOCK and not is_late:
             return False
         return each.log_p <= threshold and robust_p(fit, each.effect, *covariance) < SETTINGS.robust_level
 
-    own = {each.effect.name: each for each in selected}
-    arm, clocks = own.get(ARM), [own[name] for name in TWO_CLOCKS if name in own]
+    by_name = {each.effect.name: each for each in selected}
+    arm, clocks = by_name.get(ARM), [by_name[name] for name in TWO_CLOCKS if name in by_name]
     if arm is None or not clocks:
         return selected
     clock = min(clocks, key=lambda each: each.log_p)
-    dropped = [each for each in clocks if each is not clock and each.effect not in selection and not is_shown(each)]
+    dropped = [each for each in clocks if each is not clock and each.effect not in selection and not passes(each)]
     selected = [each for each in selected if each not in dropped]
-    if is_shown(arm) and is_shown(clock):
+    if passes(arm) and passes(clock):
         return selected
-    if is_shown(clock) and clock.effect.name in known and arm.log_p > threshold:
+    if passes(clock) and clock.effect.name in clear and arm.log_p > threshold:
         return [each for each in selected if each is not arm]
-    one, other = (arm, clock) if is_shown(arm) else (clock, arm)
-    others = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
-    without = fitter.fit_kept(fit.hypothesis.with_effects(others, len(fit.seen), {}), fit.noise)
+    kept, other = (arm, clock) if passes(arm) else (clock, arm)
+    remaining = [effect for effect in fit.effects if effect not in (arm.effect, clock.effect)]
+    without = fitter.fit_kept(fit.hypothesis.with_effects(remaining, len(fit.seen), {}), fit.noise)
     log_p = log_p_value(fit.gain_over(without), fit.dof - without.dof)
-    equivalent = dict.fromkeys((other.effect.name, *one.equivalent))
-    return [Selected(one.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (one, other))]
+    equivalent = dict.fromkeys((other.effect.name, *kept.equivalent))
+    return [Selected(kept.effect, log_p, tuple(equivalent)), *(each for each in selected if each not in (kept, other))]
 
 
 def _with_equivalents(selected: Selected, names: Sequence[str]) -> Selected:

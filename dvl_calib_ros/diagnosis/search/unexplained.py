@@ -80,7 +80,7 @@ def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     """
     problem, noise = fitter.problem, fit.noise
     score_tests, white, raw, basis = _score_tests(fitter, fit, problem, fit.seen, fit.residual)
-    nothing = raw["time"][:, :, :0]
+    no_columns = raw["time"][:, :, :0]
     # Noise in the columns keeps the residual of a fit from being orthogonal to them. Projected, the residual would
     # follow the vehicle's speed and have its periods.
     whitened = noise.whiten(fit.residual)
@@ -96,14 +96,14 @@ def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
             for each in found_events
             if _is_predictive(problem, fit, each.columns, least + _limit(tested + each.tried, each.columns.shape[2]))
         ]
-    looked_at = float(np.log(tested))
+    log_trials = float(np.log(tested))
     nominal = [
         *(each.log_p for each in found_events),
         *(test.log_p() for test in score_tests),
         *(line.log_p for line in spectral),
     ]
-    if min(nominal) + looked_at > np.log(SETTINGS.robust_level):
-        return Unexplained(min(min(nominal) + looked_at, 0.0), "", nothing, nothing)
+    if min(nominal) + log_trials > np.log(SETTINGS.robust_level):
+        return Unexplained(min(min(nominal) + log_trials, 0.0), "", no_columns, no_columns)
     grown = _inflation_under_null(fitter, fit, score_tests)
     tests: list[tuple[float, str | float, Array]]
     tests = [
@@ -113,13 +113,13 @@ def find_unexplained(fitter: Fitter, fit: Fit) -> Unexplained:
     tests += [(each.log_p, each.about, each.columns) for each in found_events]
     best = min(tests, key=_first)
     about = _simplest(tests, best[0])
-    log_p = best[0] + looked_at
+    log_p = best[0] + log_trials
     # the best of many lines would always explain some of the noise
     clear = [_along_axes(line.waves, problem.axes) for line in spectral if line.log_p < np.log(SETTINGS.robust_level)]
     columns = np.concatenate([*raw.values(), *clear], axis=2)
     tested = next((tested + each.tried for each in found_events if each.about == best[1]), tested)
     found = Unexplained(min(log_p, 0.0), about[1], columns, best[2], _limit(tested, best[2].shape[2]))
-    return found if found.found else replace(found, columns=nothing, clearest=nothing)
+    return found if found.found else replace(found, columns=no_columns, clearest=no_columns)
 
 
 def _limit(tested: int, columns: int) -> float:
@@ -160,11 +160,11 @@ def _score_tests(
     The whitened residual is of unit variance, orthogonal to the fit's columns, and ends with the rows of the prior.
     """
     noise = fit.noise
-    own = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
-    known = NuisanceFit.of(problem, fit.hypothesis, seen, own)
-    q, white = _orthogonal_to_nuisances(known, noise.whiten(known.columns), noise.whiten(residual))
+    columns = replace(fitter, problem=problem).columns(fit.hypothesis, seen)
+    nuisance = NuisanceFit.of(problem, fit.hypothesis, seen, columns)
+    q, white = _orthogonal_to_nuisances(nuisance, noise.whiten(nuisance.columns), noise.whiten(residual))
     white = white - q @ (q.T @ white)
-    unobservable = known.columns.shape[2] - own.shape[2]
+    unobservable = nuisance.columns.shape[2] - columns.shape[2]
     white = white / np.sqrt(float(white @ white) / (residual.size - q.shape[1] + unobservable))
     score_tests: list[FollowTest] = []
     raw: dict[str, Array] = {}
@@ -188,10 +188,10 @@ def _orthogonal_to_nuisances(known: NuisanceFit, columns: Array, white: Array) -
 def _inflation_under_null(fitter: Fitter, fit: Fit, score_tests: Sequence[FollowTest]) -> list[float]:
     """Return the inflation of each test's energy over chi-square in simulated recordings, at least 1."""
     energy, dof = np.full(len(score_tests), PRIOR_DOF), np.full(len(score_tests), PRIOR_DOF)
-    for other, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
-        found, *_ = _score_tests(fitter, fit, other, seen, residual)
-        energy += [test.energy for test in found]
-        dof += [test.dof for test in found]
+    for simulated, seen, residual in simulated_recordings(fitter.problem, fit, SIMULATED):
+        tests, *_ = _score_tests(fitter, fit, simulated, seen, residual)
+        energy += [test.energy for test in tests]
+        dof += [test.dof for test in tests]
     return np.maximum(energy / dof, 1.0).tolist()
 
 
@@ -212,27 +212,27 @@ def lines(problem: Problem, innovations: Array) -> list[SpectralLine]:
     """
     found = []
     for index, recording in enumerate(problem.recordings):
-        at = problem.recording_of == index
+        rows = problem.recording_of == index
         step = SHORTEST_PERIOD_S / 5.0
         time = problem.time
-        steps = np.diff(time[at])
-        shorter = shortened(steps, STEPS_OF_A_BIN * step * np.count_nonzero(at))
+        steps = np.diff(time[rows])
+        shorter = shortened(steps, STEPS_OF_A_BIN * step * np.count_nonzero(rows))
         if shorter is not steps:
             time = time.copy()
-            time[at] = time[at][0] + np.append(0.0, np.cumsum(shorter))
-        position = ((time[at] - time[at][0]) / step).astype(int)
-        sums = np.stack([np.bincount(position, series) for series in innovations[at].T])
+            time[rows] = time[rows][0] + np.append(0.0, np.cumsum(shorter))
+        position = ((time[rows] - time[rows][0]) / step).astype(int)
+        sums = np.stack([np.bincount(position, series) for series in innovations[rows].T])
         n = 2 * sums.shape[1]  # twice the resolution of independent frequencies
         frequency = np.fft.rfftfreq(n, step)
-        power = 2.0 * np.abs(np.fft.rfft(sums, n)) ** 2 / np.count_nonzero(at)  # chi-square of 2 degrees of freedom
-        inside = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
-        if not inside.any():
+        power = 2.0 * np.abs(np.fft.rfft(sums, n)) ** 2 / np.count_nonzero(rows)  # chi-square of 2 degrees of freedom
+        band = (frequency >= FEWEST_PERIODS / recording.seconds) & (frequency <= 1.0 / SHORTEST_PERIOD_S)
+        if not band.any():
             continue
-        log_p = np.vstack([chi2_logsf(power, 2), chi2_logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, inside]
+        log_p = np.vstack([chi2_logsf(power, 2), chi2_logsf(power.sum(axis=0), 2 * innovations.shape[1])])[:, band]
         best = int(np.argmin(log_p.min(axis=0)))
-        period = 1.0 / float(frequency[inside][best])
+        period = 1.0 / float(frequency[band][best])
         phase = 2.0 * np.pi * time / period
-        waves = np.where(at[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
+        waves = np.where(rows[:, None], np.column_stack([np.cos(phase), np.sin(phase)]), 0.0)
         found.append(SpectralLine(period, float(log_p.min() + np.log(log_p.size)), waves))
     return found
 

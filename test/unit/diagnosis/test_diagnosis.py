@@ -45,7 +45,7 @@ from dvl_calib_ros.diagnosis.search.clock_jumps import (
     time_by_stamps,
     with_jumps_in_gaps,
 )
-from dvl_calib_ros.diagnosis.search.clock_jumps import _found as _delays
+from dvl_calib_ros.diagnosis.search.clock_jumps import _best_delays as _delays
 from dvl_calib_ros.diagnosis.search.effect_selection import (
     started,
     with_noise_reestimated,
