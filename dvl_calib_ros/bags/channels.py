@@ -244,18 +244,18 @@ def _check_finite(types: dict[str, Any]) -> None:
 
 def _n_values(description: Any, sizes: Mapping[str, int]) -> int:
     """Return the number of values that are decoded for a field; numbers of an array are decoded at once."""
-    kind, what = description
+    kind, detail = description
     size = sizes[_message_type_of(description)]
     if kind != Nodetype.ARRAY:
         return size
-    (element, element_what), n_elements = what
+    (element, element_what), n_elements = detail
     is_number = element == Nodetype.BASE and element_what[0] not in ("string", "wstring")
     return size if is_number else size * int(n_elements)
 
 
 def _message_type_of(description: Any) -> str:
     """Return the message type of a field or of its elements; '' for numbers and strings."""
-    kind, what = description
+    kind, detail = description
     while kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-        kind, what = what[0]
-    return str(what) if kind == Nodetype.NAME else ""
+        kind, detail = detail[0]
+    return str(detail) if kind == Nodetype.NAME else ""

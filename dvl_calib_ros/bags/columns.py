@@ -105,7 +105,7 @@ def windows(bag: BagReader, topics: Collection[str], one_by_one: Collection[str]
 
 def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
     """Yield the batches of each window."""
-    taken: list[Batch] = []
+    pending: list[Batch] = []
     count = size = 0
     for batch in batches:
         sizes = np.cumsum(batch.end - batch.start)
@@ -114,14 +114,14 @@ def _windows(batches: Iterator[Batch]) -> Iterator[list[Batch]]:
             before = int(sizes[first - 1]) if first else 0
             full = 1 + int(np.searchsorted(sizes, WINDOW_BYTES - size + before))
             end = min(first + WINDOW_MESSAGES - count, full, batch.size)
-            taken.append(batch.part(slice(first, end)))
+            pending.append(batch.part(slice(first, end)))
             count, size, first = count + end - first, size + int(sizes[end - 1]) - before, end
             # large batches are used directly, because joining would copy them
             if count >= WINDOW_MESSAGES or size >= WINDOW_BYTES or (first == batch.size and count >= ENOUGH_MESSAGES):
-                yield taken
-                taken, count, size = [], 0, 0
-    if taken:
-        yield taken
+                yield pending
+                pending, count, size = [], 0, 0
+    if pending:
+        yield pending
 
 
 def _kinds(batch: Batch) -> Iterator[tuple[int, int, Index]]:
@@ -302,23 +302,23 @@ class _LayoutWalk:
 
     def _field(self, path: str, description: Any) -> None:
         """Add a field by its kind. Raises NoLayoutError for a sequence."""
-        kind, what = description
+        kind, detail = description
         if kind == Nodetype.NAME:
-            self.message(f"{path}.", what)
+            self.message(f"{path}.", detail)
         elif kind == Nodetype.ARRAY:
-            self._array(path, *what)
+            self._array(path, *detail)
         elif kind == Nodetype.SEQUENCE:
             raise NoLayoutError(f"{path} is a sequence")
-        elif what[0] == "string":
+        elif detail[0] == "string":
             self._string(path)
         else:
-            self._numbers(path, what[0])
+            self._numbers(path, detail[0])
 
     def _array(self, path: str, description: Any, size: int) -> None:
         """Add an array of fixed size, as one column if its elements are numbers."""
-        kind, what = description
-        if kind == Nodetype.BASE and what[0] in _FORMATS and what[0] != "bool":
-            self._numbers(path, what[0], size)
+        kind, detail = description
+        if kind == Nodetype.BASE and detail[0] in _FORMATS and detail[0] != "bool":
+            self._numbers(path, detail[0], size)
             return
         for number in range(size):
             self._field(f"{path}[{number}]", description)

@@ -184,14 +184,14 @@ def _natural_order(path: Path) -> list[tuple[int, str]]:
 def decompressed(path: Path, new_folder: NewFolder, notes: list[str]) -> Path:
     """Decompress the readable part of a file."""
     target = new_folder() / (path.stem if path.suffix == ".zstd" else path.name)
-    most = max(SMALL_FILE, LARGEST_RATIO * path.stat().st_size)
+    max_size = max(SMALL_FILE, LARGEST_RATIO * path.stat().st_size)
     try:
         with open_raw(path) as raw, zstd.open(raw, "rb") as packed, target.open("wb") as unpacked:
             # in small pieces: data before the damage must be written before the damage raises
             while piece := packed.read1():
                 unpacked.write(piece)
-                if unpacked.tell() > most:
-                    raise EOFError(f"it unpacks to more than {most} bytes")
+                if unpacked.tell() > max_size:
+                    raise EOFError(f"it unpacks to more than {max_size} bytes")
     except (zstd.ZstdError, EOFError) as error:
         notes.append(f"{path}: damaged ({error}); what could be unpacked is used")
     return target

@@ -148,11 +148,11 @@ class BagReader:
         try:
             for batch in source.batches(topics):
                 newest_ns = int(batch.log_ns[-1])
-                whole = _unpacked(batch)
-                lost += batch.size - whole.size
-                read += whole.size
-                if whole.size:
-                    yield whole
+                unpacked = _unpacked(batch)
+                lost += batch.size - unpacked.size
+                read += unpacked.size
+                if unpacked.size:
+                    yield unpacked
         except DAMAGE as error:
             if not source.damage_noted:
                 self.notes.append(

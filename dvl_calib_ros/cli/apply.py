@@ -153,8 +153,8 @@ def _mounting_lines(calibrated: CalibratedMounting) -> list[str]:
     from ..files.mounting import POSITION_UNKNOWN, scale_advice
     from ..files.urdf import numbers
 
-    near = near_angles(calibrated.rpy, calibrated.parameters.mounting_rpy)  # as in the report, 180.4° not -179.6°
-    degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(near))
+    angles = near_angles(calibrated.rpy, calibrated.parameters.mounting_rpy)  # as in the report, 180.4° not -179.6°
+    degrees = " ".join(f"{angle:+.2f}°" for angle in np.degrees(angles))
     known = calibrated.position is not None
     transform = (
         f"ros2 run tf2_ros static_transform_publisher {calibrated.static_transform}" if known else POSITION_UNKNOWN

@@ -212,17 +212,17 @@ def run_against_simulator(arguments: argparse.Namespace, defaults: Mapping[str, 
     common.check_outputs(arguments, "json", "report", folders=["keep"])
     write_report = report_writer(arguments)
     real = _open_side(arguments, arguments.bags, arguments.params, defaults)
-    made = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
+    sim = _open_side(arguments, arguments.simulator, arguments.simulator_params or arguments.params, defaults)
     with common.progress("comparing") as on_progress:
         found = against(
-            real[0], made[0], arguments.rounds, arguments.keep, on_progress, with_series=arguments.report is not None
+            real[0], sim[0], arguments.rounds, arguments.keep, on_progress, with_series=arguments.report is not None
         )
     document = closed_gap_document(found) if isinstance(found, ClosedGap) else unpaired_document(found)
 
     def answer() -> None:
-        common.print_document(DOCUMENTS[type(found)](found), [*real[1].doubts, *made[1].doubts])
+        common.print_document(DOCUMENTS[type(found)](found), [*real[1].doubts, *sim[1].doubts])
         common.print_found(real[1], arguments.bags)
-        common.print_found(made[1], arguments.simulator)
+        common.print_found(sim[1], arguments.simulator)
 
     common.deliver(
         answer,

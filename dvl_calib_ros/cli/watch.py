@@ -324,8 +324,8 @@ def _goal_row(status: Status, key: str, label: str, width: int) -> Row:
 def _heading_bars(status: Status) -> str:
     """Return the time driven on each sector of headings as a row of bars."""
     driven = [_number(status.get(f"driven {sector} [s]")) for sector in SECTORS]
-    most = max(max(driven), 1.0)
-    heights = (HEIGHTS[round((len(HEIGHTS) - 1) * seconds / most)] for seconds in driven)
+    longest = max(max(driven), 1.0)
+    heights = (HEIGHTS[round((len(HEIGHTS) - 1) * seconds / longest)] for seconds in driven)
     return "headings  " + "  ".join(f"{sector}{height}" for sector, height in zip(SECTORS, heights, strict=True))
 
 

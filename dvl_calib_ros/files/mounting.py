@@ -223,32 +223,32 @@ def calibrated_urdf(
     Raises InputError if its mounting or position differs from the calibration's initial one, unless force is set.
     keep_position: keep the position.
     """
-    now, corrected = mounting.rotation_body_from_dvl, calibrated.rotation_body_from_dvl
-    begun_with = calibrated.parameters.rotation_dvl_from_body.T
-    if calibrated.turned and now[:, 2] @ begun_with[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
-        corrected, begun_with = corrected @ FLU_FROM_FRD, begun_with @ FLU_FROM_FRD
+    current, corrected = mounting.rotation_body_from_dvl, calibrated.rotation_body_from_dvl
+    initial = calibrated.parameters.rotation_dvl_from_body.T
+    if calibrated.turned and current[:, 2] @ initial[:, 2] < 0.0:  # the URDF has the driver's own frame, z down
+        corrected, initial = corrected @ FLU_FROM_FRD, initial @ FLU_FROM_FRD
     known = None if keep_position or calibrated.position is None else np.array(calibrated.position)
     position = mounting.position if known is None else known
-    near = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # a configured position may be rounded
-    is_there = np.abs(mounting.position - position).max() < near
-    if angle_between(now, corrected) < ALREADY and is_there:
+    tolerance = ALREADY if calibrated.lever_arm_found else SAME_POSITION  # a configured position may be rounded
+    is_placed = np.abs(mounting.position - position).max() < tolerance
+    if angle_between(current, corrected) < ALREADY and is_placed:
         return urdf.content
-    if angle_between(now, begun_with) > SAME_MOUNTING and angle_between(now, corrected) > ALREADY and not force:
+    if angle_between(current, initial) > SAME_MOUNTING and angle_between(current, corrected) > ALREADY and not force:
         raise InputError(
-            f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(now))} in {calibrated.base_frame} (joint "
+            f"{urdf.path}: has the DVL at rpy {numbers(rpy_from_rotation(current))} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with mounting_rpy "
             f"{numbers(calibrated.parameters.mounting_rpy)}; calibrate with the URDF's (dvl-calib parameters --urdf), "
             "or write the calibrated one anyway with --force"
         )
     began_at = np.array(calibrated.parameters.lever_arm) + calibrated.parameters.reference_position
-    if not is_there and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
+    if not is_placed and np.abs(mounting.position - began_at).max() > SAME_POSITION and not force:
         found = f" and found {numbers(_rounded(position))}" if calibrated.lever_arm_found else ""
         raise InputError(
             f"{urdf.path}: has the DVL at {numbers(mounting.position)} in {calibrated.base_frame} (joint "
             f"{mounting.joint.name}), but {calibrated.path} began with {numbers(began_at)}{found}; --keep-position "
             "rotates the joint only, --force moves it there"
         )
-    return urdf.moved(mounting, corrected, None if is_there else position)
+    return urdf.moved(mounting, corrected, None if is_placed else position)
 
 
 def calibrated_parameters(path: Path, calibrated: CalibratedMounting, force: bool = False) -> bytes:

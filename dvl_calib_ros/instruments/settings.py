@@ -240,10 +240,10 @@ def _heading(calibrated: CalibratedMounting, now_deg: float) -> tuple[float, Arr
     found = configured @ calibrated.rotation_body_from_dvl
     if not _is_down(calibrated):
         found = FLU_FROM_FRD @ found @ FLU_FROM_FRD
-    whole = found @ rotation_from_rpy(np.array([0.0, 0.0, math.radians(now_deg)]))
-    *_, z, w = quaternion_from_rotation(whole)
+    rotation = found @ rotation_from_rpy(np.array([0.0, 0.0, math.radians(now_deg)]))
+    *_, z, w = quaternion_from_rotation(rotation)
     angle = 2.0 * math.atan2(z, w)  # the rotation about the DVL's z axis; the rest is about a horizontal one
-    return math.degrees(angle), whole @ rotation_from_rpy(np.array([0.0, 0.0, -angle]))
+    return math.degrees(angle), rotation @ rotation_from_rpy(np.array([0.0, 0.0, -angle]))
 
 
 def _is_down(calibrated: CalibratedMounting) -> bool:

@@ -71,11 +71,11 @@ def read_dvl_log(path: Path) -> DvlLog:
         log = read_ardupilot_log(path, start)
     else:
         content = path.read_bytes()
-        held = [kind for kind, (holds, _) in _KINDS.items() if holds(content)]
-        log = (_KINDS[held[0]][1] if held else _read_pd0)(path, content)
-        if len(held) > 1:
-            others = " and ".join(held[1:])
-            note = f"{path}: holds {others} as well as {held[0]}, which alone are imported; split it for the rest"
+        kinds = [kind for kind, (holds, _) in _KINDS.items() if holds(content)]
+        log = (_KINDS[kinds[0]][1] if kinds else _read_pd0)(path, content)
+        if len(kinds) > 1:
+            others = " and ".join(kinds[1:])
+            note = f"{path}: holds {others} as well as {kinds[0]}, which alone are imported; split it for the rest"
             log = log._replace(notes=(*log.notes, note))
     if not log.samples:
         why = ", ".join(f"{count} {reason}" for reason, count in log.left_out.items()) or "no report in it"

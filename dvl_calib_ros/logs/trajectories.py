@@ -414,12 +414,12 @@ def _is_header(rows: Sequence[Sequence[str]], place: int) -> bool:
 def _column_index(path: Path, rows: Sequence[Sequence[str]], name: str) -> int:
     """Return the index of a column by its name, its name without the unit, or its number. Raises InputError."""
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
-    wanted = name.strip().lower()
+    key = name.strip().lower()
     for each in (header, [cell.partition("(")[0].partition("[")[0].strip() for cell in header]):
-        if wanted in each:
-            return each.index(wanted)
-    if wanted.isdecimal() and 0 < int(wanted) <= len(header):
-        return int(wanted) - 1
+        if key in each:
+            return each.index(key)
+    if key.isdecimal() and 0 < int(key) <= len(header):
+        return int(key) - 1
     raise InputError(f"{path}: --columns: no column {name!r}; there are {', '.join(header)[:SHOWN] or 'none'}")
 
 

@@ -70,9 +70,9 @@ def readers(topic: str, msgtype: str) -> Mapping[str, Callable[[Any], float]]:
 class WaterCollector:
     """Collector of one topic's last `most` readings."""
 
-    def __init__(self, topic: str, msgtype: str, most: int | None = None) -> None:
+    def __init__(self, topic: str, msgtype: str, max_readings: int | None = None) -> None:
         self._topic, self._readers = topic, readers(topic, msgtype)
-        self._values: dict[str, deque[float]] = {kind: deque(maxlen=most) for kind in self._readers}
+        self._values: dict[str, deque[float]] = {kind: deque(maxlen=max_readings) for kind in self._readers}
         self._variance = 0.0
 
     def add(self, message: Any) -> None:

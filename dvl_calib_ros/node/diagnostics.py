@@ -109,11 +109,11 @@ class Silence:
         newest_ns = calibrator.newest_ns
         for stream in newest_ns:
             lost = _NOT_TAKEN | calibrator.reason_of_refusal[stream]
-            taken = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
+            used = counts[stream]["received"] - sum(counts[stream].get(key, 0) for key in lost)
             before = self._seen.get(stream)
-            if before is None or before.taken != taken:
+            if before is None or before.taken != used:
                 first_s = before.first_s if before and before.taken else now_s
-                self._seen[stream] = _Taken(taken, now_s, first_s, newest_ns["dvl"])
+                self._seen[stream] = _Taken(used, now_s, first_s, newest_ns["dvl"])
         silent_s = {stream: now_s - seen.since_s for stream, seen in self._seen.items()}
         faults = {}
         for stream, (code, own_topic) in _SILENT.items():

@@ -68,12 +68,12 @@ class LateClocks:
         if before is None or not corrections or not _are_alike(before.corrections, corrections):
             return None
         self.stand = True
-        taken = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in corrections.items()}
+        offsets = {name: round(getattr(parameters, name) + seconds, 3) for name, seconds in corrections.items()}
         self.found = [
             finding("CLOCK_TAKEN_OFF", clock=registration.clock_reason(name), parameter=name, value=seconds)
-            for name, seconds in taken.items()
+            for name, seconds in offsets.items()
         ]
-        return parameters.replace(**taken)
+        return parameters.replace(**offsets)
 
 
 def _are_alike(one: Mapping[str, float], other: Mapping[str, float]) -> bool:

@@ -124,9 +124,9 @@ def _put_covariance(message: Any, covariance: Any) -> None:
     if hasattr(message, "twist"):
         inner = message.twist
         if covariance is not None and hasattr(inner, "covariance"):
-            whole = np.zeros((6, 6))
-            whole[:3, :3] = covariance
-            inner.covariance = whole.ravel()
+            twist_covariance = np.zeros((6, 6))
+            twist_covariance[:3, :3] = covariance
+            inner.covariance = twist_covariance.ravel()
         return
     for name in _COVARIANCES:
         if hasattr(message, name) and covariance is not None:

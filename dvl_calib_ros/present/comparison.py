@@ -47,7 +47,7 @@ def comparison(result: Comparison) -> Document:
     pairs, ordered = result.pairs, result.calibrations
     by_name = [f"{each.first.name} → {each.second.name}" for each in pairs]
     neighbours = {(id(one), id(other)) for one, other in pairwise(ordered)}
-    near = [k for k, each in enumerate(pairs) if (id(each.first), id(each.second)) in neighbours]
+    adjacent = [k for k, each in enumerate(pairs) if (id(each.first), id(each.second)) in neighbours]
     few = len(pairs) <= MOST_PAIRS
     columns: Columns[Extrinsics] = {
         "": lambda each: each.name,
@@ -84,7 +84,7 @@ def comparison(result: Comparison) -> Document:
             ),
             Section(
                 "Differences, the later less the earlier (neighbours; all pairs: --json)",
-                [] if few else [_differences([pairs[k] for k in near], [by_name[k] for k in near])],
+                [] if few else [_differences([pairs[k] for k in adjacent], [by_name[k] for k in adjacent])],
                 Where.TERMINAL,
             ),
         ],

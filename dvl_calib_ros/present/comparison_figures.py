@@ -28,7 +28,7 @@ TOLD = 20
 
 def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONENTS)) -> list[Picture]:
     """Draw every quantity observable in two calibrations, one picture each. components: restrict to these."""
-    made = []
+    pictures = []
     for quantity in (each for each in shown_quantities(comparison) if each.component in components):
         at = quantity.component
         known = [each for each in comparison.calibrations if each.shown[at]]
@@ -38,8 +38,8 @@ def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONEN
         )
         values_text += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
         alt = f"{quantity.name} over time, in {quantity.unit}: {values_text}"
-        made.append(picture(f"{quantity.name.capitalize()}, {quantity.unit}", alt, _panel, comparison, quantity))
-    return made
+        pictures.append(picture(f"{quantity.name.capitalize()}, {quantity.unit}", alt, _panel, comparison, quantity))
+    return pictures
 
 
 def trend_png(comparison: Comparison) -> bytes:

@@ -113,7 +113,7 @@ NOISE: Columns[NoiseFinding] = {
 
 def first_screen(d: Diagnosis) -> Document:
     """Lay out answer, remedy, cost of the gap and next recording, within 24 rows of a terminal."""
-    whole, gap = diagnosis(replace(d, effects=d.effects[:FIRST_EFFECTS])), d.gap
+    document, gap = diagnosis(replace(d, effects=d.effects[:FIRST_EFFECTS])), d.gap
     more = len(d.effects) - FIRST_EFFECTS
     further = [f"{more} more effects: --verbose."] if more > 0 else []
     if math.isfinite(gap.before):
@@ -121,7 +121,7 @@ def first_screen(d: Diagnosis) -> Document:
         further.append(f"Cost: {cost} mm/s beyond the noise; {mm(gap.not_explained)} mm/s of it are not explained.")
         further += _drift_sentences(d)
     further += [f"Next: {d.next_manoeuvre}.", "Details: --verbose, or --report FILE."]
-    return replace(whole, sections=[section("", *map(Sentence, further))])
+    return replace(document, sections=[section("", *map(Sentence, further))])
 
 
 def diagnosis(d: Diagnosis) -> Document:

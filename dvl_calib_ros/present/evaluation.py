@@ -143,9 +143,9 @@ def _scores(e: Evaluation) -> Iterable[Item]:
     if e.own_generator:
         notes.append("The trajectories are simulated: the published figures do not apply to them.")
     if np.isfinite(published).any():
-        near = e.ratio[np.isfinite(e.ratio)]
+        ratios = e.ratio[np.isfinite(e.ratio)]
         notes.append(
-            f"{int((np.abs(near - 1.0) <= 0.25).sum())} of {len(near)} published cells are reproduced within 25 %. "
+            f"{int((np.abs(ratios - 1.0) <= 0.25).sum())} of {len(ratios)} published cells are reproduced within 25 %. "
             "Below each: the published figure and the ratio to it; green within 5 %, yellow 25 %, orange 50 %, red "
             "beyond. Means are over the cells in the row, not the paper's."
         )

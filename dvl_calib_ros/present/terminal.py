@@ -197,7 +197,7 @@ def _build(table: Table) -> RichTable:
     """Build the table for rich without fitting it to the terminal."""
     from rich import box
 
-    made = RichTable(
+    built = RichTable(
         show_header=any(_cell(name).plain for name in table.head),
         title=Text(table.title, "table.title") if table.title else None,
         title_justify="left",
@@ -207,10 +207,10 @@ def _build(table: Table) -> RichTable:
     )
     for index, name in enumerate(table.head):
         is_word = index < table.words
-        made.add_column(_cell(name), justify="left" if is_word else "right", no_wrap=not is_word, overflow="fold")
+        built.add_column(_cell(name), justify="left" if is_word else "right", no_wrap=not is_word, overflow="fold")
     for index, row in enumerate(table.rows):
-        made.add_row(*map(_cell, row), style="bold" if index == table.marked else None)
-    return made
+        built.add_row(*map(_cell, row), style="bold" if index == table.marked else None)
+    return built
 
 
 def _cell(cell: str | Cell) -> Text:

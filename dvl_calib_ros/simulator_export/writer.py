@@ -128,13 +128,13 @@ def _noise(settings: Settings, description: DvlDescription) -> list[Missing]:
     """Report axes whose noise differs from the description."""
     if description.noise_std is None or settings.noise_std is None:
         return []
-    has, wanted = np.array(settings.noise_std), np.array(description.noise_std)
-    error = math.sqrt(float(np.abs(has**2 - wanted**2).sum()))
-    if error <= SAME_NOISE * float(np.linalg.norm(wanted)):
+    represented, described = np.array(settings.noise_std), np.array(description.noise_std)
+    error = math.sqrt(float(np.abs(represented**2 - described**2).sum()))
+    if error <= SAME_NOISE * float(np.linalg.norm(described)):
         return []
     text = " and ".join(
-        f"{', '.join(f'{1e3 * value:.1f}' for value in values)} mm/s {what}"
-        for values, what in ((wanted, "found along x, y, z"), (has, "with these settings"))
+        f"{', '.join(f'{1e3 * value:.1f}' for value in values)} mm/s {label}"
+        for values, label in ((described, "found along x, y, z"), (represented, "with these settings"))
     )
     return [Missing("noise", text, error)]
 

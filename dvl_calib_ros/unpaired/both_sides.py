@@ -76,13 +76,13 @@ def facts_of(dvl: SampleBlock, reference: SampleBlock, log_ns: Stamps) -> Stream
     stamps = np.sort(dvl.stamps_ns[~refused])
     steps = 1e-9 * np.diff(stamps)
     steps = steps[steps > 0.0]
-    usual = float(np.median(steps)) if len(steps) else np.nan
-    gaps = steps[steps > DROPOUT_INTERVALS * usual] if len(steps) else steps
+    interval = float(np.median(steps)) if len(steps) else np.nan
+    gaps = steps[steps > DROPOUT_INTERVALS * interval] if len(steps) else steps
     latency = 1e-9 * (log_ns - dvl.stamps_ns)[sound] if len(log_ns) == len(dvl) else np.zeros(0)
     if len(latency) and abs(float(np.median(latency))) > OTHER_CLOCK_S:
         latency = np.zeros(0)
     values = dvl.values[sound]
-    between = int(np.rint(gaps / usual - 1.0).sum()) if len(gaps) else 0
+    between = int(np.rint(gaps / interval - 1.0).sum()) if len(gaps) else 0
     return StreamFacts(
         steps=steps,
         latency=latency,

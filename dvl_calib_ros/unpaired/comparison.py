@@ -122,8 +122,8 @@ def _differences(
         return np.zeros((0, values.shape[1])), np.zeros(0, dtype=np.intp), 1.0
     inner = np.arange(reach, reach + n)
     sums = np.sum([each * values[k : k + n] for k, each in enumerate(w)], axis=0)
-    near = np.abs(time[2 * reach :] - time[:n] - 2 * reach * interval) < 0.5 * interval
-    return sums[near], inner[near], float(np.sqrt(w @ w))
+    adjacent = np.abs(time[2 * reach :] - time[:n] - 2 * reach * interval) < 0.5 * interval
+    return sums[adjacent], inner[adjacent], float(np.sqrt(w @ w))
 
 
 def block_levels(scattered: Sequence[Scatter], axis: int) -> Array:
@@ -335,8 +335,8 @@ def compare(
 ) -> UnpairedComparison:
     """Compare bags of a vehicle with bags of a simulator. Raises InputError if they cannot be compared."""
     real = read_log(vehicle, lambda share: on_progress(0.4 * share), effects, with_series)
-    made = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
-    comparison = compare_logs(real, made, effects)
+    simulated = read_log(simulator, lambda share: on_progress(0.4 + 0.4 * share), effects, with_series)
+    comparison = compare_logs(real, simulated, effects)
     on_progress(1.0)
     return replace(comparison, reasons=(*comparison.reasons, *other_frame(vehicle, simulator)))
 
@@ -438,8 +438,8 @@ class _Compared:
         needs = ""
         if status is ComparisonStatus.CANNOT_TELL:
             blind = "simulator" if is_present[0] else "vehicle"
-            least = smallest_difference(vehicle, simulator, len(self.p))
-            smallest = ", ".join(f"{key} {value:.2g}" for key, value in least.items())
+            detectable = smallest_difference(vehicle, simulator, len(self.p))
+            smallest = ", ".join(f"{key} {value:.2g}" for key, value in detectable.items())
             needs = (
                 f"the two logs together would show a difference of {smallest}; with the {blind}: "
                 f"{self._effects[name].manoeuvre}"
@@ -476,13 +476,13 @@ class _Compared:
         return tuple(dict.fromkeys(others))
 
 
-def _status(there: tuple[bool, bool], differ: bool) -> ComparisonStatus:
+def _status(present: tuple[bool, bool], differ: bool) -> ComparisonStatus:
     """Return the status of an effect from its presence on (vehicle, simulator) and whether the sizes differ."""
-    if there[0] and there[1]:
+    if present[0] and present[1]:
         return ComparisonStatus.OTHER_SIZE if differ else ComparisonStatus.ALIKE
     if not differ:
         return ComparisonStatus.CANNOT_TELL
-    return ComparisonStatus.MISSING if there[0] else ComparisonStatus.ONLY_SIMULATOR
+    return ComparisonStatus.MISSING if present[0] else ComparisonStatus.ONLY_SIMULATOR
 
 
 def _noise(candidate: Candidate, p: float) -> ComparedNoise:

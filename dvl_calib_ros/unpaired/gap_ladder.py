@@ -132,9 +132,9 @@ def shrink(vehicle: Log, simulator: Log, ladder: Sequence[SimulatedModel], seed:
         predicted = everything if is_everything else _held_out(selection, model)
         difference = np.concatenate([a - b for a, b in zip(truth, predicted, strict=True)])
         noise = own_noise if model.vehicle_noise else drawn
-        made = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
+        simulated = np.concatenate([a - b + n for a, b, n in zip(predicted, ideal, noise, strict=True)])
         known = np.isfinite(difference).all(axis=1)
-        distance, null95, p = two_samples(recorded[known], made[known], windows[known], rng)
+        distance, null95, p = two_samples(recorded[known], simulated[known], windows[known], rng)
         errors[model.name] = difference
         rungs.append(Rung(model.name, _rms(difference[known]), distance, null95, p))
     gap = vehicle.diagnosis.gap
@@ -229,11 +229,11 @@ def turned_over(residual: Array, spectrum: Array, rng: np.random.Generator) -> A
     n = len(residual)
     values = np.nan_to_num(residual - np.nanmedian(residual, axis=0))
     signs = rng.choice([-1.0, 1.0], n)[:, None]
-    near = _limited(values)  # outliers are not coloured
+    limited = _limited(values)  # outliers are not coloured
     gain = np.sqrt(spectrum)
-    white = np.fft.irfft(np.fft.rfft(near, axis=0) / gain, n, axis=0)
-    made = np.fft.irfft(np.fft.rfft(white * signs, axis=0) * gain, n, axis=0)
-    return np.asarray(made + (values - near) * signs)
+    white = np.fft.irfft(np.fft.rfft(limited, axis=0) / gain, n, axis=0)
+    randomised = np.fft.irfft(np.fft.rfft(white * signs, axis=0) * gain, n, axis=0)
+    return np.asarray(randomised + (values - limited) * signs)
 
 
 def _random_noise(pool: Sequence[Array], like: Array, rng: np.random.Generator) -> Array:

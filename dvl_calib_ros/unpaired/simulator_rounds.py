@@ -158,8 +158,8 @@ def close_gap(
             if corrected == document:
                 break
             document = corrected
-        made = _simulated(document, len(found), simulator, folder, real.diagnosis)
-        log = read_log(made, part(1 + len(found)), effects)
+        simulated = _simulated(document, len(found), simulator, folder, real.diagnosis)
+        log = read_log(simulated, part(1 + len(found)), effects)
         log = replace(log, facts=tuple(replace(each, latency=np.zeros(0)) for each in log.facts))  # no real log times
         found.append(Round(compare_logs(real, log, effects), document))
     on_progress(1.0)

@@ -166,8 +166,8 @@ def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
 
 def _usual(steps: Array) -> Array:
     """Return the steps between stamps that are no gap."""
-    usual = float(np.median(steps)) if len(steps) else 0.0
-    return steps[steps < DROPOUT_INTERVALS * usual]
+    interval = float(np.median(steps)) if len(steps) else 0.0
+    return steps[steps < DROPOUT_INTERVALS * interval]
 
 
 def _latency(vehicle: Log, simulator: Log) -> Candidate | None:

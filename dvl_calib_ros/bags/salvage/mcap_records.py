@@ -266,9 +266,9 @@ def _record_follows(file: BinaryIO, at: int, size: int, tables: Tables, deep: in
 
 
 def message_head(
-    head: bytes, at: int, here: int, n: int, tables: Tables, holds: Callable[[int], bytes]
+    head: bytes, at: int, offset: int, n: int, tables: Tables, holds: Callable[[int], bytes]
 ) -> tuple[int, int]:
-    """Return channel and log time of a message record at `here` of `n`. Raises DamagedError if invalid.
+    """Return channel and log time of a message record at `offset` of `n`. Raises DamagedError if invalid.
 
     at: position of all records in the file. holds: function that returns the bytes at a position.
     """
@@ -278,11 +278,11 @@ def message_head(
     channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(head, RECORD_HEAD.size)
     if length < _MESSAGE_HEAD.size or channel not in tables.channels:
         raise DamagedError(f"at byte {at}: a message is of no known channel")
-    usual = tables.lengths.get(channel, length)
-    if usual != length and tables.eras:  # a damaged length may lead into the message or past others
-        ends = [here + RECORD_HEAD.size + each for each in (usual, length)]
+    expected = tables.lengths.get(channel, length)
+    if expected != length and tables.eras:  # a damaged length may lead into the message or past others
+        ends = [offset + RECORD_HEAD.size + each for each in (expected, length)]
         by_usual, by_own = (likeness(holds(end), n - end, tables) for end in ends)
-        if by_usual == ALIKE and (usual < length or by_own < ENOUGH_ALIKE):
+        if by_usual == ALIKE and (expected < length or by_own < ENOUGH_ALIKE):
             raise DamagedError(f"at byte {at}: the length of a message is damaged")
     tables.lengths[channel] = length
     tables.note_era(log_ns)

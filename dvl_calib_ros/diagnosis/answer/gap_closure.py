@@ -144,8 +144,8 @@ def _fit_own_parameters(selection: EffectSelection, hypothesis: Hypothesis, reco
 
 def only(problem: Problem, recording: int) -> Problem:
     """Return the problem of one recording."""
-    made = Problem((problem.recordings[recording],), problem.rotation_dvl_from_body, problem.lever_arm, ())
-    return replace(made, grids=(problem.grids[recording],), of_axes=problem.measured)
+    problem_of_one = Problem((problem.recordings[recording],), problem.rotation_dvl_from_body, problem.lever_arm, ())
+    return replace(problem_of_one, grids=(problem.grids[recording],), of_axes=problem.measured)
 
 
 def measure_gap(selection: EffectSelection, residuals: HeldOutResiduals) -> Gap:
@@ -294,8 +294,8 @@ def high_frequency_variance(time: Array, values: Array) -> tuple[Array, float]:
     """
     interval = float(np.median(np.diff(time))) if len(time) > 1 else 1.0
     second = values[2:] - 2.0 * values[1:-1] + values[:-2]
-    near = np.abs(time[2:] - time[:-2] - 2.0 * interval) < interval
-    second = second[near]
+    adjacent = np.abs(time[2:] - time[:-2] - 2.0 * interval) < interval
+    second = second[adjacent]
     if len(second) < 4:
         return np.zeros(values.shape[1]), np.inf
     return np.asarray((second**2).mean(axis=0) / 6.0), float(np.sqrt(3.9 / len(second)))

@@ -100,15 +100,15 @@ class DiagnosisSeries:
         return tuple(self._twin(index) for index in range(len(self.recordings)) if (self.recording_of == index).any())
 
     def _twin(self, index: int) -> HeldOutTwin:
-        at, held = self.recording_of == index, self.held_out
+        rows, held_out = self.recording_of == index, self.held_out
         return HeldOutTwin(
             self.recordings[index],
-            self.time[at],
-            segments_of([self.time[at]]),
-            held.before[at],
-            held.after[at],
-            np.sqrt(held.floor[at].mean(axis=0)),
-            {name: mask[at] for name, mask in self.regimes.items() if mask[at].any()},
+            self.time[rows],
+            segments_of([self.time[rows]]),
+            held_out.before[rows],
+            held_out.after[rows],
+            np.sqrt(held_out.floor[rows].mean(axis=0)),
+            {name: mask[rows] for name, mask in self.regimes.items() if mask[rows].any()},
         )
 
 

@@ -68,8 +68,8 @@ def best_of(fits: Sequence[Fit], effects: Mapping[str, Effect]) -> Fit:
     """
     scores = [criterion(fit, len(effects)) for fit in fits]
     rank = {name: index for index, name in enumerate(effects)}
-    alike = [fit for fit, score in zip(fits, scores, strict=True) if score < min(scores) + AS_WELL]
-    return min(alike, key=lambda fit: (sum(rank[effect.name] for effect in fit.effects), fit.deviance))
+    equivalent = [fit for fit, score in zip(fits, scores, strict=True) if score < min(scores) + AS_WELL]
+    return min(equivalent, key=lambda fit: (sum(rank[effect.name] for effect in fit.effects), fit.deviance))
 
 
 def fit_without(fitter: Fitter, fit: Fit, effect: Effect) -> Fit:
@@ -124,8 +124,8 @@ def robust_covariance(problem: Problem, fit: Fit) -> tuple[Array, int]:
     """
     block = blocks_of(problem)
     covariance, slow, rng = fit.covariance(block), SlowNoiseOfFit.of_fit(problem, fit), np.random.default_rng(0)
-    taken = slow.noise.taken_by(slow.known.columns, slow.known.std)
-    drawn = np.stack(list(slow.noise.drawn(slow.left, taken, DRAWN, rng)), axis=2)
+    absorbed = slow.noise.absorbed_by(slow.known.columns, slow.known.std)
+    drawn = np.stack(list(slow.noise.drawn(slow.left, absorbed, DRAWN, rng)), axis=2)
     steps = fit.system.covariance() @ fit.noise.whiten(fit.columns).T @ fit.noise.whiten(drawn)
     grown = np.sqrt(np.maximum((steps**2).mean(axis=1) / np.diag(covariance), 1.0))
     return np.asarray(covariance * np.outer(grown, grown)), int(block.max()) + 1
@@ -209,7 +209,7 @@ class SlowNoiseOfFit(NamedTuple):
         left, noise = residual, replace(noise, memory=float(np.exp(-problem.interval / SLOWEST_S)))
         for _ in range(2):
             left = residual + known.columns @ known.step(noise, residual).solution()
-            noise = noise.refitted(left, taken=noise.taken_by(known.columns, known.std))
+            noise = noise.refitted(left, absorbed=noise.absorbed_by(known.columns, known.std))
         return SlowNoiseOfFit(known, residual, noise, left)
 
     @staticmethod

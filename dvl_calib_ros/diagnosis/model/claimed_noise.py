@@ -101,5 +101,5 @@ def relative_noise(time: Array, sample_std: Array | None, differences: Array, we
     found = exponents(["own"], 0.5 * np.log(variance)[:, :, None], differences, stretch)
     if not found.is_significant.all():
         return np.ones(shape)
-    usual = np.median(sample_std, axis=0)
-    return np.asarray((sample_std / usual) ** min(float(found.exponents[0]), LARGEST))
+    median = np.median(sample_std, axis=0)
+    return np.asarray((sample_std / median) ** min(float(found.exponents[0]), LARGEST))

@@ -195,9 +195,9 @@ def make_recording(
     axes: As gnss_axes.
     first_ns: Stamp of the DVL's first sample.
     """
-    events, once = backward_steps(*dvl)
-    if not once.all():
-        dvl, dvl_std = (dvl[0][once], dvl[1][once]), dvl_std if dvl_std is None or dvl_std.ndim == 1 else dvl_std[once]
+    events, kept = backward_steps(*dvl)
+    if not kept.all():
+        dvl, dvl_std = (dvl[0][kept], dvl[1][kept]), dvl_std if dvl_std is None or dvl_std.ndim == 1 else dvl_std[kept]
     time, velocity = dvl
     seconds = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     rate = min(SETTINGS.max_stream_rate, max(SETTINGS.max_points / max(seconds, 1.0), SLOWEST_AVERAGE_HZ))
@@ -236,23 +236,23 @@ def _usual(std: Array | None) -> Array | None:
 
 def _rms(std: Array | None) -> Array | None:
     """Return the RMS (3,) of standard deviations (3,) or (N, 3); unmeasured axes are ignored."""
-    usual = _usual(std)
-    if std is None or usual is None or std.ndim == 1:
+    median = _usual(std)
+    if std is None or median is None or std.ndim == 1:
         return std
     known = std < SETTINGS.unmeasured_std
     squares = np.where(known, std, 0.0) ** 2
     rms = np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1))
-    return np.where(usual < SETTINGS.unmeasured_std, rms, usual)
+    return np.where(median < SETTINGS.unmeasured_std, rms, median)
 
 
 def _with_reported(stream: tuple[Array, Array], std: Array | None) -> Curve:
     """Return a curve with reported standard deviations (3,) or (N, 3); missing ones (-1) are the median."""
-    usual = _usual(std)
-    if std is None or usual is None or std.ndim == 1:
+    median = _usual(std)
+    if std is None or median is None or std.ndim == 1:
         return Curve(*stream, std)
-    finite = np.where(np.isfinite(usual), usual, SETTINGS.unmeasured_std)
+    finite = np.where(np.isfinite(median), median, SETTINGS.unmeasured_std)
     sample_std = np.where(np.isfinite(std) & (std**2 >= SMALLEST_VARIANCE), std, finite)
-    return Curve(*stream, usual, sample_std=np.minimum(sample_std, SETTINGS.unmeasured_std))
+    return Curve(*stream, median, sample_std=np.minimum(sample_std, SETTINGS.unmeasured_std))
 
 
 def _continuous_sign(quaternions: Array) -> Array:

@@ -92,15 +92,15 @@ def undo_effects(
     If an effect is not small against the motion, as for a spike of 7 m/s, iterations may diverge. Samples keep their
     last converging iteration.
     """
-    here = [each for each in injections if each.effect.acts_on is acts_on]
-    if not here:
+    of_stage = [each for each in injections if each.effect.acts_on is acts_on]
+    if not of_stage:
         return motion, np.zeros(3)
     after, added = motion.velocity_body, np.zeros_like(motion.velocity_body)
     moved_before = np.full(len(after), np.inf)
     for _ in range(PASSES):
-        before, added = added, traces(here, motion, acts_on)
+        before, added = added, traces(of_stage, motion, acts_on)
         added = added if turned is None else rotate_vectors(turned, added)
-        if not any(isinstance(each.effect, Effect) and each.effect.of_velocity for each in here):  # exact
+        if not any(isinstance(each.effect, Effect) and each.effect.of_velocity for each in of_stage):  # exact
             return replace(motion, velocity_body=after - added), added
         if np.array_equal(added, before):
             break

@@ -55,11 +55,11 @@ class Grid:
         if len(time) < 2:
             return None
         steps = np.diff(time)
-        usual = float(np.median(steps))
-        parts = min(int(np.ceil(usual / CLOSE_S)), SETTINGS.max_points // len(time))
-        if usual <= FAST_ENOUGH_S or parts < 2:
+        interval = float(np.median(steps))
+        parts = min(int(np.ceil(interval / CLOSE_S)), SETTINGS.max_points // len(time))
+        if interval <= FAST_ENOUGH_S or parts < 2:
             return None
-        of_each = np.where(steps < SETTINGS.max_gap_intervals * usual, parts, 1)
+        of_each = np.where(steps < SETTINGS.max_gap_intervals * interval, parts, 1)
         own = np.concatenate([[0], np.cumsum(of_each)])
         return np.interp(np.arange(own[-1] + 1), own, time), own
 

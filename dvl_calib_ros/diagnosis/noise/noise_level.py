@@ -84,18 +84,18 @@ def estimate_noise(
     """
     noise = white_noise(residual, problem.segments, rotation, problem.interval).refitted(residual)
     for _ in range(2):  # colour and absorbed noise depend weakly on each other
-        taken = noise.taken_by(columns, std)
-        noise = noise.refitted(noise.robust(residual), taken=taken)
+        absorbed = noise.absorbed_by(columns, std)
+        noise = noise.refitted(noise.robust(residual), absorbed=absorbed)
     names, log_claims = log_reported(problem, seen, rotation)
     if names:
         innovations = noise.whiten(residual).reshape(residual.shape)
         noise = replace(noise, level=noise.level * relative_std(log_claims, innovations, names, stretches_of(problem)))
-        noise = noise.refitted(noise.robust(residual), taken=taken)
+        noise = noise.refitted(noise.robust(residual), absorbed=absorbed)
     level = fit_level(problem, seen, noise.whiten(residual).reshape(residual.shape))
     if level is not None and level.p < SETTINGS.robust_level:
         noise = replace(noise, level=noise.level * level.values[:, None])
     robust = noise.robust(residual)
-    return noise.refitted(robust, taken=taken), robust
+    return noise.refitted(robust, absorbed=absorbed), robust
 
 
 def fit_claims(problem: Problem, seen: Sequence[Seen], innovations: Array, rotation: Array | None) -> Exponents | None:

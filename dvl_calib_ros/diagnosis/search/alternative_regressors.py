@@ -47,9 +47,9 @@ def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
         rotation = motion.rotation_enu_from_body
         yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
         roll, pitch = rotation[:, 2, 1], -rotation[:, 2, 0]
-        once = np.column_stack([np.cos(yaw), np.sin(yaw)])
+        one_cycle = np.column_stack([np.cos(yaw), np.sin(yaw)])
         more = [wave(n * yaw) for n in range(2, HEADING_HARMONICS + 1) for wave in (np.cos, np.sin)]
-        found["heading"] = np.column_stack([once, once * s[:, None], *more])
+        found["heading"] = np.column_stack([one_cycle, one_cycle * s[:, None], *more])
         found["tilt"] = np.column_stack([roll, pitch, np.abs(roll), np.abs(pitch), roll * s, pitch * s])
         steps = np.clip(np.diff(motion.time, prepend=motion.time[0]), 0.0, 10.0)
         up = np.einsum("ni,ni->n", rotation[:, 2], velocity)

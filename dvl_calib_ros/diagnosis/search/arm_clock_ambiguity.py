@@ -113,10 +113,10 @@ def with_arm(fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: M
         DVL_CLOCK: tuple({"seconds": each.offsets.dvl} for each in guesses),
         REFERENCE_CLOCK: tuple({"seconds": each.offsets.reference} for each in guesses),
     }
-    wanted = [*others, effects[ARM], *(effects[name] for name in clocks if name in effects)]
-    if len(wanted) > SETTINGS.max_effects:
+    effects_to_fit = [*others, effects[ARM], *(effects[name] for name in clocks if name in effects)]
+    if len(effects_to_fit) > SETTINGS.max_effects:
         return fit
-    found = fitter.fit_kept(fit.hypothesis.with_effects(wanted, len(guesses), start), fit.noise)
+    found = fitter.fit_kept(fit.hypothesis.with_effects(effects_to_fit, len(guesses), start), fit.noise)
     return found if found.deviance < fit.deviance + SETTINGS.indistinguishable else fit
 
 
@@ -161,11 +161,11 @@ def _arm_of(fit: Fit, block: Index) -> tuple[Array, Array]:
 def arm_ambiguity(guesses: Sequence[FirstGuess]) -> ArmAmbiguity | None:
     """Return the ambiguity of the least ambiguous recording. Return None if it is negligible."""
     found = [each.registration for each in guesses if each.registration is not None]
-    least = min(found, key=lambda each: float(np.trace(each.left_open[3:6, 3:6])), default=None)
-    if least is None or np.trace(least.left_open[3:6, 3:6]) < OPEN_M**2:
+    best = min(found, key=lambda each: float(np.trace(each.left_open[3:6, 3:6])), default=None)
+    if best is None or np.trace(best.left_open[3:6, 3:6]) < OPEN_M**2:
         return None
-    late = float(np.sqrt(np.trace(least.left_open) / (least.open_by @ least.open_by)))
-    return ArmAmbiguity(dict(zip(ARM_PARAMETERS, least.open_by[3:6].tolist(), strict=True)), late)
+    delay_std_s = float(np.sqrt(np.trace(best.left_open) / (best.open_by @ best.open_by)))
+    return ArmAmbiguity(dict(zip(ARM_PARAMETERS, best.open_by[3:6].tolist(), strict=True)), delay_std_s)
 
 
 def arm_change(fit: Fit, rivals: Sequence[Hypothesis]) -> dict[str, float]:

@@ -92,11 +92,11 @@ def intermittent_effects(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect]
     fit = replace(fit, noise=fit.noise.white)
     table, to_fit = _combinations(fitter, fit, effects)
     own = len(fit.effects)
-    most = MOST_OF_NOISE * table.misfit(range(own))
+    limit = MOST_OF_NOISE * table.misfit(range(own))
     come = [
         chosen
         for chosen in to_fit
-        if any(i >= own and table.variants[i].is_intermittent for i in chosen) and table.misfit(chosen) < most
+        if any(i >= own and table.variants[i].is_intermittent for i in chosen) and table.misfit(chosen) < limit
     ]
     return [combined(fitter, fit, table, chosen) for chosen in come[:KEPT_VARIANTS]]
 

@@ -104,9 +104,9 @@ def gaps(fitter: Fitter, fit: Fit) -> list[tuple[float, float]]:
     return result
 
 
-def _is_shifted(gap: float, usual: float) -> bool:
+def _is_shifted(gap: float, interval: float) -> bool:
     """Return whether a gap is a clock jump: negative or not a whole number of steps, unlike lost samples."""
-    return gap < 0.0 or OF_A_STEP < (gap / usual) % 1.0 < 1.0 - OF_A_STEP
+    return gap < 0.0 or OF_A_STEP < (gap / interval) % 1.0 < 1.0 - OF_A_STEP
 
 
 def _is_as_large(by: float, gap: float) -> bool:

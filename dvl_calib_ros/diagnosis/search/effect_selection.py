@@ -157,8 +157,8 @@ def select(
     fit = without_chance(fitter, wider, len(effects))
     fitter, fit = with_noise_reestimated(fitter, fit, every)
     fitter, fit, effects = _with_observable_arm(fitter, fit, every, effects)
-    fit, alike = heading_first(fitter, fit, heading)
-    found = identify_effects(fitter, fit, guesses, effects, alike)
+    fit, equivalent = heading_first(fitter, fit, heading)
+    found = identify_effects(fitter, fit, guesses, effects, equivalent)
     base = fitter.fit_kept(found.fit.hypothesis.with_effects([], len(recordings), {}), found.fit.noise)
     return EffectSelection(
         found.selected, base, found.fit, fitter, guesses, effects, found.trade_off, found.changes, wider.hypothesis
@@ -218,8 +218,8 @@ def _with_simulated_noise(fitter: Fitter, fit: Fit, effects: Mapping[str, Effect
     """Yield the same columns (M, A, p) and residual (M, A) with simulated noise in each velocity in turn."""
     for problem in fitter.problem.perturbed:
         other, seen = replace(fitter, problem=problem, _fits={}), tuple(problem.all_seen(fit.hypothesis))
-        again = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
-        yield _columns_of_all_effects(other, again, effects), problem.residual(seen)
+        perturbed = replace(fit, seen=seen, made=partial(problem.all_columns, fit.hypothesis, seen))
+        yield _columns_of_all_effects(other, perturbed, effects), problem.residual(seen)
 
 
 def _frames(problem: Problem) -> list[Array | None]:
@@ -283,14 +283,14 @@ def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit
     """Replace a moving mounting by an equally good heading error. Return the fit and equivalents by effect name."""
     if heading is None or len(fit.seen) < 2:
         return fit, {}
-    alike: dict[str, str] = {}
+    equivalent: dict[str, str] = {}
     if DRIFT in fit.values:
         own = next((_names(each) for each in fit.effects if each.name == HEADING), frozenset())
         drifting = heading.without(_names(heading) - own - {OF_DRIFT})
         found = fitter.fit_kept(_with_heading_instead(fit, {DRIFT, HEADING}, drifting), fit.noise)
         if found.deviance < fit.deviance + SETTINGS.indistinguishable:
             fit = found
-            alike[HEADING] = DRIFT
+            equivalent[HEADING] = DRIFT
     if MOVED in fit.values:
         of_vehicle, of_day = (
             fitter.fit_kept(_with_heading_instead(fit, {MOVED, HEADING}, each), fit.noise)
@@ -299,8 +299,8 @@ def heading_first(fitter: Fitter, fit: Fit, heading: Effect | None) -> tuple[Fit
         if of_vehicle.deviance < fit.deviance + SETTINGS.indistinguishable:
             return of_vehicle, {HEADING: MOVED}
         if of_day.deviance < fit.deviance + SETTINGS.indistinguishable:
-            alike[MOVED] = HEADING
-    return fit, alike
+            equivalent[MOVED] = HEADING
+    return fit, equivalent
 
 
 def _two_cycles(heading: Effect) -> tuple[Effect, Effect]:
@@ -386,10 +386,10 @@ def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn
             return values * measured
         return np.asarray(np.einsum("nji,nj->ni", recording.rotation_enu_from_body(true), values)) * measured
 
-    usual = _scatter(in_body(curve.from_neighbours))
+    scatter = _scatter(in_body(curve.from_neighbours))
     dev = in_body((curve.values - others(curve.time)) / curve.relative_noise)
     gain = (dev * error).sum(axis=1) / np.maximum((dev**2).sum(axis=1), 1e-300) / curve.relative_noise.mean(axis=1)
-    bad = suspicious & others.covers(curve.time) & (np.abs(dev / usual).max(axis=1) > SETTINGS.outlying)
+    bad = suspicious & others.covers(curve.time) & (np.abs(dev / scatter).max(axis=1) > SETTINGS.outlying)
     bad &= (gain > ALIKE[0]) & (gain < ALIKE[1])
     return ~bad
 

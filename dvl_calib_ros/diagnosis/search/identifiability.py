@@ -68,15 +68,15 @@ class Identifiability:
 
 
 def identify_effects(
-    fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], alike: Mapping[str, str]
+    fitter: Fitter, fit: Fit, guesses: Sequence[FirstGuess], effects: Mapping[str, Effect], swaps: Mapping[str, str]
 ) -> Identifiability:
-    """Test each effect of a fit and its substitutes. alike: by effect name, a substitute that is equally likely."""
+    """Test each effect of a fit and its substitutes. swaps: by effect name, a substitute that is equally likely."""
     selection, fit = fit.effects, with_arm(fitter, fit, guesses, effects)
     selected = [_selected(fitter, fit, effect, effects) for effect in fit.effects]
     trade_off = arm_ambiguity(guesses) if ARM in fit.values else None
     if is_open(guesses):
         selected = _clock_or_arm(fitter, fit, selected, len(effects), selection, trade_off, separable_clocks(guesses))
-    selected = [_with_equivalents(each, [alike[n]]) if (n := each.effect.name) in alike else each for each in selected]
+    selected = [_with_equivalents(each, [swaps[n]]) if (n := each.effect.name) in swaps else each for each in selected]
     rivals = [one for each in selected if trade_off is not None and each.effect.name in CLOCKS for one in each.rivals]
     freed = with_clocks(fitter, fit, guesses, effects, blocks_of(fitter.problem), trade_off)
     clocks = tuple(effect.name for effect in (freed or fit).effects if effect not in fit.effects)

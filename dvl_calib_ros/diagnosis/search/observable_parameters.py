@@ -43,8 +43,8 @@ def _observable_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> 
     squares = (columns**2).sum(axis=1).mean(axis=0)
     of_each = squares.reshape(-1, len(specs)).max(axis=0)  # of recordings the most informative
     sizes = np.sqrt(of_each) * [spec.typical for spec in specs]
-    least = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
-    out = {spec.name for spec, size in zip(specs, sizes.tolist(), strict=True) if size < least}
+    threshold = SHOWN_FROM * min(float(sizes.max()), USUAL_MPS)
+    out = {spec.name for spec, size in zip(specs, sizes.tolist(), strict=True) if size < threshold}
     if effect.name == ARM:
         by_metre = zip(specs, np.sqrt(of_each).tolist(), strict=True)
         out &= {spec.name for spec, size in by_metre if ARM_FROM_M * size < SHOWN_FROM * USUAL_MPS}
@@ -78,8 +78,8 @@ def _model_error(problem: Problem, fit: Fit) -> dict[str, float]:
         for each, size in zip(fit.hypothesis.parameters(), sizes, strict=True)
         if each.effect.name == ARM
     ]
-    least = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
-    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < least}
+    threshold = SHOWN_FROM * min(max(size * spec.typical for spec, size in own), USUAL_MPS)
+    return {spec.name: SHOWN_FROM * USUAL_MPS / size for spec, size in own if size * spec.typical < threshold}
 
 
 def default_values(effect: Effect, problem: Problem) -> list[Values]:

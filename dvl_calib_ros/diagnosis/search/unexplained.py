@@ -242,11 +242,11 @@ def is_predictive(problem: Problem, fit: Fit, unexplained: Unexplained) -> bool:
     return unexplained.found and _is_predictive(problem, fit, unexplained.clearest, unexplained.penalty)
 
 
-def _is_predictive(problem: Problem, fit: Fit, columns: Array, least: float) -> bool:
+def _is_predictive(problem: Problem, fit: Fit, columns: Array, min_gain: float) -> bool:
     """Return whether columns (M, A, c), added to a fit, gain more than the least in held-out deviance."""
     slow = SlowNoiseOfFit.of_fit(problem, fit)
     gain = predictive_gain(problem, slow, slow.with_nuisance(problem, fit.noise, columns))
-    return gain > least - columns.shape[2]
+    return gain > min_gain - columns.shape[2]
 
 
 def without_replaceable(selection: EffectSelection) -> tuple[EffectSelection, Unexplained]:

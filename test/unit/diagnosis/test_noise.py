@@ -311,7 +311,7 @@ def test_noise_keeps_the_colour_of_what_a_fit_has_taken_in(keep, low):
             white = noise.whiten(columns)
             left = series - columns @ np.linalg.lstsq(white, noise.whiten(series), rcond=None)[0]
             for _ in range(2):
-                noise = noise.refitted(left, taken=noise.taken_by(columns, std))
+                noise = noise.refitted(left, absorbed=noise.absorbed_by(columns, std))
         restricted.append(_at_rest(noise) / _at_rest(drawn))
         plain.append(_at_rest(noise.refitted(left)) / _at_rest(drawn))
     assert low < np.median(restricted) < 1.1
@@ -329,8 +329,8 @@ def test_the_mean_of_slow_noise_is_inside_the_interval_of_what_its_memory_may_be
         series = slow.unwhiten(rng.standard_normal(3 * n)) + rng.normal(0.0, 0.01, (n, 3))
         noise, left = replace(white, memory=float(np.exp(-0.01))), series - series.mean(axis=0)
         for _ in range(3):
-            noise = noise.refitted(left, taken=noise.taken_by(columns, std))
-        drawn = noise.drawn(left, noise.taken_by(columns, std), 100, rng)
+            noise = noise.refitted(left, absorbed=noise.absorbed_by(columns, std))
+        drawn = noise.drawn(left, noise.absorbed_by(columns, std), 100, rng)
         inside.append(np.abs(series.mean(axis=0)) < 1.96 * np.std([each.mean(axis=0) for each in drawn], axis=0))
     assert np.mean(inside) > 0.88
 
