@@ -174,6 +174,7 @@ class Calibrator:
             each.advance()
 
     def _restart(self, back_s: float) -> None:
+        """Restart after a clock step, by `back_s` backward (s), negative if forward."""
         self.restarts += 1
         how = f"back by {back_s:.1f} s" if back_s > 0.0 else f"ahead by {-back_s / 86_400.0:.0f} days"
         self._on_event(f"DVL stamps went {how}: the calibration starts anew")

@@ -181,6 +181,7 @@ def _missing(effect: Effect, available: frozenset[EffectNeeds], recordings: Sequ
 
 
 def _compared_axes(selection: EffectSelection) -> str:
+    """Return the compared axes in words."""
     problem = selection.fitter.problem
     axes = "".join(name for name, measured in zip("xyz", problem.measured, strict=True) if measured)
     if len(axes) == 3:
@@ -207,6 +208,7 @@ def _too_short(samples: int, seconds: float) -> Reason:
 
 
 def _undiagnosed(why: Reason, notes: Sequence[str]) -> Diagnosis:
+    """Return a diagnosis without numbers, for data that cannot answer."""
     nan = float("nan")
     return Diagnosis(
         verdict=DiagnosisVerdict.INSUFFICIENT_EXCITATION,
@@ -233,6 +235,7 @@ CODES = {
 
 
 def _verdict(selection: EffectSelection, unexplained: Unexplained, gap: Gap, visible_share: float) -> DiagnosisVerdict:
+    """Return the verdict; a systematic residual or a failure on held-out data makes it unknown."""
     if is_predictive(selection.fitter.problem, selection.fit, unexplained):
         return DiagnosisVerdict.UNKNOWN
     if gap.fails_held_out:
@@ -279,6 +282,7 @@ def _found_effect(
     n_tested: int,
     gap: Gap,
 ) -> FoundEffect:
+    """Return a selected effect with intervals of its sizes and times."""
     fit, effect = selection.fit, selected.effect
     stds = np.sqrt(np.diag(covariance))[6:].tolist()
     by_recording: dict[int, dict[str, Triple]] = {}

@@ -213,6 +213,7 @@ def _used(water: Water) -> str:
 
 
 def _of_water(water: Water, speed: Between) -> str:
+    """Return temperature, source, salinity and speed of sound of the water, as text."""
     salinity = "unknown salinity (0 to 40 PSU)" if math.isnan(water.salinity) else f"{water.salinity:.1f} PSU"
     source = f" ({water.source})" if water.source else ""
     named = f"water of {water.temperature:.1f} °C{source} and {salinity}"

@@ -491,6 +491,7 @@ def comparison_document(comparison: Comparison) -> dict[str, Any]:
 
 
 def _difference_document(difference: Difference) -> dict[str, Any]:
+    """Return plain data of a difference."""
     return {
         "first": difference.first.name,
         "second": difference.second.name,

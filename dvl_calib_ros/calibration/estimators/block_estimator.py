@@ -357,6 +357,7 @@ class FullEstimator(Estimator):
             self._solve_gathered()
 
     def _solve_gathered(self) -> None:
+        """Solve the gathered blocks, if any."""
         if self._gathered:
             blocks, effect_ns = self._gathered, self._gathered_ns
             self._gathered, self._gathered_ns = [], []

@@ -130,6 +130,7 @@ class Displacements(Estimator):
         self._coming.append((at_ns + SOLVED_WITHIN_NS, self._worker.submit(looked)))
 
     def _let_take_effect(self, reached_ns: int) -> None:
+        """Publish the solutions that take effect up to a stamp (ns)."""
         while self._coming and self._coming[0][0] <= reached_ns:
             from_ns, solved = self._coming.popleft()
             self._last_result = solved.result()
@@ -155,6 +156,7 @@ class Displacements(Estimator):
     # ------------------------------------------------------------------ what is known
 
     def _fit(self) -> DisplacementFit | None:
+        """Return the fit of all legs inside `settled`, else the latest published fit."""
         if not self._is_settled:
             return self._last_result.fit
         self.take_rows()

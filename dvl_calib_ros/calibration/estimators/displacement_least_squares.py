@@ -491,6 +491,7 @@ class DeadReckoning:
 
 
 def _no_legs() -> Legs:
+    """Return an empty set of legs."""
     nothing = np.zeros((0, 3))
     turned = np.zeros((0, 3, N_HEADING))
     none = np.zeros(0, dtype=np.intp)

@@ -412,6 +412,7 @@ class JointFit:
             self._append(day, _Section(SECTION_S, gram, fold, None if gram is None else part.up(x)))
 
     def _append(self, day: _Day, section: _Section) -> None:
+        """Append a section to the chain of its day."""
         assert day.chain is not None
         day.sections.append(section)
         day.chain = day.chain.after(section.gram, section.seconds, self._slow)

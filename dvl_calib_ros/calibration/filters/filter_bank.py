@@ -235,6 +235,7 @@ class Group:
         return Standing.joined([now] * n)
 
     def _process_noise(self, stamps_ns: Stamps) -> Array | None:
+        """Return the process noise added before each sample, None without any."""
         rate = self._assembler.process_rate
         if rate is None:
             return None
@@ -300,6 +301,7 @@ def _joined_ends(cuts: Ends, ends: Ends | None) -> Ends | None:
 def _filtered(
     x: Array, p: Array, data: kalman.Measurements, process: Array | None, ends: Ends | None
 ) -> kalman.Updated:
+    """Filter the samples, in a batch if there are enough and no process noise."""
     if process is None and data.z.shape[1] >= BATCH_FROM:
         return kalman.batch(x, p, data, ends)
     return kalman.recursion(x, p, data, process, ends)

@@ -229,6 +229,7 @@ class Observations:
         return self._reference(self.reference_body * _HORIZONTAL)
 
     def _reference(self, velocity_body: Array) -> Reference:
+        """Return the reference velocity (N, 3) m/s at the DVL in its frame, and its cross-product matrices."""
         if self.lever_velocity is not None:
             velocity_body = velocity_body + self.lever_velocity
         r = velocity_body @ self.rotation_dvl_from_body.T

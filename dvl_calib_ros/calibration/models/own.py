@@ -55,6 +55,7 @@ def _unaided(seen: Observations) -> Linearised:
 
 
 def _unaided_noise(seen: Observations) -> Array:
+    """Return R (N, 3, 3) (m/s)² of `unaided`: sway and heave grow with the turn rate."""
     assert seen.angular_velocity is not None and seen.oriented is not None
     turn = seen.angular_velocity[:, 2] * seen.velocity_in_body[:, 0]
     noise = np.zeros((len(turn), 3, 3))

@@ -125,6 +125,7 @@ class StreamClocks:
         return self._cached[1]
 
     def _objections(self, parameters: Parameters) -> list[Reason]:
+        """Return a finding for each clock offset beyond `LARGEST_S`, from the order of arrival."""
         ahead = {Stream.DVL: 0.0}
         for stream, spread in self._ahead.items():
             self._add_waiting(stream)

@@ -231,6 +231,7 @@ class Readings:
         fit = self._fit(reading)
 
         def of(rotation: Array | None) -> Registered:
+            """Return the fit for a nominal DVL rotation, or for the fitted one if None."""
             nominal = None if rotation is None else rotation.T @ turn
             found = nearest(fit, nominal, (REFERENCE,)) if fit else None
             if found is None:

@@ -371,6 +371,7 @@ class MotionFit:
 
 
 def _claimed(rows: _Rows, information: Array, level: float, weight: Array) -> Claimed:
+    """Return covariance and σ factors of a solution, inflated for residuals that are correlated in time."""
     p = np.linalg.inv(information)
     blocks = TimeBlocks()
     for part in np.array_split(np.arange(len(rows.at)), min(BLOCKS, max(1, len(rows.at) // 10))):

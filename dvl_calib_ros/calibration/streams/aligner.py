@@ -219,6 +219,7 @@ class Aligner(LiveAlignment):
                 self.take(half)
 
     def _take_rows(self, streams: Streams) -> None:
+        """Take the rows one by one in order of arrival."""
         take = {Stream.DVL: self.take_dvl, Stream.REFERENCE: self.take_reference, Stream.IMU: self.take_imu}
         for stream, row in streams.in_order():
             if isinstance(row, str):

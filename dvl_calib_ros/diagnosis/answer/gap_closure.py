@@ -231,6 +231,7 @@ def remainder(selection: EffectSelection, residuals: HeldOutResiduals) -> float:
 
 
 def _by_recording(problem: Problem, residuals: HeldOutResiduals) -> dict[str, tuple[float, float]]:
+    """Return RMS errors (m/s) before and after the effects by recording; empty for a single one."""
     if len(problem.recordings) == 1:
         return {}
     of_sample = problem.recording_of[problem.bin_of]

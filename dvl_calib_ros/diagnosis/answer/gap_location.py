@@ -129,6 +129,7 @@ def _log_p(noise: Noise, functions: Array, q: Array, white: Array, axis: int, ma
 
 
 def _bands(gap: Array, nyquist: float) -> list[tuple[float, float, float]]:
+    """Return (low, high, energy) of a gap (M,) m/s per frequency band, Hz."""
     energy = np.abs(np.fft.rfft(gap)) ** 2
     frequency = np.linspace(0.0, nyquist, len(energy))
     total = max(float(energy.sum()), 1e-300)

@@ -62,6 +62,7 @@ def noise_findings(fitter: Fitter, fit: Fit) -> list[NoiseFinding]:
 
 
 def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
+    """Test whether outliers are more frequent than normal noise explains."""
     scale = robust_std(innovations)
     is_outlier = (np.abs(innovations) > SETTINGS.outlying * scale).any(axis=1)
     excluded = problem.bursts // problem.grids[0].per_bin
@@ -76,6 +77,7 @@ def _outliers(innovations: Array, problem: Problem) -> NoiseFinding | None:
 
 
 def _stale(problem: Problem) -> NoiseFinding | None:
+    """Test whether repeated velocities are more frequent than chance explains."""
     count = sum(recording.repeats for recording in problem.recordings)
     n = sum(recording.received for recording in problem.recordings)
     if count < 3:
@@ -132,6 +134,7 @@ def _time_constant(arma: Arma, interval: float) -> float:
 
 
 def _inflation(problem: Problem, fit: Fit, innovations: Array) -> list[NoiseFinding | None]:
+    """Test whether the noise exceeds the reported one, or depends on speed or turn rate."""
     found: list[NoiseFinding | None] = []
     reported = reported_std(problem)
     if reported is not None:

@@ -100,6 +100,7 @@ class DiagnosisSeries:
         return tuple(self._twin(index) for index in range(len(self.recordings)) if (self.recording_of == index).any())
 
     def _twin(self, index: int) -> HeldOutTwin:
+        """Return one recording against its simulated DVL."""
         rows, held_out = self.recording_of == index, self.held_out
         return HeldOutTwin(
             self.recordings[index],
@@ -198,6 +199,7 @@ def _regressors(problem: Problem, fit: Fit, about: str | float) -> Mapping[str, 
 
 
 def _of_motion(motion: EffectInput, about: str) -> dict[str, Array]:
+    """Return the regressors (M,) of a group by their label with unit."""
     velocity, rotation, rates = motion.velocity_body, motion.rotation_enu_from_body, motion.angular_velocity
     if about in ("speed", "a band of speeds"):
         return {"speed, m/s": motion.speed}

@@ -178,6 +178,7 @@ def _by_recording(effect: FoundEffect) -> dict[str, Any]:
 
 
 def _combination_document(effect: FoundEffect) -> dict[str, Any]:
+    """Return plain data of the observable combination of lever arm and clock, empty without one."""
     found = effect.combination
     if found is None:
         return {}
@@ -191,6 +192,7 @@ def _combination_document(effect: FoundEffect) -> dict[str, Any]:
 
 
 def _dvl_document(dvl: DvlSeen) -> dict[str, Any]:
+    """Return plain data of the DVL on its vehicle."""
     return {
         "mounting_rpy": list(dvl.mounting_rpy),
         "lever_arm_m": list(dvl.lever_arm),

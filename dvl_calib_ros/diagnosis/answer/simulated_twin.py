@@ -86,6 +86,7 @@ def write_twins(folder: Path, twin: Twin) -> None:
 
 
 def _streams(twin: Twin, velocity: Array) -> tuple[list[ImuSample], list[ReferenceSample], list[DvlSample]]:
+    """Return IMU, reference and simulated DVL samples of a twin. velocity: (N, 3) m/s, DVL frame."""
     recording = twin.recording
 
     def stamps(time: Array) -> list[int]:

@@ -175,6 +175,7 @@ class Fitter:
         return _Linearisation(seen, residual, columns, self._system(noise, columns, residual, hypothesis))
 
     def _whiten(self, noise: Noise, values: Array) -> Array:
+        """Whiten values (M, A, ...) without held-out bins."""
         white = noise.whiten(values)
         if self.held is not None:
             white = white[np.repeat(~self.held, self.problem.axes)]
@@ -321,6 +322,7 @@ class Fitter:
         return fit
 
     def _refine_event_time(self, fit: Fit, effect: Effect, name: str, step: float) -> Fit:
+        """Move a time of an effect by ± `step` (s), if that lowers the deviance."""
         converged: tuple[Fit, float] | None = None
         for sign in (-1.0, 1.0):
             values = fit.values[effect.name]

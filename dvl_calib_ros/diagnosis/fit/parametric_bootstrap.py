@@ -82,6 +82,8 @@ def _moving(recording: RecordedStreams) -> RecordedStreams:
 
 
 def _drawn(recording: RecordedStreams, reference: Array, share: float, rng: np.random.Generator) -> RecordedStreams:
+    """Return a recording with simulated white noise. reference: noise-free. share: of the streams' noise level."""
+
     def noisy(curve: Curve, values: Array) -> Curve:
         noise = share * curve.noise * curve.relative_noise * rng.standard_normal(values.shape)
         return Curve(curve.time, values + noise, curve.reported, sample_std=curve.sample_std)

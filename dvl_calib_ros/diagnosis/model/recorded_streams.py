@@ -161,6 +161,7 @@ class RecordedStreams:
         oriented = attitude.quiet  # 0.01° of noise at 10 Hz is 0.1°/s
 
         def turning() -> Array:
+            """Return the angular velocity (M, 3) rad/s from the attitude's derivative."""
             q = oriented(at)
             dq = oriented.derivative(np.clip(at, oriented.time[0], oriented.time[-1]))
             square = (q * q).sum(axis=1)[:, None]
@@ -262,6 +263,7 @@ def _continuous_sign(quaternions: Array) -> Array:
 
 
 def _measured_axes(velocity: Array, std: Array | None, axes: str) -> tuple[bool, bool, bool]:
+    """Return the axes that a reference measures, by `gnss_axes` or by its reported σ."""
     if axes != "auto":
         return True, True, axes == "xyz"
     measured = np.ones(3, dtype=bool) if std is None else std < SETTINGS.unmeasured_std
@@ -455,6 +457,7 @@ def zeros_while_moving(dvl: SampleBlock, reference: SampleBlock) -> NDArray[np.b
 
 
 def _without_zeros(dvl: SampleBlock, reference: SampleBlock, notes: list[str]) -> SampleBlock:
+    """Remove DVL samples of exactly zero while the reference moves, and note their number."""
     lost = zeros_while_moving(dvl, reference)
     if not lost.any() or lost.all():
         return dvl

@@ -69,6 +69,7 @@ def measured_velocity(curve: Curve, at: Array, at_samples: bool) -> tuple[Array,
     """Return (F, 3) velocity and smoothed velocity."""
 
     def made() -> tuple[Array, Array]:
+        """Return velocity and smoothed velocity, which are the same array for a denoised curve."""
         smooth = curve.smooth
         raw = curve if at_samples else curve.quiet
         smoothed = smooth(at)

@@ -152,6 +152,7 @@ class Noise:
         return None if self.rotation is None else self.rotation / self.level[:, :, None]
 
     def _scaled(self, values: Array) -> Array:
+        """Divide values (M, A, ...) by the noise level, in the frame of the noise."""
         if self._levelled is None:
             return values / self.level.reshape(*self.level.shape, *[1] * (values.ndim - 2))
         if values.ndim == 2:

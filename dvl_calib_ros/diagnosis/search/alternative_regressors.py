@@ -30,6 +30,7 @@ def dictionary(problem: Problem, seen: Sequence[Seen]) -> dict[str, Array]:
 
 
 def _of_motion(grid: Grid, seen: Seen) -> dict[str, Array]:
+    """Return functions (M, c) of speed, acceleration, turn rate and time by name."""
     motion = seen.motion
     velocity, speed = motion.velocity_body, motion.speed
     acceleration = np.gradient(velocity[:, 0], motion.time)

@@ -347,6 +347,7 @@ def without_slow_outliers(problem: Problem, hypothesis: Hypothesis) -> tuple[Rec
 
 
 def _without_outliers(problem: Problem, hypothesis: Hypothesis, index: int) -> RecordedStreams:
+    """Return a recording without the outliers of its slow streams."""
     recording = problem.recordings[index]
     dvl = _inliers(problem, hypothesis, index, ActsOn.DVL_CLOCK)
     reference = _inliers(problem, hypothesis, index, ActsOn.REFERENCE_CLOCK)
@@ -380,6 +381,7 @@ def _inliers(problem: Problem, hypothesis: Hypothesis, index: int, clock: ActsOn
         return kept
 
     def in_body(values: Array) -> Array:
+        """Rotate values (N, 3) of the stream to the body frame; zero on unmeasured axes."""
         if of_dvl:
             return np.asarray(values @ hypothesis.body_from_measured(problem.rotation_dvl_from_body).T) * measured
         if recording.frame is VelocityFrame.BODY:

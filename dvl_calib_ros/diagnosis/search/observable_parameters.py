@@ -38,6 +38,7 @@ def unobservable_parts(effects: Mapping[str, Effect], shown: Mapping[str, Effect
 
 
 def _observable_part(effect: Effect, problem: Problem, seen: Sequence[Seen]) -> Effect:
+    """Return an effect without parameters that have little influence on the residual."""
     specs = amplitudes(effect)
     columns = problem.columns(no_effect(), seen, effect, default_values(effect, problem))
     squares = (columns**2).sum(axis=1).mean(axis=0)
