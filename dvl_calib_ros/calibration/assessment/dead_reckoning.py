@@ -181,27 +181,27 @@ def dead_reckoned(
     step_s = integration_steps(recording.dvl.times[use])
     axes = slice(2, 4) if on_a_map else slice(0, 2)
     velocity = before.velocity[use, axes]
-    along = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
-    if not len(along) or along[-1] < SHORTEST_M:
+    distance = np.cumsum(np.linalg.norm(velocity, axis=1) * step_s)
+    if not len(distance) or distance[-1] < SHORTEST_M:
         return None
     errors = [each.error[use, axes] for each in (before, after)]
     astray = [np.cumsum(error * step_s[:, None], axis=0) for error in errors]
     if slow is not None and recording.reference.in_body.all():
         slow = slow._replace(heading=0.0)  # body velocities need no heading
-    ends = ends_of_stretches(along)
+    ends = ends_of_stretches(distance)
     kept = np.round(np.linspace(0, len(use) - 1, min(POINTS, len(use)))).astype(np.intp)
     reference = np.cumsum(velocity * step_s[:, None], axis=0)
     return Navigation(
-        distance_m=float(along[-1]),
+        distance_m=float(distance[-1]),
         seconds=float(step_s.sum()),
-        stretch_m=float(along[-1] if len(ends) == 2 else along[ends[1]] - along[ends[0]]),
+        stretch_m=float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]]),
         stretches=len(ends) - 1,
-        before=drift_over(astray[0], along, ends),
-        after=drift_over(astray[1], along, ends),
-        noise_per_km=_noise(errors[1], step_s, along, ends, slow),
+        before=drift_over(astray[0], distance, ends),
+        after=drift_over(astray[1], distance, ends),
+        noise_per_km=_noise(errors[1], step_s, distance, ends, slow),
         on_a_map=on_a_map,
         stamps_ns=np.round(recording.dvl.times[use[kept]] * 1e9).astype(np.int64) + epoch_ns,
-        distances=along[kept],
+        distances=distance[kept],
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],
         track_after=(reference - astray[1])[kept],
@@ -270,37 +270,37 @@ def integration_steps(times: Array) -> Array:
     return np.where(interval > max(GAP_S, GAP_INTERVALS * usual), 0.0, np.maximum(interval, 0.0))
 
 
-def ends_of_stretches(along: Array) -> Index:
+def ends_of_stretches(distance: Array) -> Index:
     """Return indices (S + 1,) of the limits of stretches, for the longest length with enough stretches."""
     for length in STRETCHES_M:
-        n = int(along[-1] // length)
+        n = int(distance[-1] // length)
         if n >= ENOUGH:
-            return np.asarray(np.searchsorted(along, length * np.arange(n + 1)).clip(0, len(along) - 1))
-    return np.array([0, len(along) - 1])
+            return np.asarray(np.searchsorted(distance, length * np.arange(n + 1)).clip(0, len(distance) - 1))
+    return np.array([0, len(distance) - 1])
 
 
-def drift_over(astray: Array, along: Array, ends: Index) -> Drift:
+def drift_over(error_of_track: Array, distance: Array, ends: Index) -> Drift:
     """Return the drift from track errors (N, 2) m at distances (N,) m, over the stretches between ends (S + 1,)."""
-    off = np.linalg.norm(np.diff(astray[ends], axis=0), axis=1)
-    share = off / np.maximum(np.diff(along[ends]), 1e-9)
-    return Drift(1000.0 * math.sqrt(float(np.mean(share**2))), float(np.linalg.norm(astray[-1])))
+    error_m = np.linalg.norm(np.diff(error_of_track[ends], axis=0), axis=1)
+    share = error_m / np.maximum(np.diff(distance[ends]), 1e-9)
+    return Drift(1000.0 * math.sqrt(float(np.mean(share**2))), float(np.linalg.norm(error_of_track[-1])))
 
 
-def _noise(errors: Array, step_s: Array, along: Array, ends: Index, slow: SlowNoise | None) -> float:
+def _noise(errors: Array, step_s: Array, distance: Array, ends: Index, slow: SlowNoise | None) -> float:
     """Return the drift by white and slow noise, m per km, rms over stretches.
 
-    errors: (K, 2) m/s; differences of neighbours give the white noise. step_s: (K,) s. along: (K,) m driven.
+    errors: (K, 2) m/s; differences of neighbours give the white noise. step_s: (K,) s. distance: (K,) m driven.
     ends: (S + 1,) indices of the ends of stretches.
     """
     if len(errors) < 3:
         return 0.0
     variance = median(np.diff(errors, axis=0) ** 2).sum() / (2.0 * MEDIAN_SQUARE)
     squares = np.concatenate([[0.0], np.cumsum(step_s[1:] ** 2)])
-    metres = np.maximum(np.diff(along[ends]), 1e-9)
-    off = variance * np.diff(squares[ends])
+    metres = np.maximum(np.diff(distance[ends]), 1e-9)
+    variances = variance * np.diff(squares[ends])
     if slow is not None:
-        off = off + slow.squares(np.diff(np.cumsum(step_s)[ends]), metres)
-    share = off / metres**2
+        variances = variances + slow.squares(np.diff(np.cumsum(step_s)[ends]), metres)
+    share = variances / metres**2
     return 1000.0 * math.sqrt(float(np.mean(share)))
 
 

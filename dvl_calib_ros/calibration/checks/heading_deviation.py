@@ -54,16 +54,16 @@ def heading_deviation(yaw: Array, coefficients: GaussianState) -> HeadingDeviati
         return None
     terms = np.stack([np.sin(yaw), np.cos(yaw), np.sin(2.0 * yaw), np.cos(2.0 * yaw)], axis=1)
     terms -= terms.mean(axis=0)
-    shown = terms @ coefficients.x
-    rms = float(np.sqrt((shown**2).mean()))
+    deviation = terms @ coefficients.x
+    rms = float(np.sqrt((deviation**2).mean()))
     std = math.sqrt(max(float(np.einsum("ni,ij,nj->n", terms, coefficients.p, terms).mean()), 0.0))
     found = float(coefficients.x @ np.linalg.solve(coefficients.p, coefficients.x))
     if rms < REPORTED_FROM_RAD or found < chi2_isf(chance_of(Z_ONE_TEST), len(coefficients.x)):
         return None
-    most, least = int(np.argmax(shown)), int(np.argmin(shown))
+    most, least = int(np.argmax(deviation)), int(np.argmin(deviation))
     north = (0.5 * math.pi - yaw) % (2.0 * math.pi)
     return HeadingDeviation(
-        rms, std, float(shown[most]), float(north[most]), float(shown[least]), float(north[least])
+        rms, std, float(deviation[most]), float(north[most]), float(deviation[least]), float(north[least])
     )  # fmt: skip
 
 

@@ -115,16 +115,16 @@ class AttitudeRates:
 
     def contradiction(self) -> Reason | None:
         """Return the reason, and the convention that fits, if attitude and angular velocity disagree."""
-        shown = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
-        total = float(np.trace(self._turning[shown, shown]))
+        observable = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
+        total = float(np.trace(self._turning[observable, observable]))
         if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
             return None
         if not self._rates[_BODY].any():
             return finding("IMU_NO_RATES")
-        given = self._left(_BODY, np.eye(3), shown)
+        given = self._misfit(_BODY, np.eye(3), observable)
         if given < WRONG_FROM * total:
             return None
-        explained = [(self._left(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
+        explained = [(self._misfit(frame, matrix, observable), fits) for frame, matrix, fits in self._explanations()]
         best = min(left for left, _ in explained)
         if best > min(LEFT_AT_MOST * total, BETTER_BY * given):
             return None
@@ -133,11 +133,11 @@ class AttitudeRates:
             return finding("IMU_CONTRADICTS_EITHER", found=found, other=others[0])
         return finding("IMU_CONTRADICTS", found=found)
 
-    def _left(self, frame: int, matrix: Array, shown: slice) -> float:
+    def _misfit(self, frame: int, matrix: Array, observable: slice) -> float:
         """Return Σ|a - B w|² over the observable axes, for B (3, 3) and a frame of w."""
-        matrix = matrix[shown]
-        crossed = float((matrix * self._both[frame][shown]).sum())
-        turning = float(np.trace(self._turning[shown, shown]))
+        matrix = matrix[observable]
+        crossed = float((matrix * self._both[frame][observable]).sum())
+        turning = float(np.trace(self._turning[observable, observable]))
         return turning - 2.0 * crossed + float(np.trace(matrix @ self._rates[frame] @ matrix.T))
 
     def _explanations(self) -> Iterator[tuple[int, Array, Reason]]:

@@ -298,27 +298,27 @@ def navigated(
         own = numbers[at] % len(states) == fold
         after[own] = steps(left(state.x))[own]
     moved = steps(np.einsum("nabc,bc->na", legs.way, parameters.rotation_dvl_from_body.T))
-    along = np.cumsum(np.linalg.norm(moved, axis=1))
-    if along[-1] < SHORTEST_M:
+    distance = np.cumsum(np.linalg.norm(moved, axis=1))
+    if distance[-1] < SHORTEST_M:
         return None
-    ends = ends_of_stretches(along)
+    ends = ends_of_stretches(distance)
     astray = [np.cumsum(each, axis=0) for each in (before, after)]
     reference = np.cumsum(steps(legs.position), axis=0)
-    stretch_m = float(along[-1] if len(ends) == 2 else along[ends[1]] - along[ends[0]])
+    stretch_m = float(distance[-1] if len(ends) == 2 else distance[ends[1]] - distance[ends[0]])
     noise = float(np.sqrt(2.0 * np.var(of_all[at, :2], axis=0).sum()))
     kept = np.round(np.linspace(0, len(at) - 1, min(POINTS, len(at)))).astype(np.intp)
     in_body = [_velocities(each, seconds, legs.rotation[at])[kept] for each in astray]
     return Navigation(
-        distance_m=float(along[-1]),
+        distance_m=float(distance[-1]),
         seconds=float(step_s.sum()),
         stretch_m=stretch_m,
         stretches=len(ends) - 1,
-        before=drift_over(astray[0], along, ends),
-        after=drift_over(astray[1], along, ends),
+        before=drift_over(astray[0], distance, ends),
+        after=drift_over(astray[1], distance, ends),
         noise_per_km=1000.0 * noise / stretch_m,
         on_a_map=True,
         stamps_ns=first_ns + np.round(seconds[kept] * 1e9).astype(np.int64),
-        distances=along[kept],
+        distances=distance[kept],
         reference=reference[kept],
         track_before=(reference - astray[0])[kept],
         track_after=(reference - astray[1])[kept],

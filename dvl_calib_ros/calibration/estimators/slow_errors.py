@@ -105,8 +105,8 @@ def binned_rows(rows: PredictedRows, row_weight: Array, from_s: float, end_s: fl
     both = np.concatenate([rows.columns, rows.residual[:, :, None]], axis=2)
     mean = np.add.reduceat(both * share[:, :, None], first)
     slow = np.add.reduceat(rows.slow * share[:, :, None], first)
-    along = np.add.reduceat((rows.times[:, None] - from_s) / (end_s - from_s) * share, first)[:, :, None]
-    whole = np.concatenate([(1.0 - along) * slow, along * slow, mean], axis=2)
+    fraction = np.add.reduceat((rows.times[:, None] - from_s) / (end_s - from_s) * share, first)[:, :, None]
+    whole = np.concatenate([(1.0 - fraction) * slow, fraction * slow, mean], axis=2)
     return Bins(whole, total, rows.fold[first])
 
 

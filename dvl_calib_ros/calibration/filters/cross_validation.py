@@ -105,8 +105,8 @@ class FoldInformation:
             some = rows.take(at, axis=3)
             weighted = some * weight[:, None, None, at]
             flat = (*some.shape[:2], -1)
-            told = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
-            self._told.add(fold, told[..., :-1, :-1], told[..., :-1, -1])
+            added = weighted.reshape(flat) @ some.reshape(flat).swapaxes(1, 2)
+            self._told.add(fold, added[..., :-1, :-1], added[..., :-1, -1])
 
     def without(self, fold: int) -> tuple[Array, Array]:
         """Return Λ (K, n, n) and Λx (K, n) without a fold."""

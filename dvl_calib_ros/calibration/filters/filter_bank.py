@@ -45,10 +45,10 @@ class RelativeHeight:
         heights = np.empty(len(rising))
         for row, (stamp_ns, speed) in enumerate(zip(stamps_ns.tolist(), rising.tolist(), strict=True)):
             step_s = 0.0 if last_ns is None else 1e-9 * (stamp_ns - last_ns)
-            left = math.exp(-step_s / MEMORY_S)
-            height *= left
+            decay = math.exp(-step_s / MEMORY_S)
+            height *= decay
             if step_s <= LONGEST_STEP_S:
-                height += speed * MEMORY_S * (1.0 - left)
+                height += speed * MEMORY_S * (1.0 - decay)
             heights[row] = height
             last_ns = stamp_ns
         self._height, self._last_ns = height, last_ns

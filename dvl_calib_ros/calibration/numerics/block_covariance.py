@@ -91,9 +91,9 @@ class TimeBlocks:
         onto[:, of_day] = 0.0
         found = (within @ vector[:, of_day, None])[..., 0]
         for told, y in zip(*self.kept, strict=True):
-            rest = y - (told[:, :, of_day] @ found[..., None])[..., 0]
+            residual = y - (told[:, :, of_day] @ found[..., None])[..., 0]
             told[:] = onto @ told @ onto.swapaxes(1, 2)
-            y[:] = (onto @ rest[..., None])[..., 0]
+            y[:] = (onto @ residual[..., None])[..., 0]
         self.choose(source)
 
     def choose(self, source: NDArray[np.intp]) -> None:

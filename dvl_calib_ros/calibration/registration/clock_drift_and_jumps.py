@@ -142,10 +142,10 @@ def _reach(times: Array) -> float:
     return float(np.ptp(times)) / MOST_STRETCHES + STRETCH_S
 
 
-def _holes(times: Array, leap: float, at: float, reach: float) -> Index:
+def _holes(times: Array, jump: float, at: float, reach: float) -> Index:
     """Return indices of times (N,) before gaps of the size of a step (s), within reach of it."""
     gap = np.diff(times)
-    return np.flatnonzero((gap > HOLE * leap) & (np.abs(times[1:] - at) < reach + gap))
+    return np.flatnonzero((gap > HOLE * jump) & (np.abs(times[1:] - at) < reach + gap))
 
 
 def unsteady(
@@ -212,6 +212,6 @@ def _explained(seen: Array, weight: Array, moved: Array, kept: Mask) -> tuple[fl
     n = k + is_asked
     p = np.linalg.inv(information[:n, :n])
     x = p @ np.einsum("sij,sik,sk->j", h, w, z)[:n]
-    rest = z - h[:, :, :n] @ x
-    left = float(np.einsum("si,sij,sj->", rest, w, rest))
-    return (left, float(x[k]), float(np.sqrt(p[k, k]))) if is_asked else (left, 0.0, np.inf)
+    residual = z - h[:, :, :n] @ x
+    chi_square = float(np.einsum("si,sij,sj->", residual, w, residual))
+    return (chi_square, float(x[k]), float(np.sqrt(p[k, k]))) if is_asked else (chi_square, 0.0, np.inf)

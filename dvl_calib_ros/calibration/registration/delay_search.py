@@ -52,11 +52,11 @@ def places(motion: MotionStreams, rotation_body_from_dvl: Array | None, most: in
     rotation_body_from_dvl: (3, 3), None if unknown. Without an attitude, or with a body-frame reference, only the
     relative delay is observable and is assigned to the DVL.
     """
-    late, misfit = _misfits(motion, rotation_body_from_dvl)
-    by_reference = late if misfit.shape[0] > 1 else np.zeros(1)
-    near = (np.abs(by_reference)[:, None] <= 3.0) & (np.abs(late) <= 3.0)
-    found = _minima(misfit, by_reference, late, most)
-    found += _minima(np.where(near, misfit, np.inf), by_reference, late, 1)
+    delays, misfit = _misfits(motion, rotation_body_from_dvl)
+    by_reference = delays if misfit.shape[0] > 1 else np.zeros(1)
+    near = (np.abs(by_reference)[:, None] <= 3.0) & (np.abs(delays) <= 3.0)
+    found = _minima(misfit, by_reference, delays, most)
+    found += _minima(np.where(near, misfit, np.inf), by_reference, delays, 1)
     return sorted(set(found), key=lambda place: place.misfit)
 
 
@@ -82,7 +82,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
     """Return delays (L,) s, and the misfit (L or 1, L) by reference delay and DVL delay."""
     step, grid = _grid(motion)
     reach = round(LONGEST_S / step)
-    late = step * np.arange(-reach, reach + 1)
+    delays = step * np.arange(-reach, reach + 1)
     v = _on_grid(motion.dvl.times, motion.dvl.velocity, grid, step)
     g = _on_grid(motion.reference_times, np.where(motion.measured, motion.reference, 0.0), grid, step)
     n = len(grid)
@@ -93,7 +93,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
     if motion.in_earth and motion.has_attitude:
         attitude, oriented = attitude_at(motion.imu, grid, HOLE_S)
     shifts = range(-reach, reach + 1) if attitude is not None else (0,)
-    misfit = np.full((len(shifts), len(late)), np.inf)
+    misfit = np.full((len(shifts), len(delays)), np.inf)
     for row, shift in enumerate(shifts):
         b = _shifted(g, shift)
         if attitude is not None:
@@ -122,7 +122,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
             alike = np.linalg.svd(matrices, compute_uv=False).sum(axis=1)  # either handedness will do for a search
         enough = (count >= least) & (squares > 0.0)
         misfit[row, enough] = (squares - 2.0 * alike)[enough] / (0.5 * squares[enough])
-    return late, np.maximum(misfit, 0.0)
+    return delays, np.maximum(misfit, 0.0)
 
 
 def _grid(motion: MotionStreams) -> tuple[float, Array]:

@@ -259,9 +259,9 @@ class MotionFit:
         information = (h * w[:, None]).T @ h + np.diag(prior)
         vector = -(h * w[:, None]).T @ rows.residual.ravel() - prior * np.concatenate([np.zeros(3), from_prior[kept]])
         found = np.linalg.solve(information, vector)
-        left = rows.residual.ravel() + h @ found
+        residual = rows.residual.ravel() + h @ found
         # residuals that the factors explain are no noise
-        share = float((w * left**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
+        share = float((w * residual**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
         std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
         return AxisFactors(1.0 + found[:3], std)
 

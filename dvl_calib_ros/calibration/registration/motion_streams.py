@@ -208,9 +208,9 @@ def _parts(n: int) -> list[slice]:
 
 def _between(values: Array, before: Index, share: Array) -> Array:
     """Interpolate rows linearly between index `before` and the next, at a share (0..1)."""
-    left = values.take(before, axis=0)
+    before_value = values.take(before, axis=0)
     found: Array = values.take(before + 1, axis=0)
-    found -= left
+    found -= before_value
     found *= share
-    found += left
+    found += before_value
     return found

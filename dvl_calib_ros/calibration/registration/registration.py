@@ -176,10 +176,10 @@ class Registration:
         if not clock.is_shown or (self.next_worse < REFUSED_FROM and self._holds(clock)):
             return self.ambiguity
         offset = round(getattr(parameters, name) + clock.delay_s, 2)
-        off = {"seconds": abs(clock.delay_s), "way": _way(clock), "parameter": name, "offset": offset}
+        values = {"seconds": abs(clock.delay_s), "way": _way(clock), "parameter": name, "offset": offset}
         if clock is self.reference and self.dvl.is_shown:
-            return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.delay_s), dvl_way=_way(self.dvl), **off)
-        return finding("CLOCK_LATE", whose=OFFSETS[name], **off)
+            return finding("CLOCKS_LATE", dvl_seconds=abs(self.dvl.delay_s), dvl_way=_way(self.dvl), **values)
+        return finding("CLOCK_LATE", whose=OFFSETS[name], **values)
 
     def _holds(self, clock: Clock) -> bool:
         """Return whether the σ of a calibration that assumes synchronisation cover the delay of a clock."""

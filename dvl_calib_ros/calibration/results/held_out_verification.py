@@ -113,8 +113,8 @@ def shown_misalignment(model: Model, state: GaussianState, parameters: Parameter
     t = parameters.rotation_dvl_from_body
     about = t.T @ (model.error_terms_from_state @ state.x)[:3]
     std = body_angle_std(state.p, parameters)
-    shown = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > Z_ONE_TEST * std)
-    return np.where(shown, about, 0.0)
+    observable = (std <= OBSERVED_SHARE * parameters.initial_std_misalignment) | (np.abs(about) > Z_ONE_TEST * std)
+    return np.where(observable, about, 0.0)
 
 
 def shown_mounting(model: Model, state: GaussianState, parameters: Parameters) -> tuple[float, float, float]:

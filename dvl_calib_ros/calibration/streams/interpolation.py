@@ -245,8 +245,8 @@ def _within(times: Array, seconds: float) -> int:
     """
 
     def some(n: int) -> bool:
-        apart = times[n:] - times[:-n]
-        return bool(((apart < seconds) & (apart >= 0.0)).any())
+        duration = times[n:] - times[:-n]
+        return bool(((duration < seconds) & (duration >= 0.0)).any())
 
     low, high = 0, 1
     while some(high):

@@ -57,16 +57,16 @@ def _deconvolved(times: Array, velocity: Array, window_s: float) -> Array:
         return velocity
     known = np.ones(len(times), dtype=bool)
     sides = []
-    for asked in (times - window_s, times + window_s):
-        after = np.clip(np.searchsorted(times, asked), 1, len(times) - 1)
+    for shifted in (times - window_s, times + window_s):
+        after = np.clip(np.searchsorted(times, shifted), 1, len(times) - 1)
         # no correction beyond an end and across an outage
-        known &= (asked >= times[0]) & (asked <= times[-1]) & (times[after] - times[after - 1] <= 1.5 * window_s)
-        sides.append(asked)
+        known &= (shifted >= times[0]) & (shifted <= times[-1]) & (times[after] - times[after - 1] <= 1.5 * window_s)
+        sides.append(shifted)
     found, bend = velocity.copy(), velocity
     for factor in SERIES:
-        around = sum(np.column_stack([np.interp(asked, times, axis) for axis in bend.T]) for asked in sides)
+        around = sum(np.column_stack([np.interp(shifted, times, axis) for axis in bend.T]) for shifted in sides)
         bend = np.where(known[:, None], around - 2.0 * bend, 0.0)
         found += factor * bend
         # the next difference needs this one on both sides
-        known = known & np.all([np.interp(asked, times, known) > 0.99 for asked in sides], axis=0)
+        known = known & np.all([np.interp(shifted, times, known) > 0.99 for shifted in sides], axis=0)
     return found
