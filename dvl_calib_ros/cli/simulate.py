@@ -164,7 +164,7 @@ def _with_diagnosis(arguments: argparse.Namespace, defaults: argparse.Namespace,
 
     for name in OF_THE_DVL:
         if getattr(arguments, name) != getattr(defaults, name):
-            raise InputError(f"--{name.replace('_', '-')}: {arguments.diagnosis} has it, too; leave one of the two out")
+            raise InputError(f"--{name.replace('_', '-')}: {arguments.diagnosis} sets it as well; omit one of the two")
     description = load_description(arguments.diagnosis)
     scenario, left_out = with_dvl(scenario, description)
     notes = [

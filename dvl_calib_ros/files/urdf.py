@@ -69,7 +69,7 @@ class Urdf:
         while not _is_link(chain[0].parent, base):
             above = self._joint_above(chain[0].parent, f"; joint {chain[-1].name} does not lead to {base}")
             if above in chain:
-                raise InputError(f"{self.path}: joint {above.name} is above itself")
+                raise InputError(f"{self.path}: joint {above.name} is its own ancestor")
             chain.insert(0, above)
         for each in chain:
             if each.kind != "fixed":

@@ -199,7 +199,7 @@ CONFIGURATIONS = on_page(
     reject(
         "CLOCK_DRIFTS_DVL",
         "the DVL's clock drifts by {ppm:.0f} ± {std:.0f} ppm against the others",
-        remedy="synchronise the clocks, or dvl_clock_drift to {drift:.2g}",
+        remedy="synchronise the clocks, or set dvl_clock_drift to {drift:.2g}",
     ),
     reject(
         "CLOCK_LEAPS",

@@ -336,7 +336,7 @@ FINDINGS = (
     warning(
         "DVL_BIAS",
         "the DVL has the same velocity error at every speed, {axes} mm/s in the body, which "
-        "looks like {degrees:.1f}° of mounting at the usual speed",
+        "looks like {degrees:.1f}° of misalignment at the usual speed",
         means="A bias of the DVL's electronics, a rounding, or water that moves in its shell.",
         remedy="subtract the bias in the driver, or have the DVL serviced",
     ),
