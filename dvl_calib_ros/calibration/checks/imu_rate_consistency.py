@@ -115,16 +115,16 @@ class AttitudeRates:
 
     def contradiction(self) -> Reason | None:
         """Return the reason, and the convention that fits, if attitude and angular velocity disagree."""
-        observable = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
-        total = float(np.trace(self._turning[observable, observable]))
+        shown = slice(None) if self._tilted else slice(2, None)  # a heading only shows rotation about the vertical
+        total = float(np.trace(self._turning[shown, shown]))
         if self._n < ENOUGH or total < self._n * LEAST_TURNING**2:
             return None
         if not self._rates[_BODY].any():
             return finding("IMU_NO_RATES")
-        given = self._misfit(_BODY, np.eye(3), observable)
+        given = self._misfit(_BODY, np.eye(3), shown)
         if given < WRONG_FROM * total:
             return None
-        explained = [(self._misfit(frame, matrix, observable), fits) for frame, matrix, fits in self._explanations()]
+        explained = [(self._misfit(frame, matrix, shown), fits) for frame, matrix, fits in self._explanations()]
         best = min(left for left, _ in explained)
         if best > min(LEFT_AT_MOST * total, BETTER_BY * given):
             return None
