@@ -492,9 +492,9 @@ class FullEstimator(Estimator):
         for begins_ns, (x, p) in zip(first_ns, states, strict=False):
             std = np.sqrt(np.diag(p))
             (east, north), (east_std, north_std) = x[offset].tolist(), std[offset].tolist()
-            observable = bool(p[DELAY, DELAY] <= SHOWN_SHARE**2 * known)
-            delay = nominal + float(x[DELAY])
-            days.append(Day(begins_ns, delay, float(std[DELAY]), observable, (east, north), (east_std, north_std)))
+            shown = bool(p[DELAY, DELAY] <= SHOWN_SHARE**2 * known)
+            late = nominal + float(x[DELAY])
+            days.append(Day(begins_ns, late, float(std[DELAY]), shown, (east, north), (east_std, north_std)))
         return tuple(days)
 
     def held_out_terms(self, n_days: int) -> list[list[Terms]]:

@@ -118,8 +118,8 @@ def _solved(legs: Legs, parameters: Parameters, errors: GaussianState) -> Displa
     noise = 0.0
     for _ in range(ROUNDS):
         linear = linear_about(legs, state.x, parameters)
-        residual = linear.y - linear.columns @ state.x
-        used = _no_outliers(residual[:, :2], legs.stretch)
+        left = linear.y - linear.columns @ state.x
+        used = _no_outliers(left[:, :2], legs.stretch)
         if used.sum() < ENOUGH_FIXES:
             return None
         state, noise = _fitted(_means(linear, legs, used, (0, 1)), prior)
@@ -196,17 +196,17 @@ def _of_stretches(rows: Array, weight: Array, stretch: Index) -> Array:
     return np.asarray(sums / total[..., None])
 
 
-def _no_outliers(residual: Array, stretch: Index) -> Mask:
+def _no_outliers(left: Array, stretch: Index) -> Mask:
     """Return which of N fixes are no outliers, from their residuals (N, 2) m."""
-    n = len(residual)
+    n = len(left)
     places = np.clip(np.arange(n)[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1), 0, n - 1)
-    near = np.where((stretch[places] == stretch[:, None])[..., None], residual[places], np.nan)
-    away = residual - np.nanmedian(near, axis=1)
+    near = np.where((stretch[places] == stretch[:, None])[..., None], left[places], np.nan)
+    away = left - np.nanmedian(near, axis=1)
     near_enough = np.abs(away) < OUTLYING * np.maximum(robust_std(away), 1e-6)
-    centred = residual.copy()
+    centred = left.copy()
     for each in np.unique(stretch):
         own = stretch == each
-        centred[own] -= median(residual[own])
+        centred[own] -= median(left[own])
     in_reach = np.abs(centred) < FAR_OUT * np.maximum(robust_std(centred), FINEST_M)
     return np.asarray((near_enough & in_reach).all(axis=1))
 
@@ -241,8 +241,8 @@ def _hypotheses(blocks: _Blocks) -> Array:
     same = blocks.stretch[:, None] == blocks.stretch
     starts = np.array([t[blocks.stretch == each][0] for each in blocks.stretch])
     walk = np.where(same, np.minimum(t[:, None], t) - starts[:, None], 0.0) / WALK_S
-    lag = np.abs(t[:, None] - t)
-    lasting = [np.zeros_like(lag)] + [size * np.exp(-lag / tau) for size in LASTING for tau in LASTING_S]
+    apart = np.abs(t[:, None] - t)
+    lasting = [np.zeros_like(apart)] + [size * np.exp(-apart / tau) for size in LASTING for tau in LASTING_S]
     each = np.array([one + more * walk for one in lasting for more in WALKED]) * usual + np.diag(white)
     most = np.diagonal(each, axis1=1, axis2=2).max(axis=1)
     return np.asarray(each + ANYWHERE * most[:, None, None] * same)
@@ -262,7 +262,7 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     whitened = np.linalg.solve(root, np.concatenate(list(rows), axis=1)[None])  # NumPy 1 takes (B, k) for vectors
     parts = np.split(whitened, axes, axis=2)
     square = np.asarray(sum(part.swapaxes(1, 2) @ part for part in parts))
-    yy, by, xtx = square[:, 0, 0], square[:, 0, 1:], square[:, 1:, 1:]
+    yy, by, told = square[:, 0, 0], square[:, 0, 1:], square[:, 1:, 1:]
     freedom = float(axes * (n - len(np.unique(blocks.stretch))))
     # hypotheses of the heading deviation, combined with those of the noise: (G, F, ...)
     wider = np.ones((len(DEVIATES), N_THETA))
@@ -270,16 +270,16 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     known = np.linalg.inv(prior.p * wider[:, :, None] * wider[:, None, :])
     level = np.maximum(yy / max(freedom, 1.0), FINEST_M**2)[:, None] * np.ones(len(DEVIATES))
     for _ in range(6):
-        information = known + xtx[:, None] / level[..., None, None]
+        information = known + told[:, None] / level[..., None, None]
         vector = (known @ prior.x) + by[:, None] / level[..., None]
         x = np.linalg.solve(information, vector[..., None])[..., 0]
-        squares = yy[:, None] - 2.0 * (x * by[:, None]).sum(axis=-1) + np.einsum("gfi,gij,gfj->gf", x, xtx, x)
-        spent = np.trace(np.linalg.solve(information, xtx[:, None] / level[..., None, None]), axis1=2, axis2=3)
-        level = np.maximum(squares / np.maximum(freedom - spent, 1.0), FINEST_M**2)
-    information = known + xtx[:, None] / level[..., None, None]
+        left = yy[:, None] - 2.0 * (x * by[:, None]).sum(axis=-1) + np.einsum("gfi,gij,gfj->gf", x, told, x)
+        spent = np.trace(np.linalg.solve(information, told[:, None] / level[..., None, None]), axis1=2, axis2=3)
+        level = np.maximum(left / np.maximum(freedom - spent, 1.0), FINEST_M**2)
+    information = known + told[:, None] / level[..., None, None]
     p = np.linalg.inv(information)
     away = x - prior.x
-    misfit = squares / level + np.einsum("gfi,fij,gfj->gf", away, known, away)
+    misfit = left / level + np.einsum("gfi,fij,gfj->gf", away, known, away)
     likely = -0.5 * (
         misfit
         + freedom * np.log(level)
@@ -291,11 +291,11 @@ def _fitted(blocks: _Blocks, prior: GaussianState) -> tuple[GaussianState, float
     share = np.exp(likely - likely.max())
     share /= share.sum()
     mean = np.einsum("gf,gfi->i", share, x)
-    deviation = x - mean
+    apart = x - mean
     # Student's t, as few degrees of freedom determine the level
     few = np.maximum(freedom - spent, 3.0)
     p = p * (few / (few - 2.0))[..., None, None]
-    total = np.einsum("gf,gfij->ij", share, p) + np.einsum("gf,gfi,gfj->ij", share, deviation, deviation)
+    total = np.einsum("gf,gfij->ij", share, p) + np.einsum("gf,gfi,gfj->ij", share, apart, apart)
     return GaussianState(mean, 0.5 * (total + total.T)), float(np.sqrt((share * level).sum()))
 
 
