@@ -153,7 +153,7 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
     if len(header) != N_COLUMNS:
         names = ", ".join(cell.strip() for cell in header)[:SHOWN]
         raise InputError(
-            f"{path}: has {len(header)} columns, expected {EXPECTED}; name the columns of a DVL's table with --columns "
+            f"{path}: has {len(header)} columns, expected {EXPECTED}; of a DVL's table name them with --columns "
             f"time=NAME,vx=NAME,vy=NAME,vz=NAME; there are {names}"
         )
     units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]

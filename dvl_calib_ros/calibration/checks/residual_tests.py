@@ -321,33 +321,33 @@ def residual_warnings(
     for axis, name in enumerate(("roll", "pitch")):
         share, std = float(found.tilt[axis]), float(found.tilt_std[axis])
         if abs(share) > max(Z_SLOW_ERRORS * std, MISSING_TILT_SHARE):
-            angle = abs(share * float(found.lean[axis]))
-            severity = Severity.REJECT if angle > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
-            found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(angle))
+            off = abs(share * float(found.lean[axis]))
+            severity = Severity.REJECT if off > accepted or abs(share) > WRONG_SIGN_TILT_SHARE else Severity.MARGINAL
+            found_tilt = finding("TILT_NOT_FOLLOWED", axis=name, share=share, std=std, off=math.degrees(off))
             reasons.append(found_tilt.weighed(severity))
         elif std > TILT_UNOBSERVABLE_STD and abs(float(found.lean[axis])) > accepted:
             reasons.append(finding("TILT_NOT_SHOWN", axis=name, lean=math.degrees(abs(float(found.lean[axis])))))
     # the heading at either end, relative to its mean
-    angle = 0.5 * abs(found.turned)
-    if angle > REPORTED_FROM_RAD and angle > Z_ONE_TEST * found.turned_std:
-        severity = Severity.MARGINAL if angle > max(accepted, Z_95_PERCENT * mounting_std[1]) else Severity.WARNING
+    off = 0.5 * abs(found.turned)
+    if off > REPORTED_FROM_RAD and off > Z_ONE_TEST * found.turned_std:
+        severity = Severity.MARGINAL if off > max(accepted, Z_95_PERCENT * mounting_std[1]) else Severity.WARNING
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
-        reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(angle)).weighed(severity))
+        reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(severity))
     if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
         reasons += beam_warning(beam, accepted)
     magnitude = np.abs(found.bias)
-    is_significant = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
-    if is_significant.any():
+    shown = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
+    if shown.any():
         axes = ", ".join(
             f"{axis} {1000.0 * found.bias[i]:+.0f} ± {1000.0 * found.bias_std[i]:.0f}"
             for i, axis in enumerate("xyz")
-            if is_significant[i]
+            if shown[i]
         )
-        turned = float(magnitude[is_significant].max()) / found.speed
+        turned = float(magnitude[shown].max()) / found.speed
         is_wrong = (
             magnitude - found.bias_std > np.maximum(accepted, Z_95_PERCENT * np.asarray(mounting_std)) * found.speed
         )
-        severity = Severity.REJECT if (is_significant & is_wrong).any() else Severity.MARGINAL
+        severity = Severity.REJECT if (shown & is_wrong).any() else Severity.MARGINAL
         reasons.append(finding("DVL_BIAS", axes=axes, degrees=math.degrees(turned)).weighed(severity))
     elif float(found.bias_std[:2].max()) > BIAS_UNOBSERVABLE_STD_MPS:
         share = TYPICAL_BIAS_MPS / found.speed
@@ -368,9 +368,9 @@ def _fitted(
     if len(starts) < ENOUGH:
         return None
     n = columns.shape[2]
-    residual = error
+    rest = error
     for _ in range(ROUNDS):
-        square = (residual**2).sum(axis=1)
+        square = (rest**2).sum(axis=1)
         level = max(float(median(square)), QUIETEST_MPS**2)
         weight = 1.0 / np.maximum(square / (OUTLYING**2 * level), 1.0)
         weighted = columns * weight[:, None, None]
@@ -378,8 +378,8 @@ def _fitted(
         prior = level / 3.0 / likely**2
         p = np.linalg.inv(weighted.reshape(-1, n).T @ flat + np.diag(prior))
         x = p @ (weighted.reshape(-1, n).T @ z)
-        residual = error - columns @ x
-    scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, residual), starts, axis=0)
+        rest = error - columns @ x
+    scores = np.add.reduceat(np.einsum("nij,ni->nj", weighted, rest), starts, axis=0)
     # one axis at a time to save memory: hours of data would need a tenth of a gigabyte
     each_axis = [np.add.reduceat((weighted[:, axis] @ p) ** 2, starts, axis=0) for axis in range(3)]
     contributions = np.sum(each_axis, axis=0)
@@ -429,8 +429,8 @@ def _noise_in_reference(time: Array, dvl: Array, error: Array, columns: Array, f
 
     rest, found = without_now(rest), []
     for seconds in FILTER_MEMORIES_S:
-        for delay in (0.0, seconds):  # the lag may have been corrected as a delay
-            past = without_now(without_columns(_filtered_noise(noise, step, seconds, delay)))
+        for late in (0.0, seconds):  # the lag may have been corrected as a delay
+            past = without_now(without_columns(_filtered_noise(noise, step, seconds, late)))
             square = float(np.einsum("n,ni,ni->", weight, past, past))
             if square <= 0.0:
                 continue
@@ -440,10 +440,10 @@ def _noise_in_reference(time: Array, dvl: Array, error: Array, columns: Array, f
     return max(found, key=lambda each: each[0] / each[1], default=(0.0, math.inf, 0.0))
 
 
-def _filtered_noise(noise: Array, step: float, seconds: float, delay: float) -> Array:
-    """Return a filter's output from earlier noise (N, 3). seconds: memory. delay: lag that is corrected, s."""
+def _filtered_noise(noise: Array, step: float, seconds: float, late: float) -> Array:
+    """Return a filter's output from earlier noise (N, 3). seconds: memory. late: lag that is corrected, s."""
     kernel = np.exp(-np.arange(math.ceil(3.0 * seconds / step) + 1.0) * step / seconds)
-    ahead = int(delay / step + 1e-6)
+    ahead = int(late / step + 1e-6)
     kernel[ahead] = 0.0
     made = np.column_stack([np.convolve(np.append(each, np.zeros(ahead)), kernel) for each in noise.T])
     return np.asarray(made[ahead : ahead + len(noise)])
