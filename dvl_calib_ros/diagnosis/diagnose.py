@@ -299,7 +299,7 @@ def _found_effect(
     }
     names = [recording.name for recording in selection.fitter.problem.recordings]
     together = _weighted_mean(list(ordered.values())) if len(ordered) > 1 else next(iter(ordered.values()))
-    is_of_each = effect.of_the_day and len(names) > 1
+    is_of_each = effect.per_recording and len(names) > 1
     return FoundEffect(
         effect.name,
         selected.equivalent,

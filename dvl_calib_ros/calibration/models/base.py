@@ -38,15 +38,15 @@ class Needs(Enum):
 class Nuisance(NamedTuple):
     """State that is estimated only to keep its effect out of misalignment and scale.
 
-    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. of_the_day: the value
-    differs per recording. handed_on: a result file passes it on as a prior, even if it differs per recording, because a
-    restarted node usually continues the same recording.
+    std: prior standard deviation in `unit`, a number or the name of the parameter that holds it. per_recording: the
+    value differs per recording. handed_on: a result file passes it on as a prior, even if it differs per recording,
+    because a restarted node usually continues the same recording.
     """
 
     name: str
     unit: str
     std: float | str
-    of_the_day: bool = False
+    per_recording: bool = False
     handed_on: bool = True
 
 
@@ -108,8 +108,8 @@ class Model:
 
     @cached_property
     def of_day(self) -> NDArray[np.intp]:
-        """Indices (u,) of the states that differ per recording (`Nuisance.of_the_day`)."""
-        return self._nuisance_that(lambda each: each.of_the_day)
+        """Indices (u,) of the states that differ per recording (`Nuisance.per_recording`)."""
+        return self._nuisance_that(lambda each: each.per_recording)
 
     @cached_property
     def not_handed_on(self) -> NDArray[np.intp]:

@@ -92,7 +92,7 @@ def held_out(selection: EffectSelection, unexplained: Unexplained) -> HeldOutRes
     """Return the errors before and after the effects of a selection on held-out data.
 
     One recording is split into alternating stretches. Of several, each is held out, and parameters per recording
-    (`Effect.of_the_day`) are fitted to it. All parameters are re-estimated in the composed model.
+    (`Effect.per_recording`) are fitted to it. All parameters are re-estimated in the composed model.
     """
     fitter, fit = selection.fitter, selection.fit
     problem = fitter.problem
@@ -121,7 +121,7 @@ def held_out(selection: EffectSelection, unexplained: Unexplained) -> HeldOutRes
 def _undetermined(fit: Fit) -> Array:
     """Return the predicted error variance (M,), (m/s)², of a fit per bin. Parameters per recording do not contribute:
     they are fitted to the held-out recording."""
-    of_day = [each.effect.of_the_day and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
+    of_day = [each.effect.per_recording and len(fit.seen) > 1 for each in fit.hypothesis.parameters()]
     return np.asarray(_error_variance(fit, np.flatnonzero(~np.array([False] * 6 + of_day))).sum(axis=1))
 
 
@@ -139,7 +139,7 @@ def _fit_own_parameters(selection: EffectSelection, hypothesis: Hypothesis, reco
     outliers = selection.fitter.outliers
     fitter = Fitter(alone, outliers[of_it] if isinstance(outliers, np.ndarray) else outliers)
     values = {name: (per[recording],) for name, per in hypothesis.values.items()}
-    return fitter.fit(replace(hypothesis, values=values), noise.part(of_it), only_of_the_day=True)
+    return fitter.fit(replace(hypothesis, values=values), noise.part(of_it), only_own=True)
 
 
 def only(problem: Problem, recording: int) -> Problem:

@@ -190,17 +190,17 @@ class Fitter:
         start: Hypothesis,
         noise: Noise,
         max_steps: int = MAX_STEPS,
-        only_of_the_day: bool = False,
+        only_own: bool = False,
         fixed: frozenset[str] = frozenset(),
         linearised: _Linearisation | None = None,
         evaluated: Evaluated | None = None,
     ) -> Fit:
-        """Fit a hypothesis under a noise. only_of_the_day: fit parameters per recording only.
+        """Fit a hypothesis under a noise. only_own: fit only the parameters per recording.
 
         fixed: names of effects whose values are fixed. linearised, evaluated: linearisation or evaluation of the
         start, if known.
         """
-        is_fixed = np.array([True] * 6 + [not each.effect.of_the_day for each in start.parameters()]) & only_of_the_day
+        is_fixed = np.array([True] * 6 + [not each.effect.per_recording for each in start.parameters()]) & only_own
         is_fixed |= np.array([False] * 6 + [each.effect.name in fixed for each in start.parameters()])
         hypothesis = start
         if linearised is not None:
@@ -290,7 +290,7 @@ class Fitter:
             for spec in effect.parameters
             if is_time_of_run(spec)
         )
-        effects = sorted((effect.name, len(effect.parameters), effect.of_the_day) for effect in start.effects)
+        effects = sorted((effect.name, len(effect.parameters), effect.per_recording) for effect in start.effects)
         model = tuple(effects), windows
         key = (id(noise), *model)
         if key not in self._fits:

@@ -391,7 +391,7 @@ class Problem:
         parts, at = {}, 6
         for effect in lagging:
             p = len(amplitudes(effect))
-            parts[effect.name] = self._of_the_day(effect, joined[:, :, at : at + p])
+            parts[effect.name] = self._columns_per_recording(effect, joined[:, :, at : at + p])
             at += p
         for effect in effects:
             if effect not in lagging:
@@ -400,7 +400,7 @@ class Problem:
 
     def columns(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """Return d e / d parameters of an effect about values, (M, A, p); per recording if its parameters are."""
-        per_recording = []
+        columns_of = []
         for recording, each in enumerate(seen):
             lags = hypothesis.lags(recording)
             of_motion = lags if effect.acts_on is not ActsOn.REFERENCE else []
@@ -408,16 +408,16 @@ class Problem:
             if isinstance(effect, EffectWithMemory):
                 unsmoothed, own = each.close_unsmoothed
                 body = trace_columns(effect, unsmoothed, values[recording])[own]
-                per_recording.append(without_remembered(lags, each, body))
+                columns_of.append(without_remembered(lags, each, body))
             else:
                 body = self._derivatives(hypothesis, close, effect, values[recording])
                 lagging = (
                     lagged_columns(lags, each, close, own, body) if of_motion else without_remembered(lags, each, body)
                 )
-                per_recording.append(lagging)
-        return self._of_the_day(effect, self.binned(per_recording, seen))
+                columns_of.append(lagging)
+        return self._columns_per_recording(effect, self.binned(columns_of, seen))
 
-    def _of_the_day(self, effect: Effect, columns: Array) -> Array:
+    def _columns_per_recording(self, effect: Effect, columns: Array) -> Array:
         """Return columns (M, A, p), or (M, A, r p) for parameters per recording, zero in other recordings."""
         whose, p = whose_parameters(effect, len(self.grids)), columns.shape[2]
         if whose == [None]:
@@ -467,7 +467,7 @@ class Problem:
         r). The cosine of a 4° rotation scales all velocities of a recording by -0.25 per cent."""
         turned = self.columns(hypothesis, seen, effect, (effect.defaults,) * len(seen))
         slower = self.binned([-each.motion.velocity_body for each in seen], seen)[:, :, None]
-        return [turned, self._of_the_day(effect, slower)]
+        return [turned, self._columns_per_recording(effect, slower)]
 
     def trace(self, hypothesis: Hypothesis, seen: Sequence[Seen], effect: Effect, values: Sequence[Values]) -> Array:
         """Return (M, A) m/s that an effect adds to the residual of a hypothesis without it."""

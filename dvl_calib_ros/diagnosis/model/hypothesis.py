@@ -28,7 +28,7 @@ def amplitudes(effect: Effect) -> list[EffectParameter]:
 
 def whose_parameters(effect: Effect, n_recordings: int) -> list[int | None]:
     """Return recordings with their own parameters for an effect; [None] if all share them."""
-    if not effect.of_the_day or n_recordings == 1:
+    if not effect.per_recording or n_recordings == 1:
         return [None]
     return list(range(1 if effect.relative_to_first else 0, n_recordings))
 

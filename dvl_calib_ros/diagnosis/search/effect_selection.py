@@ -319,7 +319,7 @@ def _with_heading_instead(fit: Fit, names: Collection[str], heading: Effect) -> 
     none = {name: value for name, value in heading.defaults.items() if name in _names(heading)}
     own: tuple[Values, ...] = fit.values.get(HEADING, (none,) * n)
     start = tuple({name: each.get(name, value) for name, value in none.items()} for each in own)
-    if not heading.of_the_day:
+    if not heading.per_recording:
         start = ({name: sum(each[name] for each in start) / n for name in none},) * n
     others = [effect for effect in fit.effects if effect.name not in names]
     return fit.hypothesis.with_effects([*others, heading], n, {HEADING: start})
