@@ -37,7 +37,7 @@ from ..streams.interpolation import LONGEST_DELAY_S
 from ..streams.stream_order import LONG_AGO_NS, LONGEST_NS
 from .block_preprocessing import MARGIN_NS, Block, DvlSamples, ImuSamples, ReferenceSamples
 from .block_solver import BlockSolver, Outcome
-from .estimator import AtOnce, Estimator, EstimatorSetup, Rest
+from .estimator import AtOnce, Estimator, EstimatorSetup, Residuals
 from .full_forward_model import deviation_of
 from .slow_errors import Priors
 
@@ -118,7 +118,7 @@ class FullEstimator(Estimator):
         return self._n_taken
 
     @property
-    def told_until_ns(self) -> int | None:
+    def affected_from_ns(self) -> int | None:
         """Stamp of the first DVL sample that a gathered block may still affect; None without any."""
         return self._gathered_ns[0] if self._gathered_ns else None
 
@@ -210,9 +210,9 @@ class FullEstimator(Estimator):
         """See `Estimator`."""
         return self._idle_solver().is_horizontal
 
-    def rest(self, *, fresh: bool) -> Rest | None:
+    def residuals(self, *, fresh: bool) -> Residuals | None:
         """See `Estimator`."""
-        return self._idle_solver().rest() if fresh else self._result_in_effect.looked.rest
+        return self._idle_solver().residuals() if fresh else self._result_in_effect.looked.residuals
 
     @property
     def registration_so_far(self) -> Registration | None:
@@ -225,7 +225,7 @@ class FullEstimator(Estimator):
         return self._result_in_effect.suggestion
 
     @property
-    def n_told(self) -> int:
+    def n_results(self) -> int:
         """Number of blocks in effect."""
         return self._n_updates
 

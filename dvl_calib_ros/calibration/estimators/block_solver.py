@@ -24,7 +24,7 @@ from ..registration.registration import Registration
 from ..results.thinned_recording import MEASURED_BELOW, ThinnedBlock, mean_around
 from ..streams.interpolation import LONGEST_DELAY_S, DvlColumns, ImuColumns, InBody, attitude_at, in_body
 from .block_preprocessing import Block, Cleaned, cleaned, seconds
-from .estimator import Rest
+from .estimator import Residuals
 from .full_fit import JointFit
 from .full_forward_model import FitBlock, spline_slopes
 from .registration_schedule import FitSoFar, KeptClocks, Looked
@@ -116,9 +116,9 @@ class BlockSolver:
         """Return the registration of clocks and frames; None if the data do not determine it."""
         return self._clocks.looked(self._so_far).registration
 
-    def rest(self) -> Rest | None:
+    def residuals(self) -> Residuals | None:
         """Return the calibration's residuals, live only; else None."""
-        return self._clocks.looked(self._so_far).rest
+        return self._clocks.looked(self._so_far).residuals
 
     @property
     def _so_far(self) -> FitSoFar | None:

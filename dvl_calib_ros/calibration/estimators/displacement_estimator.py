@@ -183,7 +183,7 @@ class Displacements(Estimator):
         return ModelCounts(used, gated, 2.0 if used else math.nan, 2.0, 0)
 
     @property
-    def n_told(self) -> int:
+    def n_results(self) -> int:
         """Number of solutions in effect."""
         return self._n_updates
 

@@ -30,7 +30,7 @@ from ..results.thinned_recording import (
     typical_error,
 )
 from ..streams.interpolation import DvlColumns, ImuColumns, ReferenceColumns
-from .estimator import Rest
+from .estimator import Residuals
 from .full_fit import JointFit
 from .full_forward_model import deviation_of
 
@@ -147,7 +147,7 @@ class Looked(NamedTuple):
     blocks: int = 0
     registration: Registration | None = None
     configuration: Reason | None = None
-    rest: Rest | None = None
+    residuals: Residuals | None = None
 
 
 class KeptClocks:
@@ -207,19 +207,19 @@ class KeptClocks:
         try:
             found = register(motion, nominal, lever_arm)
             configuration = fitting_configuration(motion, declared, found, self._parameters)
-            rest = self._rest(fit_so_far) if self._is_live and fit_so_far is not None else None
-            return Looked(self._blocks, found, configuration, rest)
+            residuals = self._residuals(fit_so_far) if self._is_live and fit_so_far is not None else None
+            return Looked(self._blocks, found, configuration, residuals)
         except np.linalg.LinAlgError:  # the fit diverged
             return Looked(self._blocks)
 
-    def _rest(self, fit_so_far: FitSoFar) -> Rest:
+    def _residuals(self, fit_so_far: FitSoFar) -> Residuals:
         """Return the residuals of all kept blocks, each corrected by the fit without its fold."""
         recording, p = self._seen.recording(), self._parameters
         stamps_ns = np.round(recording.dvl.times * 1e9).astype(np.int64) + fit_so_far.epoch_ns
         without = [[states[-1]] for states in fit_so_far.fit.without_folds()]
         state = fit_so_far.fit.states[-1]
         terms = [Terms.of_state(state.x) for [state] in without]
-        return Rest(
+        return Residuals(
             fit_so_far.fit.held_out_error(),
             typical_error(recording, Terms.of_state(state.x), p),
             recording.judged(p),
