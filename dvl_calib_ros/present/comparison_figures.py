@@ -23,7 +23,7 @@ _POINT, _MOVED = "#1f6fb2", "#c0392b"
 PANEL_WIDTH, PANEL_HEIGHT = 4.6, 2.3
 PNG_DPI = 160
 # with more calibrations than these the alternative text has only the first and the last
-TOLD = 20
+MOST_LISTED = 20
 
 
 def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONENTS)) -> list[Picture]:
@@ -34,9 +34,9 @@ def trend(comparison: Comparison, components: Collection[int] = range(N_COMPONEN
         known = [each for each in comparison.calibrations if each.shown[at]]
         values_text = ", ".join(
             f"{each.name} {quantity.factor * each.value[at]:+.2f} ± {quantity.factor * each.std[at]:.2f}"
-            for each in (known if len(known) <= TOLD else (known[0], known[-1]))
+            for each in (known if len(known) <= MOST_LISTED else (known[0], known[-1]))
         )
-        values_text += f", and {len(known) - 2} between them" if len(known) > TOLD else ""
+        values_text += f", and {len(known) - 2} between them" if len(known) > MOST_LISTED else ""
         alt = f"{quantity.name} over time, in {quantity.unit}: {values_text}"
         pictures.append(picture(f"{quantity.name.capitalize()}, {quantity.unit}", alt, _panel, comparison, quantity))
     return pictures

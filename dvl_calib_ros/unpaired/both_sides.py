@@ -12,7 +12,7 @@ from ..calibration.models.parameters import Parameters
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.samples import SampleBlock, Stamps
 from ..diagnosis.answer.results import Diagnosis
-from ..diagnosis.answer.simulated_twin import simulated, with_smooth_reference
+from ..diagnosis.answer.simulated_twin import simulated, with_denoised_reference
 from ..diagnosis.diagnose import diagnose_recordings
 from ..diagnosis.model.recorded_streams import RecordedStreams, load_recordings, zeros_while_moving
 from ..diagnosis.model.stream_curve import Curve
@@ -169,7 +169,7 @@ def dithered(recording: RecordedStreams) -> RecordedStreams:
 
 def dvl_residuals(selection: EffectSelection) -> tuple[Array, ...]:
     """Return (N, 3) m/s per recording: recorded minus fitted, DVL frame, with a noise-free reference."""
-    problem = with_smooth_reference(selection.fitter.problem)
+    problem = with_denoised_reference(selection.fitter.problem)
     return tuple(
         recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)
         for index, recording in enumerate(problem.recordings)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..calibration.numerics.frames import Array
 from ..calibration.numerics.robust import robust_std
-from ..diagnosis.answer.simulated_twin import simulated, with_smooth_reference
+from ..diagnosis.answer.simulated_twin import simulated, with_denoised_reference
 from ..diagnosis.fit.cross_validation import fitted_without, stretch_of
 from ..diagnosis.model.forward_model import Problem
 from ..diagnosis.model.hypothesis import Hypothesis, Values, amplitudes, is_time_of_run
@@ -170,11 +170,11 @@ def _held_out(selection: EffectSelection, model: SimulatedModel) -> list[Array]:
     sample_folds = [_fold_of(problem, index) for index in range(n)]
     predicted = [np.full_like(each.dvl.values, np.nan) for each in problem.recordings]
     # at shifted times the reference's noise is different, so it would count twice
-    quiet = with_smooth_reference(problem)
+    denoised = with_denoised_reference(problem)
     for fold, (fitted,) in fitted_without(fitter, [start], fit.noise, bins, fixed):
         for index in range(n):
             at = sample_folds[index] == fold
-            predicted[index][at] = simulated(quiet, fitted.hypothesis, index)[at]
+            predicted[index][at] = simulated(denoised, fitted.hypothesis, index)[at]
     return predicted
 
 
@@ -190,11 +190,11 @@ def _fold_of(problem: Problem, recording: int) -> Array:
 def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Generator) -> list[Array]:
     """Return the slow noise (SIMULATED, N, 3) m/s per recording that simulated reference noise adds to the DVL.
 
-    Fast reference noise is excluded, because `with_smooth_reference` subtracts it.
+    Fast reference noise is excluded, because `with_denoised_reference` subtracts it.
     """
-    quiet = with_smooth_reference(problem)
+    denoised = with_denoised_reference(problem)
     noisy = [
-        with_smooth_reference(
+        with_denoised_reference(
             replace(
                 problem,
                 recordings=tuple(replace(one, reference=one.reference.perturbed(rng)) for one in problem.recordings),
@@ -203,7 +203,7 @@ def _reference_noise(problem: Problem, hypothesis: Hypothesis, rng: np.random.Ge
         for _ in range(SIMULATED)
     ]
     return [
-        np.stack([simulated(each, hypothesis, index) for each in noisy]) - simulated(quiet, hypothesis, index)
+        np.stack([simulated(each, hypothesis, index) for each in noisy]) - simulated(denoised, hypothesis, index)
         for index in range(len(problem.recordings))
     ]
 

@@ -93,7 +93,7 @@ class ClosedGap(Answering):
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """Return the reduction of the gap, the differences found, and those that the best round still has."""
+        """Return the reduction of the gap, the differences found, and the differences that remain in the best round."""
         first, best = self.rounds[0], self.rounds[self.best]
         if len(self.rounds) == 1:
             return (*first.comparison.reasons, finding("SIMULATOR_NO_ROUNDS"))

@@ -106,7 +106,7 @@ CONFIGURATIONS = on_page(
     reject(
         "HEADING_CLOCKWISE",
         "a heading that turns against the angular velocity about z, as a compass counts it (clockwise)",
-        means="An ENU yaw is 0 at east and grows to the left.",
+        means="An ENU yaw is 0 at east and grows counter-clockwise.",
     ),
     reject("RATES_NEGATED", "an angular velocity of the other sign"),
     reject(

@@ -19,7 +19,7 @@ from ..model.hypothesis import Hypothesis, Values
 from ..model.recorded_streams import RecordedStreams
 from ..model.stream_curve import Curve
 from ..search.effect_selection import EffectSelection
-from .simulated_twin import simulated, with_smooth_reference
+from .simulated_twin import simulated, with_denoised_reference
 
 Three = tuple[float, float, float]
 # Parameters of effects that the calibration may already correct; the estimate is added
@@ -119,7 +119,7 @@ def _noise(recordings: Sequence[RecordedStreams], selection: EffectSelection) ->
     The former includes motion too fast for the DVL's rate, bounded by the reported noise if slow. The latter includes
     noise of the reference.
     """
-    problem = with_smooth_reference(selection.fitter.problem)
+    problem = with_denoised_reference(selection.fitter.problem)
     variances = []
     for index, recording in enumerate(recordings):
         residual = recording.dvl.values - simulated(problem, selection.fit.hypothesis, index)

@@ -108,7 +108,7 @@ def _coloured(problem: Problem, fit: Fit) -> NoiseFinding | None:
 def _made_by_comparing(problem: Problem, fit: Fit) -> Noise:
     """Return the noise with the colour that interpolation gives to white noise.
 
-    A stream that is `quiet` between its samples retains only low frequencies of its noise, as slow as the vehicle's
+    A stream that is `denoised` between its samples retains only low frequencies of its noise, as slow as the vehicle's
     motion.
     """
     noise, white = fit.noise, replace(fit, noise=fit.noise.white)

@@ -41,10 +41,10 @@ def twins(selection: EffectSelection) -> tuple[Twin, ...]:
     return tuple(found)
 
 
-def with_smooth_reference(problem: Problem) -> Problem:
+def with_denoised_reference(problem: Problem) -> Problem:
     """Remove the noise of every reference at frequencies without motion."""
-    quiet = tuple(replace(one, reference=one.reference.quiet) for one in problem.recordings)
-    return replace(problem, recordings=quiet)
+    denoised = tuple(replace(one, reference=one.reference.denoised) for one in problem.recordings)
+    return replace(problem, recordings=denoised)
 
 
 def simulated(problem: Problem, hypothesis: Hypothesis, index: int) -> Array:

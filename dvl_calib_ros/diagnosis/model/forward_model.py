@@ -230,7 +230,7 @@ class Problem:
         time = self.grids[recording].true_time(injections) if at is None else at
         reference = time + late(injections, ActsOn.REFERENCE_CLOCK, time)
         by_dvl = self.grids[recording].clock is ActsOn.DVL_CLOCK
-        curve = stream.reference.quiet if by_dvl else stream.reference
+        curve = stream.reference.denoised if by_dvl else stream.reference
         g = curve.kept.at("values", reference, lambda: curve(reference))
         moved = self._moved(hypothesis, recording, time)
         rotation = moved.motion.rotation_enu_from_body

@@ -154,11 +154,11 @@ class RecordedStreams:
         """Return (M, 3) rad/s, body: of the gyroscopes, or of the attitude if these are too slow."""
         rates, attitude = self.rates, self.attitude
         if rates is not None and (attitude is None or rates.interval * SETTINGS.own_rates_from <= 1.0):
-            own = rates.quiet
+            own = rates.denoised
             return np.asarray(own.kept.at("values", at, lambda: own(at)))
         if attitude is None:
             raise ValueError(f"{self.name}: no angular velocity")
-        oriented = attitude.quiet  # 0.01° of noise at 10 Hz is 0.1°/s
+        oriented = attitude.denoised  # 0.01° of noise at 10 Hz is 0.1°/s
 
         def turning() -> Array:
             """Return the angular velocity (M, 3) rad/s from the attitude's derivative."""

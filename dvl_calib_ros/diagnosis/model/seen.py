@@ -71,7 +71,7 @@ def measured_velocity(curve: Curve, at: Array, at_samples: bool) -> tuple[Array,
     def made() -> tuple[Array, Array]:
         """Return velocity and smoothed velocity, which are the same array for a denoised curve."""
         smooth = curve.smooth
-        raw = curve if at_samples else curve.quiet
+        raw = curve if at_samples else curve.denoised
         smoothed = smooth(at)
         return smoothed if raw is smooth else raw(at), smoothed
 

@@ -81,7 +81,7 @@ class Curve:
         return values
 
     @cached_property
-    def quiet(self) -> Curve:
+    def denoised(self) -> Curve:
         """Return the curve without frequencies of pure noise, stretch by stretch.
 
         Noise then is equal between and at samples, and a delay does not gain from it. The sine transform about the line
@@ -101,9 +101,9 @@ class Curve:
 
     @cached_property
     def smooth(self) -> Curve:
-        """Return the curve for regressors: `quiet`, or for a slow stream each sample on a local cubic."""
+        """Return the curve for regressors: `denoised`, or for a slow stream each sample on a local cubic."""
         if self.interval <= FAST_ENOUGH_S or len(self.time) <= SMOOTH_SAMPLES:
-            return self.quiet
+            return self.denoised
         return Curve(self.time, _on_cubics(self.values))
 
     @cached_property

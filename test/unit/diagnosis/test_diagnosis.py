@@ -938,9 +938,9 @@ def test_a_quiet_curve_keeps_the_motion_and_loses_noise(rng):
     true = np.column_stack([np.sin(0.3 * time), np.cos(0.2 * time), 0.0 * time])
     noisy = Curve(time, true + rng.normal(0.0, 0.05, true.shape))
     np.testing.assert_allclose(noisy.roughness, 0.05, rtol=0.1)
-    assert np.std(noisy.quiet.values - true) < 0.5 * 0.05
+    assert np.std(noisy.denoised.values - true) < 0.5 * 0.05
     clean = Curve(time, true)
-    np.testing.assert_allclose(clean.quiet.values, true, atol=1e-3)
+    np.testing.assert_allclose(clean.denoised.values, true, atol=1e-3)
 
 
 def test_whitened_coloured_noise_is_white_and_comes_back(rng):
