@@ -235,10 +235,10 @@ def corrected_document(
 def _difference(compared: ComparedEffect, name: str) -> float:
     """Return vehicle minus simulator for a parameter, averaged over recordings; 0 if one side does not have it."""
 
-    def of(side: Mapping[str, Triple]) -> list[float]:
+    def size_on(side: Mapping[str, Triple]) -> list[float]:
         return [value for key, (value, _, _) in side.items() if key == name or key.startswith(f"{name} of ")]
 
-    vehicle, simulator = of(compared.vehicle), of(compared.simulator)
+    vehicle, simulator = size_on(compared.vehicle), size_on(compared.simulator)
     return sum(vehicle) / len(vehicle) - sum(simulator) / len(simulator) if vehicle and simulator else 0.0
 
 

@@ -158,10 +158,10 @@ def _rate(vehicle: Log, simulator: Log) -> Candidate | None:
 def _jitter(vehicle: Log, simulator: Log) -> Candidate | None:
     """Compare the standard deviation of the steps between stamps, s."""
 
-    def of(log: Log) -> Array:
+    def std_of_steps(log: Log) -> Array:
         return np.concatenate([_blocks(_usual(f.steps), lambda b: np.std(b, axis=1)) for f in log.facts])
 
-    return _compare_times("jitter", of(vehicle), of(simulator), JITTER_S)
+    return _compare_times("jitter", std_of_steps(vehicle), std_of_steps(simulator), JITTER_S)
 
 
 def _usual(steps: Array) -> Array:
@@ -173,10 +173,10 @@ def _usual(steps: Array) -> Array:
 def _latency(vehicle: Log, simulator: Log) -> Candidate | None:
     """Compare the median delay from stamp to log time, s."""
 
-    def of(log: Log) -> Array:
+    def latency_of(log: Log) -> Array:
         return np.concatenate([_blocks(f.latency, lambda b: np.median(b, axis=1)) for f in log.facts])
 
-    return _compare_times("latency", of(vehicle), of(simulator), LATENCY_S)
+    return _compare_times("latency", latency_of(vehicle), latency_of(simulator), LATENCY_S)
 
 
 def _blocks(values: Array, of: Callable[[Array], Array]) -> Array:

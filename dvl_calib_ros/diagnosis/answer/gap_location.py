@@ -42,16 +42,16 @@ class GapPlace:
 def regimes(problem: Problem, seen: Sequence[Seen], per_sample: bool = False) -> dict[str, Mask]:
     """Return (M,) bool each, or (F,) per sample: straight, turning, accelerating, slow or fast (terciles)."""
 
-    def of(function: Callable[[EffectInput], Array]) -> Array:
+    def sampled(function: Callable[[EffectInput], Array]) -> Array:
         if per_sample:
             return np.concatenate([function(each.motion) for each in seen])
         return problem.sampled(seen, function)
 
-    speeds = of(lambda motion: motion.speed)
-    change = of(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
+    speeds = sampled(lambda motion: motion.speed)
+    change = sampled(lambda motion: np.gradient(motion.velocity_body[:, 0], motion.time))
     found = {"accelerating": np.abs(change) > ACCELERATING_MPS2}
     if EffectNeeds.ANGULAR_VELOCITY in problem.available:
-        found["turning"] = np.abs(of(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
+        found["turning"] = np.abs(sampled(lambda motion: motion.turn_rate[:, 2])) > TURNING_RADPS
         found["straight"] = ~found["turning"]
     slow, fast = np.quantile(speeds, [1 / 3, 2 / 3])
     if fast - slow > 0.1 * fast:
