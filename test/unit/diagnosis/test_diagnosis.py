@@ -1105,7 +1105,7 @@ def test_a_stretch_is_left_open_by_no_more_than_what_it_has_beyond_the_noise():
     residuals = HeldOutResiduals(
         after, after, np.ones((6, 1)), np.array([0, 0, 1, 1, 2, 2]), np.array([900.0, 1.0, 0.5, 0.5, 7.0, 0.0])
     )
-    np.testing.assert_allclose(residuals.open_of_blocks(), [6.0, 1.0, 0.0])
+    np.testing.assert_allclose(residuals.undetermined_of_blocks(), [6.0, 1.0, 0.0])
 
 
 def test_what_is_left_beyond_all_doubt_is_told_by_what_explains_it():
