@@ -8,6 +8,7 @@ Its likelihood is that of the residual of DVL and reference, see `frame_hypothes
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -59,6 +60,8 @@ MOUNTING_OTHER, MOUNTING_TURNED, UPSIDE_DOWN = math.log(1 / 50), math.log(1 / 3)
 BASE_Z_DOWN, UNPLACED_BASE_Z_DOWN = math.log(1 / 50), math.log(1 / 500)
 REFERENCE_FRAME_OTHER = math.log(1 / 200)
 REFERENCE_AXES_OTHER = math.log(1 / 50)
+# a twist in the axes of REP-103 though the vehicle is z down
+TWIST_IN_ROS_AXES = math.log(1 / 3)
 # a reference without a declared frame: ENU, the body, NED; other worlds
 UNDECLARED = {"enu": 0.0, "ned": math.log(1 / 3)} | dict.fromkeys(("body", FLU, FRD), math.log(1 / 2))
 OTHER_WORLD = math.log(1 / 50)
@@ -78,6 +81,9 @@ ARM_STD_M, MOST_OF_ARM = 0.1, 12.0
 OVER = -0.9
 # smallest rotation (rad) of a mounting that differs from the body's axes
 TURNED_FROM = math.radians(12.0)
+# what a parameter is about, and words for its values, in the question which of two readings is right
+ASKED = {"base_axes": "base_link", "dvl_axes": "the DVL", "gnss_frame": "the reference", "imu_frame": "the IMU's world"}
+AXES = {FLU: "forward-left-up", FRD: "forward-right-down"}
 # interval (s) over which a twist is compared with the motion of its own pose
 POSE_STEP_S, POSE_LONGEST_S = 0.5, 1.5
 
@@ -243,7 +249,8 @@ class FrameChooser:
             priors = {name: UNDECLARED.get(name, OTHER_WORLD) for name in names}
         else:
             of_body = declared.frame is VelocityFrame.BODY
-            other = dict.fromkeys(("body", turned), REFERENCE_AXES_OTHER) if of_body else {}
+            of_turned = TWIST_IN_ROS_AXES if z_down else REFERENCE_AXES_OTHER
+            other = {"body": REFERENCE_AXES_OTHER, turned: of_turned} if of_body else {}
             priors = {name: other.get(name, REFERENCE_FRAME_OTHER) for name in names} | {declared.name: 0.0}
         shown = twist_axes(reference)
         if shown is not None:
@@ -332,15 +339,9 @@ class FrameChooser:
             other_axes = any(one[name] != other[name] for name in ("dvl_axes", "base_axes"))
             # in which the IMU's frame affects only the lever arm
             in_body = best.reading.in_body and rival.reading.in_body
-            if other_axes or (
-                not in_body
-                and angle_between(fits[best].rotation_dvl_from_body, fits[rival].rotation_dvl_from_body) > SAME_ANSWER
-            ):
-                taken, instead = (
-                    " and ".join(f"{name} {this[name]}" for name in this if one[name] != other[name]) or "the mounting"
-                    for this in (one, other)
-                )
-                reasons += (finding("FRAMES_AMBIGUOUS", taken=taken, other=instead),)
+            turns = [fits[each].rotation_dvl_from_body for each in (best, rival)]
+            if other_axes or (not in_body and angle_between(*turns) > SAME_ANSWER):
+                reasons += (_ambiguous(one, other, turns),)
                 break
         turn = fits[best].rotation_dvl_from_body
         if (
@@ -361,6 +362,21 @@ class FrameChooser:
             "dvl_axes": FRD if reading.turned != z_down else FLU,
             "imu_frame": IMU_ENU if imu is None else imu.frame.world,
         }
+
+
+def _ambiguous(taken: dict[str, str], other: dict[str, str], turns: Sequence[Array]) -> Reason:
+    """Return the finding of two readings, as values of parameters, with the question that decides between them.
+
+    turns: rotation_dvl_from_body (3, 3) of each, which are named if nothing else differs.
+    """
+    differing = [name for name in taken if taken[name] != other[name]]
+    if not differing:
+        differing = ["mounting_rpy"]
+        taken, other = ({"mounting_rpy": as_option(nominal_rpy(turn.T))} for turn in turns)
+    said = [" and ".join(f"{name} {these[name]}" for name in differing) for these in (taken, other)]
+    asked, value = differing[0], other[differing[0]]
+    fields = {"what": ASKED.get(asked, "the mounting"), "axes": AXES.get(value, value), "parameter": asked, "value": value}
+    return finding("FRAMES_AMBIGUOUS", taken=said[0], other=said[1], first=taken[asked], **fields)
 
 
 def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None) -> Reason:

@@ -252,7 +252,7 @@ CONFIGURATIONS = on_page(
     marginal(
         "FRAMES_AMBIGUOUS",
         "the data fit {taken} and {other} equally well; the first is used",
-        remedy="which side is port on the DVL, and which axes has the reference? Set the one that is right",
+        remedy="is {what} {axes}? If so, set {parameter} to {value}; if not, set it to {first}",
     ),
     reject("TWO_CONTRADICTIONS", "{one}; {other}"),
 )
