@@ -237,10 +237,12 @@ def wrong_axes(
     _, signs, near = min(found, key=lambda each: each[0])
     fit = MotionFit(_signed(motion, signs), lever_arm, curves.signed(signs), MOST_ROWS)
     fitted = fit(0.0, near.dvl_delay_s, nominal, (REFERENCE,))
-    if fitted is None or fitted.level > most:
+    if fitted is None:
         return None
-    factors, std = fit.axis_factors(fitted, nominal)
+    factors, std, level = fit.axis_factors(fitted, nominal)
     is_shown, is_turned = factors > Z_REPEATED_TEST * std, signs < 0.0
+    if (fitted.level if is_turned.any() else level) > most:
+        return None
     if is_turned[ahead]:  # a mounting unless all signs are observable
         axis = "each of x, y and z" if is_turned.all() else "xyz"[ahead]
         return finding("DVL_LEFT_HANDED", axis=axis, alike="") if is_shown.all() else None

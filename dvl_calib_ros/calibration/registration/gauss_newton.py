@@ -134,10 +134,14 @@ class Fitted(NamedTuple):
 
 
 class AxisFactors(NamedTuple):
-    """Scale factors (3,) of the DVL's axes relative to the fit, and their σ (3,); 1 is right."""
+    """Scale factors (3,) of the DVL's axes relative to the fit, and their σ (3,); 1 is right.
+
+    level: residual with the factors, m/s per axis.
+    """
 
     factors: Array
     std: Array
+    level: float
 
 
 class _Rows(NamedTuple):
@@ -246,7 +250,7 @@ class MotionFit:
         """
         rows, rotation = self._rows(fitted.x, fitted.rotation_body_from_dvl, None), fitted.rotation_body_from_dvl
         if rows is None:
-            return AxisFactors(np.ones(3), np.full(3, np.inf))
+            return AxisFactors(np.ones(3), np.full(3, np.inf), fitted.level)
         axes = rows.residual.shape[1]
         weight = 1.0 / (1.0 + squared(rows.residual) / (HALF_AT**2 * axes * fitted.level**2))
         own = self._axes_of_dvl(fitted, rows, rotation)
@@ -263,7 +267,7 @@ class MotionFit:
         # residuals that the factors explain are no noise
         share = float((w * left**2).sum() / max((w * rows.residual.ravel() ** 2).sum(), 1e-30))
         std = np.sqrt(np.diag(np.linalg.inv(information)) * share)[:3] * fitted.inflation
-        return AxisFactors(1.0 + found[:3], std)
+        return AxisFactors(1.0 + found[:3], std, fitted.level * math.sqrt(share))
 
     def _axes_of_dvl(self, fitted: Fitted, rows: _Rows, rotation: Array) -> Array:
         """Return the derivative (J, A, 3) m/s of the residuals with respect to the axis factors."""
