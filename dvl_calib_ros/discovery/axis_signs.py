@@ -14,10 +14,10 @@ import numpy as np
 
 from ..calibration.models.parameters import FLU, FRD, Parameters
 from ..calibration.numerics.block_covariance import student_factor
-from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
 from ..calibration.numerics.robust import robust_std
 from ..calibration.numerics.tests import Z_ONE_TEST
-from ..calibration.registration.configuration_check import Directions
+from ..calibration.registration.configuration_check import Directions, angle_between
 from ..calibration.registration.frame_hypotheses import ImuFrame
 from ..calibration.streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..messages.decode import turns_dvl
@@ -26,7 +26,7 @@ from ..recordings.topic_preview import Survey
 from ..recordings.topics import Topics
 from ..verdict.reasons import Reason, finding
 from .clock_offsets import imu_columns_of
-from .discovery import in_time_of
+from .discovery import as_option, in_time_of
 from .frame_choice import SAME_ANSWER
 
 # Interval over which the speed ahead changes in a turn, s: longer than waves, shorter than a change of throttle.
@@ -98,14 +98,20 @@ def sway_sign(times: Array, velocity: Array, imu: ImuColumns) -> SwaySign | None
     return SwaySign(float(slopes[0]), std, number)
 
 
-def sign_findings(recordings: Sequence[Survey], topics: Topics, parameters: Parameters) -> Iterator[Reason]:
-    """Yield the finding of axes of the earth, of an inverted sway, or of each open sign that changes the mounting."""
+def sign_findings(
+    recordings: Sequence[Survey], topics: Topics, parameters: Parameters, axes_are_given: bool
+) -> Iterator[Reason]:
+    """Yield the finding of axes of the earth, of an inverted sway, or of each open sign that changes the mounting.
+
+    axes_are_given: the user has set dvl_axes, which confirms all signs.
+    """
     seen = [(one.looks[topics.dvl], one.looks.get(topics.imu)) for one in recordings if topics.dvl in one.looks]
     if not seen:
         return
     first = seen[0][0]
     is_turned = turns_dvl(VELOCITY_TYPES[first.msgtype], first.frame_id, parameters)
-    body_from_message = parameters.rotation_dvl_from_body.T @ (FLU_FROM_FRD if is_turned else np.eye(3))
+    turn = FLU_FROM_FRD if is_turned else np.eye(3)
+    body_from_message = parameters.rotation_dvl_from_body.T @ turn
     frame = ImuFrame(rotation_from_rpy(parameters.imu_rpy), parameters.imu_frame, "")
     each, directions = [], Directions()
     for dvl, imu in seen:
@@ -128,17 +134,32 @@ def sign_findings(recordings: Sequence[Survey], topics: Topics, parameters: Para
         axes = FLU if is_turned != parameters.is_z_down else FRD
         yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=axes)
         return
-    for axis in range(3):
-        other = body_from_message @ (mean * np.where(np.arange(3) == axis, -1.0, 1.0))
-        change = _angle(given, other)
-        if change < SAME_ANSWER or _angle(other, straight) > LIKELY:
-            continue
-        row = 1 + int(np.argmax(np.abs(given - other)[1:]))
-        if row == 1 and signs:
-            continue
-        is_positive = bool(body_from_message[row, axis] > 0.0) != parameters.is_z_down
-        fields = {"axis": "xyz"[axis], "angle": ("", "yaw", "pitch")[row], "degrees": math.degrees(change)}
-        yield finding("DVL_SIGN_OPEN", **fields, way=WAYS[row][is_positive])
+    if axes_are_given:
+        return
+    asked = {1} if signs else set()
+    flips = 1.0 - 2.0 * np.eye(3)
+
+    def question(axis: int, row: int, effect: str, also: str = "") -> Reason:
+        asked.add(row)
+        way = WAYS[row][bool(body_from_message[row, axis] > 0.0) != parameters.is_z_down]
+        axes = FRD if is_turned != parameters.is_z_down else FLU
+        return finding("DVL_SIGN_OPEN", axis="xyz"[axis], effect=effect, way=way, axes=axes, also=also)
+
+    with_mounting_kept = []
+    for axis, flip in enumerate(flips):
+        other = body_from_message @ (mean * flip)
+        change, row = _angle(given, other), 1 + int(np.argmax(np.abs(given - other)[1:]))
+        if row not in asked and change >= SAME_ANSWER and _angle(other, straight) <= LIKELY:
+            effect = f"the {('yaw', 'pitch')[row - 1]} changes by {math.degrees(change):.1f}°"
+            with_mounting_kept.append(question(axis, row, effect))
+    for row in {1, 2} - asked:  # with the mounting mirrored as well, the data fit as they do
+        each = [flips[row][:, None] * body_from_message * flip for flip in flips]
+        angles = [angle_between(body_from_message, mirrored) for mirrored in each]
+        axis = min(range(3), key=lambda axis: (round(angles[axis], 6), axis != row))
+        if angles[axis] >= SAME_ANSWER:
+            mounting = as_option(rpy_from_rotation(each[axis] @ turn) + 0.0)
+            yield question(axis, row, f"mounting_rpy {mounting} fits", f" and try -p mounting_rpy:={mounting}")
+    yield from with_mounting_kept
 
 
 def _angle(a: Array, b: Array) -> float:

@@ -80,7 +80,8 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
     named = given or Given()
     found = _Search(recording.survey, parameters, named, recording.where).run()
     if found.topics.gnss not in recording.types and not found.contradictions:
-        signs = sign_findings([one.whole(found.topics) for one in recording.each], found.topics, found.parameters)
+        each, given = [one.whole(found.topics) for one in recording.each], "dvl_axes" in named.parameters
+        signs = sign_findings(each, found.topics, found.parameters, given)
         return replace(found, contradictions=tuple(signs))
     clocks = clocks_of_recording(recording, found, named)
     if clocks is None:

@@ -373,7 +373,7 @@ def _ambiguous(taken: dict[str, str], other: dict[str, str], turns: Sequence[Arr
     if not differing:
         differing = ["mounting_rpy"]
         taken, other = ({"mounting_rpy": as_option(nominal_rpy(turn.T))} for turn in turns)
-    said = [" and ".join(f"{name} {these[name]}" for name in differing) for these in (taken, other)]
+    said = [" with ".join(f"{name} {these[name]}" for name in differing) for these in (taken, other)]
     asked, value = differing[0], other[differing[0]]
     asking = {"what": ASKED.get(asked, "the mounting"), "axes": AXES.get(value, value), "parameter": asked}
     return finding("FRAMES_AMBIGUOUS", taken=said[0], other=said[1], first=taken[asked], value=value, **asking)

@@ -53,9 +53,11 @@ CONFIGURATIONS = on_page(
     ),
     marginal(
         "DVL_SIGN_OPEN",
-        "without a reference the sign of the DVL's {axis} is not observable: negated, the {angle} changes by "
-        "{degrees:.1f}°",
-        remedy="is the DVL's {axis} positive when the vehicle moves {way}? If not, negate it in the DVL's driver",
+        "without a reference the sign of the DVL's {axis} is not observable: negated, {effect}",
+        remedy=(
+            "is the DVL's {axis} positive when the vehicle moves {way}? If so, set dvl_axes to {axes}; if not, negate "
+            "it in the DVL's driver{also}"
+        ),
     ),
     reject(
         "DVL_AXIS_SCALED",

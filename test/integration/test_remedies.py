@@ -167,6 +167,7 @@ FAULTS = {
 # codes whose remedy another module executes
 ELSEWHERE = {
     "DVL_SIDE_INVERTED": "unit/discovery/test_axis_signs.py",
+    "DVL_SIGN_OPEN": "unit/discovery/test_axis_signs.py",
     "GRAVITY_UPSIDE_DOWN": "unit/node/test_gravity_seen.py",
     "BAGS_OVERLAP": "integration/test_several_bags.py",
     "FRAMES_AMBIGUOUS": "integration/test_frame_choice.py",
@@ -176,7 +177,7 @@ ELSEWHERE = {
 # codes whose remedy no test executes: more data, another instrument, a question, or a pointer to a command
 OPEN = {
     "BAGS_DELAY_CHANGED", "BODY_OR_EARTH", "CLOCKS_NOT_TOLD_APART", "DELAY_CHANGED", "DRIFT_OPEN", "DRIFT_WORSE",
-    "DVL_AXIS_SCALED", "DVL_SIGN_OPEN", "GAP_REFERENCE_CONSTANT", "GAP_REFERENCE_VERTICAL", "GAP_TOO_SHORT",
+    "DVL_AXIS_SCALED", "GAP_REFERENCE_CONSTANT", "GAP_REFERENCE_VERTICAL", "GAP_TOO_SHORT",
     "HELD_OUT_SEVERAL_TIMES", "IMU_CONTRADICTS_EITHER", "MOUNTING_SUSPECTED", "MOUNTING_SUSPICIOUS",
     "NOTHING_COMPARED", "SCALE_CHANGED",
 }  # fmt: skip
