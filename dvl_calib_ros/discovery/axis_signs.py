@@ -153,11 +153,11 @@ def sign_findings(
             effect = f"the {('yaw', 'pitch')[row - 1]} changes by {math.degrees(change):.1f}°"
             with_mounting_kept.append(question(axis, row, effect))
     for row in {1, 2} - asked:  # with the mounting mirrored as well, the data fit as they do
-        each = [flips[row][:, None] * body_from_message * flip for flip in flips]
-        angles = [angle_between(body_from_message, mirrored) for mirrored in each]
+        mirrored = [flips[row][:, None] * body_from_message * flip for flip in flips]
+        angles = [angle_between(body_from_message, one) for one in mirrored]
         axis = min(range(3), key=lambda axis: (round(angles[axis], 6), axis != row))
         if angles[axis] >= SAME_ANSWER:
-            mounting = as_option(rpy_from_rotation(each[axis] @ turn) + 0.0)
+            mounting = as_option(rpy_from_rotation(mirrored[axis] @ turn) + 0.0)
             yield question(axis, row, f"mounting_rpy {mounting} fits", f" and try -p mounting_rpy:={mounting}")
     yield from with_mounting_kept
 

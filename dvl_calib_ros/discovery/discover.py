@@ -80,8 +80,8 @@ def discover(recording: Recording | Sequence[Path], parameters: Parameters, give
     named = given or Given()
     found = _Search(recording.survey, parameters, named, recording.where).run()
     if found.topics.gnss not in recording.types and not found.contradictions:
-        each, given = [one.whole(found.topics) for one in recording.each], "dvl_axes" in named.parameters
-        signs = sign_findings(each, found.topics, found.parameters, given)
+        seen_whole = [one.whole(found.topics) for one in recording.each]
+        signs = sign_findings(seen_whole, found.topics, found.parameters, "dvl_axes" in named.parameters)
         return replace(found, contradictions=tuple(signs))
     clocks = clocks_of_recording(recording, found, named)
     if clocks is None:

@@ -339,9 +339,9 @@ class FrameChooser:
             other_axes = any(one[name] != other[name] for name in ("dvl_axes", "base_axes"))
             # in which the IMU's frame affects only the lever arm
             in_body = best.reading.in_body and rival.reading.in_body
-            turns = [fits[each].rotation_dvl_from_body for each in (best, rival)]
-            if other_axes or (not in_body and angle_between(*turns) > SAME_ANSWER):
-                reasons += (_ambiguous(one, other, turns),)
+            fitted = [fits[each].rotation_dvl_from_body for each in (best, rival)]
+            if other_axes or (not in_body and angle_between(*fitted) > SAME_ANSWER):
+                reasons += (_ambiguous(one, other, fitted),)
                 break
         turn = fits[best].rotation_dvl_from_body
         if (
