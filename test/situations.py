@@ -86,16 +86,27 @@ def stamps_a_minute_and_a_half_ahead(told: Told, wrong: bool) -> None:
             message.header.stamp.sec += 90
 
 
-def one_beam_low(told: Told, wrong: bool) -> None:
-    """One of four beams at 30 degrees reads 15 % low."""
-    sound(told)
+def beam_low(told: Told, by: float) -> None:
+    """Lower the reading of one of four beams at 30 degrees by a share."""
     around = np.radians([45.0, 135.0, 225.0, 315.0])
     beams = np.column_stack([0.5 * np.cos(around), 0.5 * np.sin(around), np.full(4, -math.sqrt(0.75))])
     solved = np.linalg.pinv(beams)
     for _, topic, _, message in told.rows:
-        if wrong and topic == DVL:
+        if topic == DVL:
             v = message.twist.twist.linear
-            v.x, v.y, v.z = (solved @ (beams @ [v.x, v.y, v.z] * [1.0, 0.85, 1.0, 1.0])).tolist()
+            v.x, v.y, v.z = (solved @ (beams @ [v.x, v.y, v.z] * [1.0, 1.0 - by, 1.0, 1.0])).tolist()
+
+
+def one_beam_low(told: Told, wrong: bool) -> None:
+    """One beam reads 15 % low."""
+    sound(told)
+    beam_low(told, 0.15 * wrong)
+
+
+def one_beam_low_at_5_degrees(told: Told, wrong: bool) -> None:
+    """One beam reads 10 % low, of a DVL whose yaw of 5 degrees nothing says."""
+    sound(told, yaw=math.radians(5.0))
+    beam_low(told, 0.1 * wrong)
 
 
 def quaternion_components_mixed_up(told: Told, wrong: bool) -> None:
@@ -287,6 +298,9 @@ SITUATIONS = {
         told_by(one_axis_negated, long_motion), "DVL_LEFT_HANDED", "negate z in the DVL's driver"
     ),
     "one beam low": Situation(told_by(one_beam_low, long_motion), "BEAM_OFF", "at 135°"),
+    "one beam low, which looks like a misalignment": Situation(
+        told_by(one_beam_low_at_5_degrees, long_motion), "BEAM_OFF", "at 180°", yaw_deg=5.0, verdicts=("reject",)
+    ),
     "quaternion components mixed up": Situation(
         told_by(quaternion_components_mixed_up), "GRAVITY_LEANS", "check the IMU's mounting in its driver"
     ),

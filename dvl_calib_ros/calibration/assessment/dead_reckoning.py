@@ -391,14 +391,13 @@ def doubts(
         found.append(heading_warnings(navigation.deviation).weighed(severity_of(navigation.deviation, estimate)))
     if in_earth and bed is None:
         found += one_heading_warnings(estimate, parameters, navigation.speed)
-    # the first-order model of a misalignment makes a velocity longer, which looks like one beam
-    is_large = float(np.linalg.norm(estimate.state[:3])) > parameters.reject_misalignment
     return found + residual_warnings(
         navigation.followed,
         are_positions(parameters),
         reference_lag_s(estimate, parameters),
         is_insignificant(estimate),
         confused_with_bias_std(estimate, parameters),
-        None if is_large else navigation.beam,
+        navigation.beam,
         ACCEPTED_DRIFT * parameters.target_drift / KM,
+        float(estimate.state[:3] @ estimate.state[:3]),
     )

@@ -293,12 +293,14 @@ def residual_warnings(
     mounting_std: Sequence[float] | Array = (0.0, 0.0, 0.0),
     beam: BeamFault | None = None,
     accepted: float = 0.01,
+    second_order: float = 0.0,
 ) -> list[Reason]:
     """Return the reasons from the residual, weighed by their effect on the verdict.
 
     of_positions: the reference's velocities are position differences, smoothed by their interval. lag_s, finds_nothing,
     mounting_std: see `reference_lag_s`, `is_insignificant`, `confused_with_bias_std`. accepted: error of the mounting
     (rad, or share of the distance) that does not reject a calibration; nor does an error within its own 95 % interval.
+    second_order: square of the misalignment, rad²: the error of its first-order model, which looks like a beam.
     """
     if found is None:
         return []
@@ -334,7 +336,7 @@ def residual_warnings(
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
         reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(severity))
     if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
-        reasons += beam_warning(beam, accepted)
+        reasons += beam_warning(beam, accepted + second_order)
     magnitude = np.abs(found.bias)
     shown = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
     if shown.any():
