@@ -326,7 +326,7 @@ SITUATIONS = {
     "yaw that no drawing has": Situation(
         yaw_other_than_said(37.0),
         "MOUNTING_CONTRADICTED",
-        "try -p mounting_rpy:=[0deg,0deg,",
+        ": try -p mounting_rpy:=[0deg,0deg,",
         yaw_deg=37.0,
         verdicts=NOISY,
     ),

@@ -350,7 +350,9 @@ class FrameChooser:
             and not readings.are_axes_mirrored(best.reading, turn, mounting)
         ):
             imu = None if best.reading.in_body else imus[best.reading]
-            reasons += (_mounting_contradicted(mounting.T, turn.T, imu),)
+            mean = self._dvl.values[np.isfinite(self._dvl.values).all(axis=1)].mean(axis=0)
+            travel = FLU_FROM_FRD @ mean if best.reading.turned else mean
+            reasons += (_mounting_contradicted(mounting.T, turn.T, imu, travel),)
         return FrameChoice(best.agreement, imus[best.reading], reasons)
 
     def _options(self, reading: Reading, imu: ImuHypothesis | None) -> dict[str, str]:
@@ -379,10 +381,11 @@ def _ambiguous(taken: dict[str, str], other: dict[str, str], turns: Sequence[Arr
     return finding("FRAMES_AMBIGUOUS", taken=said[0], other=said[1], first=taken[asked], value=value, **asking)
 
 
-def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None) -> Reason:
+def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None, travel: Array) -> Reason:
     """Return the finding of another mounting; its remedy names what looks the same.
 
     given, found: (3, 3) rotation_body_from_dvl. imu: by which the reference is turned into the body, None for none.
+    travel: (3,) m/s, mean velocity in the DVL. It is ahead with `given` if the heading is wrong, else with `found`.
     """
     rpy, fitting = rpy_from_rotation(given), nominal_rpy(found)
     first = also = ""
@@ -390,9 +393,11 @@ def _mounting_contradicted(given: Array, found: Array, imu: ImuHypothesis | None
     is_drawn = abs(math.remainder(about_z, DRAWN)) < MEANT_WITHIN[2]
     if imu is not None and not is_drawn and np.allclose(fitting[:2], rpy[:2], atol=MEANT_WITHIN[0]):
         offset = math.degrees(imu.frame.heading_offset + math.remainder(-about_z if imu.z_down else about_z, math.tau))
-        first = (
-            f"set the declination of the compass, here -p heading_offset:={offset:.4g}deg; if the heading is right, "
-        )
+        declination = f"set the declination of the compass, here -p heading_offset:={offset:.4g}deg"
+        if (given @ travel)[0] > (found @ travel)[0]:
+            first = f"{declination}; if the heading is right, "
+        else:
+            also = f"; if the mounting is right, {declination}"
     shares = np.diag(given.T @ found)
     if np.abs(shares).min() > math.cos(TURNED_FROM):  # a half turn
         negated = " and ".join(axis for axis, share in zip("xyz", shares, strict=True) if share < 0.0)
