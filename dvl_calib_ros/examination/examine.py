@@ -167,7 +167,8 @@ def examine(recording: Recording | Sequence[Path], parameters: Parameters, given
     if replayed is not None:
         discovery = discovery.with_mounting(replayed.result.parameters["mounting_rpy"])
     reasons = () if verification is None else tuple(verification.reasons)
-    findings = [each for each in findings if each.numbers.get("says") not in reasons]  # said once
+    said = set(map(str, reasons))
+    findings = [each for each in findings if str(each.numbers.get("says")) not in said]  # said once
     judged = Severity.REJECT if verification is None else verification.verdict
     if judged is not Severity.REJECT:  # the replay is usable, so no finding prevents a calibration
         findings = [each.weighed(Severity.WARNING) if _has_error([each]) else each for each in findings]

@@ -136,36 +136,36 @@ CONFIGURATIONS = on_page(
         "an angular velocity whose axes are rotated by {degrees:.0f}° from the attitude's",
         means="Two instruments in one message, or one is corrected for its mounting alone.",
     ),
-    # gravity
-    reject(
+    # gravity; alone it rejects no calibration, as no calibration uses the acceleration
+    accept(
         "GRAVITY_SIGN",
         "{topic}: the IMU's acceleration at rest points down, as gravity with the other sign",
         remedy="correct the IMU's driver",
     ),
-    reject(
+    accept(
         "GRAVITY_UPSIDE_DOWN",
         "{topic}: gravity is upside down in the {where}",
         means="The IMU is upside down, or axes and orientation follow two conventions.",
         remedy="set {parameter} to {value}",
     ),
-    reject(
+    accept(
         "GRAVITY_FITS_INVERTED",
         "{topic}: the IMU's orientation looks inverted: gravity is {given:.1f}° from up, and {inverted:.1f}° with the "
         "quaternion inverted",
         remedy="correct the IMU's driver",
     ),
-    reject(
+    accept(
         "GRAVITY_LEANS",
         "{topic}: gravity is {degrees:.0f}° from up by the IMU's own orientation",
         remedy="check the IMU's mounting in its driver",
     ),
-    reject(
+    accept(
         "GRAVITY_IN_G",
         "{topic}: the IMU's acceleration at rest is 1 g and not 9.81 m/s²",
         means="Check the angular velocity too.",
         remedy="let the driver send SI units",
     ),
-    reject(
+    accept(
         "GRAVITY_SIZE",
         "{topic}: the IMU's acceleration at rest is {size:.3g} m/s², which is not gravity",
         means="Gravity is subtracted, or the units are wrong.",
@@ -215,7 +215,7 @@ CONFIGURATIONS = on_page(
         remedy="set that clock; use the recording times for this bag: --restamp log",
     ),
     # declarations of a recording
-    reject(
+    accept(
         "DVL_FRAME_NOT_OWN",
         "{topic}: the DVL's messages carry frame {frame!r} and not one of the DVL's own; the data are used unchanged",
         means="The driver may have rotated the velocity into that frame.",
@@ -227,7 +227,7 @@ CONFIGURATIONS = on_page(
         means="Without an attitude that changes, both fit.",
         remedy="set gnss_frame",
     ),
-    reject(
+    accept(
         "REFERENCE_FRAME_OTHER",
         "{topic}: frame {frame!r} says {declared}, but DVL and reference agree only as {taken}, which is used",
         means="A gnss_frame that is given is not questioned.",
