@@ -152,7 +152,7 @@ def _check_header(path: Path, header: list[str], unit: str) -> None:
     if len(header) != N_COLUMNS:
         names = ", ".join(cell.strip() for cell in header)[:SHOWN]
         raise InputError(
-            f"{path}: has {len(header)} columns, expected {EXPECTED}; of a DVL's table name them with --columns "
+            f"{path}: has {len(header)} columns, expected {EXPECTED}; of a DVL's table name all four with --columns "
             f"time=NAME,vx=NAME,vy=NAME,vz=NAME; there are {names}"
         )
     units = [re.search(r"[\[(](.*)[\])]", cell) for cell in header]
@@ -359,6 +359,8 @@ def column_map(text: str) -> Mapping[str, str]:
     unknown = [key for key in found if key not in _KEYS]
     if missing or unknown:
         what = f"{unknown[0]!r} is none of {', '.join(_KEYS)}" if unknown else f"{missing[0]} is missing"
+        if missing == ["vz"] and not unknown:
+            what += ", and two velocities show no mounting: import the DVL's own log, or log the vertical one as well"
         raise InputError(f"--columns: {what}; write time=NAME,vx=NAME,vy=NAME,vz=NAME,valid=NAME")
     return found
 
