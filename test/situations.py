@@ -364,7 +364,12 @@ SITUATIONS = {
     ),
     "stamps an hour ahead": Situation(told_by(stamps_an_hour_ahead), "CLOCKS_APART", "--restamp log"),
     "alignment of an RDI": Situation(lambda path, _: ensembles(path, -45.0), yaw_deg=-45.0, verdicts=NOISY),
-    "moving bed": Situation(lambda path, _: ensembles(path, bed_mps=np.array(BED_MPS)), verdicts=(*NOISY, "reject")),
+    "moving bed": Situation(
+        lambda path, wrong: ensembles(path, bed_mps=np.array(BED_MPS) * wrong),
+        "BED_MOVES",
+        "121 mm/s faster than the DVL towards 56°",
+        verdicts=NOISY,
+    ),
     "text of a DVL": Situation(lambda path, _: lines(path), verdicts=NOISY),
     "antenna on a mast": Situation(told_by(antenna_on_a_mast, long_motion), verdicts=NOISY),
     "fixes around a dive": Situation(told_by(fixes_around_a_dive, long_motion), verdicts=NOISY),
