@@ -14,11 +14,11 @@ import numpy as np
 
 from ..calibration.models.parameters import FLU, FRD, Parameters
 from ..calibration.numerics.block_covariance import student_factor
-from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy, rpy_from_rotation
+from ..calibration.numerics.frames import FLU_FROM_FRD, Array, rotation_from_rpy
 from ..calibration.numerics.robust import robust_std
 from ..calibration.numerics.tests import Z_ONE_TEST
 from ..calibration.registration.configuration_check import Directions, angle_between
-from ..calibration.registration.frame_hypotheses import ImuFrame
+from ..calibration.registration.frame_hypotheses import ImuFrame, least_turn, nominal_rpy
 from ..calibration.streams.interpolation import ImuColumns, TurnRates, angular_velocity_at, attitude_at
 from ..messages.decode import turns_dvl
 from ..messages.drivers import VELOCITY_TYPES
@@ -130,36 +130,27 @@ def sign_findings(
     if _angle(given, straight) > LIKELY:
         return  # no vehicle that travels ahead
     signs = [one for one in each if one is not None and one.sign]
+    axes, other = (FRD, FLU) if is_turned != parameters.is_z_down else (FLU, FRD)
     if signs and all(one.sign < 0 for one in signs):
-        axes = FLU if is_turned != parameters.is_z_down else FRD
-        yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=axes)
+        yield finding("DVL_SIDE_INVERTED", slope=signs[0].slope, std=signs[0].std, axes=other)
         return
     if axes_are_given:
         return
-    asked = {1} if signs else set()
-    flips = 1.0 - 2.0 * np.eye(3)
-
-    def question(axis: int, row: int, effect: str, also: str = "") -> Reason:
-        asked.add(row)
+    fitted, flips = least_turn(given, straight) @ body_from_message, 1.0 - 2.0 * np.eye(3)
+    for row in (2,) if signs else (1, 2):
+        # the axis most along this row of the body; negated, the mirrored mounting fits as well
+        along = np.abs(body_from_message[row]).round(6)
+        axis = max(range(3), key=lambda each: (along[each], each == row))
+        mirrored = flips[row][:, None] * fitted * flips[axis]
+        change, also = angle_between(fitted, mirrored), ""
+        if change < SAME_ANSWER:
+            continue
+        effect = f"the {('yaw', 'pitch')[row - 1]} changes by {math.degrees(change):.1f}°"
+        if angle_between(mirrored, body_from_message) > LIKELY:
+            mounting = as_option(nominal_rpy(mirrored @ turn))
+            effect, also = f"mounting_rpy {mounting} fits", f" and try -p mounting_rpy:={mounting}"
         way = WAYS[row][bool(body_from_message[row, axis] > 0.0) != parameters.is_z_down]
-        axes = FRD if is_turned != parameters.is_z_down else FLU
-        return finding("DVL_SIGN_OPEN", axis="xyz"[axis], effect=effect, way=way, axes=axes, also=also)
-
-    with_mounting_kept = []
-    for axis, flip in enumerate(flips):
-        other = body_from_message @ (mean * flip)
-        change, row = _angle(given, other), 1 + int(np.argmax(np.abs(given - other)[1:]))
-        if row not in asked and change >= SAME_ANSWER and _angle(other, straight) <= LIKELY:
-            effect = f"the {('yaw', 'pitch')[row - 1]} changes by {math.degrees(change):.1f}°"
-            with_mounting_kept.append(question(axis, row, effect))
-    for row in {1, 2} - asked:  # with the mounting mirrored as well, the data fit as they do
-        mirrored = [flips[row][:, None] * body_from_message * flip for flip in flips]
-        angles = [angle_between(body_from_message, one) for one in mirrored]
-        axis = min(range(3), key=lambda axis: (round(angles[axis], 6), axis != row))
-        if angles[axis] >= SAME_ANSWER:
-            mounting = as_option(rpy_from_rotation(mirrored[axis] @ turn) + 0.0)
-            yield question(axis, row, f"mounting_rpy {mounting} fits", f" and try -p mounting_rpy:={mounting}")
-    yield from with_mounting_kept
+        yield finding("DVL_SIGN_OPEN", axis="xyz"[axis], effect=effect, way=way, axes=axes, also=also)
 
 
 def _angle(a: Array, b: Array) -> float:

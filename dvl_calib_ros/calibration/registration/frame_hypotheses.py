@@ -260,7 +260,7 @@ class Readings:
     def without_roll(self, found: Agreement, rotation_dvl_from_body: Array) -> Array:
         """Return a rotation (3, 3) without roll about the direction of travel, unless the data need it."""
         travel = (self._dvl @ FLU_FROM_FRD if found.reading.turned else self._dvl).mean(axis=0)
-        least = _least_turn(rotation_dvl_from_body.T @ travel, travel)
+        least = least_turn(rotation_dvl_from_body.T @ travel, travel)
         is_needed = ROLLED * self.agreements([found.reading], least)[0].residual > found.best_residual
         return rotation_dvl_from_body if is_needed else least
 
@@ -316,7 +316,7 @@ def best_rotation(a: Array, b: Array, as_it_is: Array) -> Array:
     return nearest_rotation(a.T @ b / len(a) + AS_IT_IS * square * as_it_is)
 
 
-def _least_turn(a: Array, b: Array) -> Array:
+def least_turn(a: Array, b: Array) -> Array:
     """Return the rotation (3, 3) by the smallest angle from direction a (3,) to b."""
     axis = cross(a, b)
     sine = float(np.linalg.norm(axis))
