@@ -375,7 +375,7 @@ def doubts(
     finders: Estimates of the lever arm, the best first.
     navigation: Held-out drift with the selected model; None if not available.
     parameters: The configuration.
-    suggested: Whether another configuration fits, which would explain a different lever arm.
+    suggested: Whether another configuration fits, which would explain a different lever arm and a beam.
     in_earth: Whether the reference is in an earth frame.
     is_level: Whether the IMU gives a heading only, see `IMU_LEVEL`.
     """
@@ -397,7 +397,7 @@ def doubts(
         reference_lag_s(estimate, parameters),
         is_insignificant(estimate),
         confused_with_bias_std(estimate, parameters),
-        navigation.beam,
+        None if suggested else navigation.beam,
         ACCEPTED_DRIFT * parameters.target_drift / KM,
         float(estimate.state[:3] @ estimate.state[:3]),
     )

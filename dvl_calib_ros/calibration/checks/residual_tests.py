@@ -336,7 +336,7 @@ def residual_warnings(
         degrees = {"degrees": math.degrees(found.turned), "std": math.degrees(found.turned_std)}
         reasons.append(finding("HEADING_DRIFTS", **degrees, off=math.degrees(off)).weighed(severity))
     if all(each.severity is Severity.WARNING for each in reasons):  # a wrong tilt or heading looks like a beam
-        reasons += beam_warning(beam, accepted + second_order)
+        reasons += beam_warning(beam, max(accepted, second_order))
     magnitude = np.abs(found.bias)
     shown = (magnitude > Z_FIFTY_TESTS * found.bias_std) & (magnitude > REPORTED_FROM_RAD * found.speed)
     if shown.any():
