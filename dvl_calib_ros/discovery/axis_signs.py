@@ -127,7 +127,7 @@ def sign_findings(
     mean = np.concatenate([dvl.values[np.isfinite(dvl.values).all(axis=1)] for dvl, _ in seen]).mean(axis=0)
     given = body_from_message @ mean
     straight = np.array([given[0], 0.0, 0.0])
-    if _angle(given, straight) > LIKELY:
+    if math.hypot(given[1], given[2]) >= math.tan(LIKELY) * abs(given[0]):
         return  # no vehicle that travels ahead
     signs = [one for one in each if one is not None and one.sign]
     axes, other = (FRD, FLU) if is_turned != parameters.is_z_down else (FLU, FRD)
@@ -151,9 +151,3 @@ def sign_findings(
             effect, also = f"mounting_rpy {mounting} fits", f" and try -p mounting_rpy:={mounting}"
         way = WAYS[row][bool(body_from_message[row, axis] > 0.0) != parameters.is_z_down]
         yield finding("DVL_SIGN_OPEN", axis="xyz"[axis], effect=effect, way=way, axes=axes, also=also)
-
-
-def _angle(a: Array, b: Array) -> float:
-    """Return the angle between two directions (3,), rad; π for none."""
-    size = float(np.linalg.norm(a) * np.linalg.norm(b))
-    return math.acos(min(1.0, max(-1.0, float(a @ b) / size))) if size > 0.0 else math.pi

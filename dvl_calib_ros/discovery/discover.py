@@ -38,14 +38,7 @@ from ..verdict.reasons import Reason, finding
 from . import topic_choice
 from .axis_signs import sign_findings
 from .clock_offsets import compared_motion, difference_of, on_imu_clock
-from .discovery import (
-    Discovery,
-    Given,
-    as_option,
-    clocks_of_recording,
-    in_time_of,
-    mounting_guessed,
-)
+from .discovery import Discovery, Given, as_option, clocks_of_recording, in_time_of, mounting_guessed
 from .frame_choice import FrameChoice, FrameChooser, declared_reference
 from .gravity import Gravity, believed_heading
 from .transforms import FrameTree, Placed, in_degrees, in_metres
@@ -392,13 +385,7 @@ class _Search:
         is_known = _is_located(placed) and self._known_reference_position(reference) is not None
         return frames.choose(self._readings, reference, None if known is None else known.T, is_known)
 
-    def _use_reading(
-        self,
-        chosen: Agreement,
-        known: Array | None,
-        reference: Look,
-        imu: Look | None,
-    ) -> None:
+    def _use_reading(self, chosen: Agreement, known: Array | None, reference: Look, imu: Look | None) -> None:
         """Write the frames and mounting of a reading into the parameters."""
         reading, parameters = chosen.reading, self._parameters
         declared = self._declared_reference(reference)

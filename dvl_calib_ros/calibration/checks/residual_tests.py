@@ -131,12 +131,7 @@ class _Fit(NamedTuple):
 
 
 def residual_trend(
-    time: Array,
-    rotation_enu_from_body: Array,
-    velocity: Array,
-    error: Array,
-    rates: Array,
-    interval_s: float = 0.0,
+    time: Array, rotation_enu_from_body: Array, velocity: Array, error: Array, rates: Array, interval_s: float = 0.0
 ) -> ResidualTrend | None:
     """Fit the residual velocity; None for too little data.
 

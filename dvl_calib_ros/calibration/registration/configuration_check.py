@@ -161,10 +161,7 @@ def fitting_configuration(
 
 
 def nearest(
-    fit: MotionFit,
-    rotation_body_from_dvl: Array | None,
-    held: Sequence[Array] = WITHOUT_ARM,
-    most: float = math.inf,
+    fit: MotionFit, rotation_body_from_dvl: Array | None, held: Sequence[Array] = WITHOUT_ARM, most: float = math.inf
 ) -> Fitted | None:
     """Return the best fit over the DVL delays that a calibration covers, or None.
 

@@ -102,11 +102,7 @@ def _misfits(motion: MotionStreams, rotation: Array | None) -> tuple[Array, Arra
             b = _Series(values, known, b.squares * known)
         of_b = np.fft.rfft(np.column_stack([b.values, b.known, b.squares]), size, axis=0)
         # Σ_t b(t) v(t + lag): count, squares of each where the other is known, products of all components
-        pairs = [
-            np.conj(of_b[:, 3]) * of_v[:, 3],
-            np.conj(of_b[:, 3]) * of_v[:, 4],
-            np.conj(of_b[:, 4]) * of_v[:, 3],
-        ]
+        pairs = [np.conj(of_b[:, 3]) * of_v[:, 3], np.conj(of_b[:, 3]) * of_v[:, 4], np.conj(of_b[:, 4]) * of_v[:, 3]]
         if rotation is not None:
             turned = np.conj(of_b[:, :3]) * (of_v[:, :3] @ rotation.T)
             pairs.append(turned.sum(axis=1))

@@ -97,11 +97,7 @@ def motion_of(streams: Streams, parameters: Parameters) -> MotionStreams | None:
     if code == FRAME_CODES[VelocityFrame.NED]:
         measured = measured[1], measured[0], measured[2]
     made = make_motion(
-        (dvl_times, velocity),
-        (reference_times, seen),
-        code != FRAME_CODES[VelocityFrame.BODY],
-        measured,
-        columns,
+        (dvl_times, velocity), (reference_times, seen), code != FRAME_CODES[VelocityFrame.BODY], measured, columns
     )
     return None if made is None else replace(made, epoch_ns=first_ns)
 
